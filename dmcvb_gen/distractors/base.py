@@ -1,0 +1,88 @@
+"""What varies in a picture and nowhere else: the setting's name, and the per-frame labels it expands to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from dmcvb_gen.errors import UnknownNameError
+
+KINDS = ("none", "static", "dynamic")
+SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
+"""Difficulty -> the scale s of every range (Distracting Control Suite); medium is DMC-VB's."""
+VIDEOS = {"easy": 4, "medium": 8, "hard": None}
+"""Difficulty -> how many background videos are in play; None: all."""
+
+
+@dataclass(frozen=True)
+class DistractorSetting:
+    """A kind of distractor at a difficulty; `name` is "none", "static", "dynamic_hard", ... (medium is not named)."""
+
+    kind: str = "none"
+    difficulty: str = "medium"
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise UnknownNameError("distractor", self.kind, KINDS)
+        if self.difficulty not in SCALES:
+            raise UnknownNameError("difficulty", self.difficulty, SCALES)
+
+    @property
+    def name(self) -> str:
+        return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
+
+    @property
+    def scale(self) -> float:
+        return 0.0 if self.kind == "none" else SCALES[self.difficulty]
+
+    @property
+    def videos(self) -> int | None:
+        """How many videos are in play, None for all."""
+        return VIDEOS[self.difficulty]
+
+    @classmethod
+    def parse(cls, name: str) -> DistractorSetting:
+        """The setting of a name such as "dynamic", "dynamic_medium" or "static_easy"."""
+        kind, _, difficulty = name.partition("_")
+        return cls(kind, difficulty or "medium")
+
+
+@dataclass(frozen=True)
+class Exogenous:
+    """Labels of the distractors, a row a frame; the leading shape is (frame,) or (episode, step).
+
+    Pictures are painted from these very values, so a stored frame can be painted again from its labels.
+
+    Attributes:
+      camera_position: (..., view, 3) float32, world frame, meters.
+      camera_quaternion: (..., view, 4) float32, w x y z, MuJoCo's camera frame (looks along -z, y up).
+      material_rgb: (..., material, 3) float32 in [0, 1], the model's materials in their order.
+      background_video: (...,) int16, index of the video seen through the sky; -1: the model's own sky.
+      background_frame: (...,) int16, frame of that video; -1 with the model's own sky.
+      style: (...,) int16, visual style of a maze; -1: none.
+    """
+
+    camera_position: np.ndarray
+    camera_quaternion: np.ndarray
+    material_rgb: np.ndarray
+    background_video: np.ndarray
+    background_frame: np.ndarray
+    style: np.ndarray
+
+    def __getitem__(self, index) -> Exogenous:
+        """Index the leading axes of all labels alike."""
+        return Exogenous(**{name: value[index] for name, value in self.items()})
+
+    def __len__(self) -> int:
+        return len(self.background_video)
+
+    def items(self) -> Iterator[tuple[str, np.ndarray]]:
+        for field in fields(self):
+            yield field.name, getattr(self, field.name)
+
+    def flat(self) -> Exogenous:
+        """With the leading (episode, step) axes made one frame axis."""
+        lead = self.background_video.ndim
+        return Exogenous(**{name: value.reshape(-1, *value.shape[lead:]) for name, value in self.items()})

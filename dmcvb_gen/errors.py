@@ -1,0 +1,43 @@
+"""The errors that a person at a terminal is meant to read: what was given, what was expected, what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class DmcvbError(Exception):
+    """A mistake in the request or its surroundings; the CLI prints it in one line and exits with 2."""
+
+
+class UnknownNameError(DmcvbError, KeyError):
+    """A name that is not among the known ones; the message lists those and the nearest match."""
+
+    def __init__(self, kind: str, name: object, known: Iterable[str]):
+        known = sorted(map(str, known))
+        near = difflib.get_close_matches(str(name), known, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(known)}.")
+
+    def __str__(self) -> str:  # KeyError would print the repr
+        return str(self.args[0])
+
+
+class PolicyFileError(DmcvbError):
+    """A policy file that cannot be trusted or does not fit the task."""
+
+
+class StoreError(DmcvbError):
+    """A release or store that is damaged, foreign or cannot be written."""
+
+
+class RenderingError(DmcvbError):
+    """A renderer that cannot start here."""
+
+
+class BackgroundError(DmcvbError):
+    """A background folder or video that cannot be used."""
+
+
+class RecipeError(DmcvbError):
+    """A recipe that does not make sense."""

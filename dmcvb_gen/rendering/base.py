@@ -1,0 +1,64 @@
+"""The one interface of the renderers: physics states and distractor labels in, pictures out."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.distractors.base import DistractorSetting, Exogenous
+from dmcvb_gen.tasks.base import Task
+
+MIN_SIZE, MAX_SIZE = 8, 1024
+"""Pixels a side that a renderer accepts."""
+
+
+class Renderer(abc.ABC):
+    """Paints frames of one task at one size.
+
+    Pixels are a pure function of (physics, labels, renderer settings, size, view): a frame comes out the
+    same however many frames are painted in one call and in whatever order.
+    """
+
+    name: str
+    task: Task
+    size: int
+
+    @abc.abstractmethod
+    def render(
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
+    ) -> np.ndarray:
+        """Paint frames.
+
+        Args:
+          physics: (frame, physics) float64 states.
+          exogenous: labels with leading shape (frame,).
+          views: names out of `task.views`; all by default.
+          hide_goal: leave out `task.goal_geoms`.
+
+        Returns:
+          (frame, view, size, size, 3) uint8.
+        """
+
+    @abc.abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Name, version and every setting that decides a pixel, for the manifest."""
+
+    def close(self) -> None:
+        """Free what the renderer holds; it cannot be used afterwards."""
+
+
+def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
+    """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
+
+    1.0 for walker and cheetah, 0.3 otherwise (Distracting Control Suite); untouched without distractors.
+    """
+    if setting.kind == "none" or task.id in ("walker-walk", "cheetah-run"):
+        return 1.0
+    return 0.3

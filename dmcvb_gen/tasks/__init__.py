@@ -1,0 +1,42 @@
+"""Tasks: `get_task("walker-walk")` gives the task of that name."""
+
+from __future__ import annotations
+
+import functools
+
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
+from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
+
+_LOCOMOTION = {task.id: task for task in (WalkerWalk, CheetahRun, HumanoidWalk)}
+
+LOCOMOTION_TASKS = tuple(_LOCOMOTION)
+
+
+def task_ids() -> tuple[str, ...]:
+    """The names that `get_task` takes."""
+    return LOCOMOTION_TASKS
+
+
+@functools.lru_cache(maxsize=None)
+def get_task(task_id: str) -> Task:
+    """The task named `task_id`.
+
+    Raises:
+      UnknownNameError: no task has that name.
+    """
+    if task_id in _LOCOMOTION:
+        return _LOCOMOTION[task_id]()
+    raise UnknownNameError("task", task_id, task_ids())
+
+
+__all__ = [
+    "ACTION_REPEAT",
+    "LOCOMOTION_TASKS",
+    "PHYSICS_SPEC",
+    "EpisodeBatch",
+    "StepResult",
+    "Task",
+    "get_task",
+    "task_ids",
+]

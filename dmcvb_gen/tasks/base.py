@@ -1,0 +1,269 @@
+"""What a task is: a MuJoCo model, a state with named fields, a reward; simulated as a batch of episodes.
+
+A `Task` is the description (one per task id, shared freely). `Task.batch` makes an `EpisodeBatch`:
+`size` episodes side by side on `mujoco.batch.Batch`, stepped together. Tasks know nothing of pixels.
+
+One agent step is `ACTION_REPEAT` control steps with the same action; their rewards are summed
+(paper, section 3.2). Step t of an episode holds the state before action t and the reward that it earned.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+ACTION_REPEAT = 2
+"""Control steps an agent step (paper, section 3.2)."""
+
+PHYSICS_SPEC = int(
+    mujoco.mjtState.mjSTATE_FULLPHYSICS
+    | mujoco.mjtState.mjSTATE_WARMSTART
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+"""The `mjtState` bits of the stored `physics`: all that decides what the simulation does next and how
+it looks. The solver's warm start is in, so that a step redone from a stored state gives the same bits."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one agent step of a batch gave.
+
+    Attributes:
+      state: (size, state) float64, the states after the step.
+      reward: (size,) float64, summed over the control steps.
+      terminated: (size,) bool, the task ended by itself (never by the time limit).
+    """
+
+    state: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+
+
+class Task(abc.ABC):
+    """A task, as DMC-VB means it.
+
+    Attributes:
+      id: the task's name, e.g. "walker-walk".
+      model: the compiled MuJoCo model. Never change it: renderers and batches share it.
+      state_fields: name -> size of each part of the state, in the state's order.
+      max_steps: agent steps at which the time limit ends an episode.
+      substeps: physics steps a control step.
+      views: the names of the pictures made of each frame; ("pixels",) for a task with one.
+      return_range: (lowest, highest) return an episode can have.
+    """
+
+    id: str
+    model: mujoco.MjModel
+    state_fields: Mapping[str, int]
+    max_steps: int
+    substeps: int
+    views: tuple[str, ...] = ("pixels",)
+    return_range: tuple[float, float] = (0.0, 1000.0)
+
+    cameras: tuple[int | str, ...] = (0,)
+    """The model's camera behind each of `views`."""
+    goal_geoms: tuple[int, ...] = ()
+    """Geoms left out of the hidden-goal pictures."""
+
+    def style_geom_matid(self, style: int) -> np.ndarray | None:
+        """(geom,) int: material of every geom under a visual style; None where a task has no styles."""
+        return None
+
+    @property
+    def action_size(self) -> int:
+        """Actions are float32 (action_size,) in [-1, 1]."""
+        return self.model.nu
+
+    @property
+    def state_size(self) -> int:
+        return sum(self.state_fields.values())
+
+    @property
+    def state_slices(self) -> dict[str, slice]:
+        """Where each field lies in the state."""
+        ends = np.cumsum(list(self.state_fields.values()))
+        return {
+            name: slice(int(end - size), int(end))
+            for (name, size), end in zip(self.state_fields.items(), ends, strict=True)
+        }
+
+    @property
+    def behaviour_indices(self) -> np.ndarray:
+        """(observation,) int: the entries of the state that behaviour policies see (all, by default)."""
+        return np.arange(self.state_size)
+
+    @property
+    def behaviour_size(self) -> int:
+        return len(self.behaviour_indices)
+
+    @property
+    def physics_size(self) -> int:
+        """Length of a stored physics state (float64), see `PHYSICS_SPEC`."""
+        return mujoco.mj_stateSize(self.model, PHYSICS_SPEC)
+
+    @property
+    def control_timestep(self) -> float:
+        """Seconds a control step; an agent step takes `ACTION_REPEAT` of them."""
+        return self.substeps * self.model.opt.timestep
+
+    @abc.abstractmethod
+    def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
+        """`size` episodes side by side, stepped on `threads` threads (the result does not depend on them)."""
+
+
+class EpisodeBatch(abc.ABC):
+    """`size` episodes of one task, simulated together. A simulation never influences its neighbors.
+
+    Built on a persistent `mujoco.batch.Batch` stepped with `mjSTAGE_VEL`, which makes positions,
+    velocities and sensors current after each control step as dm_control does.
+    """
+
+    def __init__(self, task: Task, size: int, threads: int = 1):
+        self.task = task
+        self.size = size
+        self.sims = Batch(task.model, size, nthread=threads, persistent=True)
+        self._ctrl = self.sims.bind("ctrl")
+        self._all = np.arange(size)
+
+    # -- what a task must say ---------------------------------------------------------------
+
+    @abc.abstractmethod
+    def _initialize(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Set the initial physics state of the simulations `ids`, one generator each; end with `_refresh`."""
+
+    @abc.abstractmethod
+    def state(self) -> np.ndarray:
+        """(size, state) float64: the current states, fields as in `task.state_fields`."""
+
+    @abc.abstractmethod
+    def _control_reward(self) -> np.ndarray:
+        """(size,) float64: the reward of the control step just taken."""
+
+    def _control_terminated(self) -> np.ndarray:
+        """(size,) bool: whether the control step just taken ended the episode."""
+        return np.zeros(self.size, bool)
+
+    # -- what callers use -------------------------------------------------------------------
+
+    def reset(
+        self, generators: Sequence[np.random.Generator], ids: np.ndarray | Sequence[int] | None = None
+    ) -> np.ndarray:
+        """Start new episodes.
+
+        Args:
+          generators: one a simulation of `ids`; each is used for that episode's initial state alone.
+          ids: the simulations to restart; all by default.
+
+        Returns:
+          (size, state) float64, the states of all simulations.
+        """
+        ids = self._all if ids is None else np.asarray(ids, int)
+        if len(generators) != len(ids):
+            raise ValueError(f"{len(ids)} simulations to reset, {len(generators)} generators given")
+        if len(ids):
+            self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+            self._initialize(ids, generators)
+        return self.state()
+
+    def step(self, actions: np.ndarray) -> StepResult:
+        """One agent step of every simulation.
+
+        Args:
+          actions: (size, action), clipped to [-1, 1] by MuJoCo's control limits as in dm_control.
+
+        An episode that terminates at its first control step is frozen for the second: its state stays
+        what it was at the end and it earns nothing more (as an action-repeat wrapper that breaks).
+        """
+        actions = np.asarray(actions, np.float64)
+        if actions.shape != self._ctrl.shape:
+            raise ValueError(f"actions have shape {actions.shape}, expected {self._ctrl.shape}")
+        self._ctrl[:] = actions
+        reward = np.zeros(self.size)
+        terminated = np.zeros(self.size, bool)
+        for _ in range(ACTION_REPEAT):
+            alive = None if not terminated.any() else np.flatnonzero(~terminated)
+            if alive is not None and not len(alive):
+                break
+            self._advance(alive)
+            gain = self._control_reward()
+            reward += gain if alive is None else np.where(terminated, 0.0, gain)
+            terminated = terminated | self._control_terminated()
+        return StepResult(self.state(), reward, terminated)
+
+    def _advance(self, ids: np.ndarray | None) -> None:
+        self.sims.step(ids=ids, nstep=self.task.substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+
+    def _refresh(self, ids: np.ndarray) -> None:
+        """Make derived fields current after a write to the state."""
+        self.sims.forward(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+
+    def physics(self) -> np.ndarray:
+        """(size, physics) float64: the states to set back into MuJoCo (`PHYSICS_SPEC`)."""
+        return self.sims.state[:, self._physics_columns].copy()
+
+    def set_physics(self, physics: np.ndarray, ids: np.ndarray | Sequence[int] | None = None) -> np.ndarray:
+        """Put simulations into stored physics states; gives all states (size, state).
+
+        Args:
+          physics: (len(ids), physics) float64.
+        """
+        ids = self._all if ids is None else np.asarray(ids, int)
+        self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.sims.state[np.ix_(ids, self._physics_columns)] = physics
+        self._refresh(ids)
+        return self.state()
+
+    @property
+    def _physics_columns(self) -> np.ndarray:
+        """Where the components of `PHYSICS_SPEC` lie in a batch's state rows (`mjSTATE_INTEGRATION`)."""
+        if not hasattr(self, "_columns"):
+            self._columns = physics_columns(self.task.model)
+        return self._columns
+
+
+def physics_columns(model: mujoco.MjModel) -> np.ndarray:
+    """Indices of the `PHYSICS_SPEC` components inside a state vector of `mjSTATE_INTEGRATION`."""
+    columns, offset = [], 0
+    for bit in range(32):
+        component = 1 << bit
+        if not component & int(mujoco.mjtState.mjSTATE_INTEGRATION):
+            continue
+        size = mujoco.mj_stateSize(model, component)
+        if component & PHYSICS_SPEC:
+            columns.extend(range(offset, offset + size))
+        offset += size
+    return np.array(columns, int)
+
+
+_SIGMOID_DEFAULT = 0.1
+
+
+def tolerance(x, lower=0.0, upper=0.0, margin=0.0, sigmoid="gaussian", value_at_margin=_SIGMOID_DEFAULT):
+    """1 where x lies in [lower, upper], falling to `value_at_margin` at `margin` outside (elementwise).
+
+    The reward shape of the DeepMind Control Suite, for arrays: sigmoid "gaussian", "linear" or "quadratic".
+    """
+    x = np.asarray(x, np.float64)
+    inside = (lower <= x) & (x <= upper)
+    if margin == 0:
+        return np.where(inside, 1.0, 0.0)
+    distance = np.where(x < lower, lower - x, x - upper) / margin
+    if sigmoid == "gaussian":
+        scale = math.sqrt(-2 * math.log(value_at_margin))
+        value = np.exp(-0.5 * (distance * scale) ** 2)
+    elif sigmoid == "linear":
+        scaled = distance * (1 - value_at_margin)
+        value = np.where(np.abs(scaled) < 1, 1 - scaled, 0.0)
+    elif sigmoid == "quadratic":
+        scaled = distance * math.sqrt(1 - value_at_margin)
+        value = np.where(np.abs(scaled) < 1, 1 - scaled**2, 0.0)
+    else:
+        raise ValueError(f"unknown sigmoid {sigmoid!r}")
+    return np.where(inside, 1.0, value)
