@@ -7,7 +7,9 @@ batch. dm_control is the authority: from the same physics state and actions they
 from __future__ import annotations
 
 import functools
+import importlib.util
 from collections.abc import Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -19,11 +21,13 @@ EPISODE_STEPS = 500
 
 
 def _suite_model(domain: str) -> mujoco.MjModel:
-    """The compiled model of a dm_control suite domain."""
-    from dm_control.suite import common
+    """The compiled model of a dm_control suite domain.
 
-    xml = common.read_model(f"{domain}.xml")
-    return mujoco.MjModel.from_xml_string(xml.decode() if isinstance(xml, bytes) else xml, dict(common.ASSETS))
+    The XML files are read in place: importing `dm_control.suite` would load every domain and a GL library.
+    """
+    suite = Path(importlib.util.find_spec("dm_control").submodule_search_locations[0]) / "suite"
+    assets = {f"./common/{path.name}": path.read_bytes() for path in (suite / "common").glob("*.xml")}
+    return mujoco.MjModel.from_xml_string((suite / f"{domain}.xml").read_text(), assets)
 
 
 class LocomotionTask(Task):

@@ -1,0 +1,192 @@
+r"""The layout of a subset: task and setting in, the Zarr arrays that hold its episodes out.
+
+One Zarr v3 group a subset, arrays episode-major, one shard file an array and job::
+
+    <release>/manifest.json
+    <release>/<task>/<level>/<setting>.zarr/
+        pixels                    (episode, step, height, width, channel) uint8
+        state action reward ...   (episode, step, ...)
+        length return ...         (episode,)
+
+An episode of `length` L transitions fills rows 0..L; row t holds observation t, the action taken there
+and the reward that it earned; row L holds the last observation and no action (zeros)::
+
+    step        0     1          L-1    L     L+1 ...
+    pixels      o_0   o_1   ...  o_L-1  o_L   (nothing stored)
+    state       s_0   s_1   ...  s_L-1  s_L
+    action      a_0   a_1   ...  a_L-1  0
+    reward      r_0   r_1   ...  r_L-1  0      r_t: earned by a_t
+    discount    1     1     ...  d      0      d = 0 if the task ended the episode, 1 at the time limit
+
+Rows past L are never written: a missing chunk costs no storage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import zarr
+from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
+
+from dmcvb_gen.tasks.base import Task
+
+SCHEMA_VERSION = 1
+"""Version of the layout; a reader refuses a newer one."""
+
+PIXEL_CHUNK_STEPS = 32
+"""Steps an inner chunk of the pictures: the unit of reading (chosen with scripts/bench_store.py)."""
+STATE_CHUNK_STEPS = None
+"""Inner chunks of the small arrays hold a whole episode."""
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """One array of a subset.
+
+    Attributes:
+      name: path inside the group, e.g. "pixels" or "exogenous/camera_position".
+      dtype: numpy name.
+      shape: shape of one step, or of one episode's entry where `steps` is false.
+      dims: names of the axes of `shape`.
+      steps: whether the array has a step axis.
+      picture: whether it holds pictures (another chunking and codec).
+      attributes: stored with the array.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...] = ()
+    dims: tuple[str, ...] = ()
+    steps: bool = True
+    picture: bool = False
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+def pixel_array_names(task: Task, hidden_goal: bool = False) -> tuple[str, ...]:
+    """Names of the picture arrays, a view each: ("pixels",), or ("pixels/top", ...)."""
+    if task.views == ("pixels",):
+        return ("pixels",)
+    root = "pixels_hidden_goal" if hidden_goal else "pixels"
+    return tuple(f"{root}/{view}" for view in task.views)
+
+
+def picture_spec(name: str, size: int) -> ArraySpec:
+    """The spec of one picture array of `size` x `size` RGB."""
+    return ArraySpec(name, "uint8", (size, size, 3), ("height", "width", "channel"), picture=True)
+
+
+def array_specs(task: Task, size: int, pixels: bool = True) -> tuple[ArraySpec, ...]:
+    """All arrays of a subset of `task` with pictures of `size` (none with pixels=False)."""
+    names = pixel_array_names(task) + (pixel_array_names(task, hidden_goal=True) if task.goal_geoms else ())
+    fields = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
+    views = len(task.views)
+    specs = [picture_spec(name, size) for name in names] if pixels else []
+    specs += [
+        ArraySpec("state", "float32", (task.state_size,), ("state",), attributes={"fields": fields}),
+        ArraySpec("action", "float32", (task.action_size,), ("action",)),
+        ArraySpec("reward", "float32"),
+        ArraySpec("discount", "float32"),
+        ArraySpec("physics", "float64", (task.physics_size,), ("physics",)),
+        ArraySpec("exogenous/camera_position", "float32", (views, 3), ("view", "xyz")),
+        ArraySpec("exogenous/camera_quaternion", "float32", (views, 4), ("view", "wxyz")),
+        ArraySpec("exogenous/material_rgb", "float32", (task.model.nmat, 3), ("material", "rgb")),
+        ArraySpec("exogenous/background_video", "int16"),
+        ArraySpec("exogenous/background_frame", "int16"),
+        ArraySpec("exogenous/style", "int16"),
+        ArraySpec("length", "int32", steps=False),
+        ArraySpec("terminated", "bool", steps=False),
+        ArraySpec("return", "float64", steps=False),
+        ArraySpec("seed", "uint64", steps=False),
+        ArraySpec("behaviour", "int16", steps=False),
+        ArraySpec("goal_pair", "int16", steps=False),
+    ]
+    return tuple(specs)
+
+
+EXOGENOUS_NAMES = (
+    "camera_position",
+    "camera_quaternion",
+    "material_rgb",
+    "background_video",
+    "background_frame",
+    "style",
+)
+
+
+# -- codecs: how one inner chunk becomes bytes ----------------------------------------------------
+
+
+def picture_codecs(layout: str) -> dict[str, Any]:
+    """Codecs of a picture chunk (1, step, height, width, channel), by name of the layout.
+
+    All are standard or numcodecs' own, so plain zarr-python reads them. See scripts/bench_store.py.
+    """
+    from zarr.codecs import BloscCodec, numcodecs
+
+    time_last = TransposeCodec(order=(0, 2, 3, 4, 1))
+    width_last = TransposeCodec(order=(0, 1, 4, 2, 3))
+    delta = numcodecs.Delta(dtype="|u1")
+    layouts = {
+        "zstd": dict(filters=(), compressors=(ZstdCodec(level=3),)),
+        "blosc-bitshuffle": dict(
+            filters=(), compressors=(BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle", typesize=1),)
+        ),
+        "time-zstd": dict(filters=(time_last,), compressors=(ZstdCodec(level=3),)),
+        "time-delta-zstd": dict(filters=(time_last, delta), compressors=(ZstdCodec(level=3),)),
+        "width-delta-zstd": dict(filters=(width_last, delta), compressors=(ZstdCodec(level=3),)),
+        "width-time-delta-zstd": dict(
+            filters=(width_last, delta, TransposeCodec(order=(0, 2, 3, 4, 1)), delta),
+            compressors=(ZstdCodec(level=3),),
+        ),
+    }
+    return layouts[layout]
+
+
+PICTURE_LAYOUT = "width-delta-zstd"
+"""The layout that releases use (measured with scripts/bench_store.py)."""
+
+
+def create_arrays(
+    group: zarr.Group,
+    specs: tuple[ArraySpec, ...],
+    episodes: int,
+    rows: int,
+    episodes_per_shard: int,
+    picture_layout: str | None = None,
+    chunk_steps: int | None = None,
+) -> None:
+    """Create the (empty) arrays of a subset: metadata only, no data.
+
+    Args:
+      episodes: episodes the subset will have.
+      rows: rows of the step axis, max_steps + 1.
+      episodes_per_shard: episodes a shard file.
+    """
+    for spec in specs:
+        if not spec.steps:
+            shape, dims = (episodes, *spec.shape), ("episode", *spec.dims)
+            chunks, shards = (episodes_per_shard, *spec.shape), None
+        else:
+            shape, dims = (episodes, rows, *spec.shape), ("episode", "step", *spec.dims)
+            steps = (chunk_steps or PIXEL_CHUNK_STEPS) if spec.picture else rows
+            steps = min(steps, rows)
+            chunks = (1, steps, *spec.shape)
+            shards = (episodes_per_shard, -(-rows // steps) * steps, *spec.shape)
+        if spec.picture:
+            codecs = dict(picture_codecs(picture_layout or PICTURE_LAYOUT))
+        else:
+            codecs = dict(filters=(), compressors=(ZstdCodec(level=3),))
+        codecs["compressors"] = (*codecs["compressors"], Crc32cCodec())
+        group.create_array(
+            name=spec.name,
+            shape=shape,
+            chunks=chunks,
+            shards=shards,
+            dtype=spec.dtype,
+            fill_value=0,
+            dimension_names=dims,
+            attributes=dict(spec.attributes),
+            **codecs,
+        )

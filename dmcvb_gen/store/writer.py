@@ -1,0 +1,222 @@
+"""Writing a release: a manifest starts it, shards are committed one by one, a last look completes it.
+
+A shard is written whole, file by file, each file atomically; only then its commit record. So a crash at
+any moment leaves committed shards and rubbish without a record, which the next run writes over.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import zarr
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.store.manifest import (
+    MANIFEST,
+    CommitRecord,
+    FileRecord,
+    Manifest,
+    SubsetRecord,
+    parse_commit,
+    parse_manifest,
+    write_json_atomically,
+)
+from dmcvb_gen.store.schema import ArraySpec, create_arrays
+
+
+def subset_path(name: str) -> str:
+    """Folder of a subset's Zarr group inside the release."""
+    return f"{name}.zarr"
+
+
+def commit_path(name: str, shard: int) -> str:
+    """Commit record of a shard inside the release."""
+    return f"commits/{name}/{shard:05d}.json"
+
+
+def sha256_file(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def start_release(root: Path, manifest: Manifest) -> Manifest:
+    """Create a release folder, or take up the one that is there.
+
+    Raises:
+      StoreError: the folder holds something else, or another recipe's release, or cannot be written.
+    """
+    path = root / MANIFEST
+    try:
+        if path.exists():
+            old = parse_manifest(path.read_bytes(), str(path))
+            if (old.recipe, _asked(old)) != (manifest.recipe, _asked(manifest)):
+                raise StoreError(
+                    f"{root} holds another recipe's release ({_difference(old, manifest)}); "
+                    "choose another --out, or delete the folder if it is not needed"
+                )
+            environments = old.environments
+            for environment in manifest.environments:
+                if environment not in environments:
+                    environments = (*environments, environment)
+            manifest = old.model_copy(update={"environments": environments})
+        elif root.exists() and any(root.iterdir()):
+            raise StoreError(f"{root} is not empty and holds no release; choose an empty or new folder for --out")
+        root.mkdir(parents=True, exist_ok=True)
+        write_json_atomically(path, manifest)
+    except OSError as error:
+        raise StoreError(f"cannot write to {root}: {error.strerror or error}; choose a writable --out") from None
+    return manifest
+
+
+def _asked(manifest: Manifest) -> list[SubsetRecord]:
+    return [subset.model_copy(update={"digest": None}) for subset in manifest.subsets]
+
+
+def _difference(old: Manifest, new: Manifest) -> str:
+    for key in sorted(set(old.recipe) | set(new.recipe)):
+        if old.recipe.get(key) != new.recipe.get(key):
+            return f"its {key} is {_short(old.recipe.get(key))}, asked for {_short(new.recipe.get(key))}"
+    before = {subset.name: subset for subset in _asked(old)}
+    for subset in _asked(new):
+        if subset.name not in before:
+            return f"it has no {subset.name}"
+        for field in SubsetRecord.model_fields:
+            if getattr(before[subset.name], field) != getattr(subset, field):
+                return f"{field} of {subset.name} differs"
+    return "its subsets differ"
+
+
+def _short(value) -> str:
+    text = str(value)
+    return text if len(text) < 80 else text[:77] + "..."
+
+
+def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
+    """Create a subset's group and arrays (metadata alone), unless they are there already.
+
+    Raises:
+      StoreError: the folder cannot be written.
+    """
+    path = root / subset_path(subset.name)
+    if (path / ".created").exists():
+        return
+    try:
+        group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
+        create_arrays(group, specs, subset.episodes, rows, subset.episodes_per_shard)
+        zarr.consolidate_metadata(str(path))
+        (path / ".created").touch()  # an interrupted creation is done again from the start
+    except OSError as error:
+        raise StoreError(f"cannot write to {path}: {error.strerror or error}") from None
+
+
+def write_shard(
+    root: Path,
+    subset: SubsetRecord,
+    shard: int,
+    arrays: Iterable[tuple[str, np.ndarray]],
+    lengths: np.ndarray,
+) -> CommitRecord:
+    """Write the arrays of one shard and commit it.
+
+    Args:
+      arrays: (name, values (episode of the shard, ...)) pairs, taken one after the other, so that a caller
+        may make the big ones as they are asked for.
+      lengths: (episode of the shard,) transitions of each episode.
+
+    Raises:
+      StoreError: the disk is full or cannot be written; what was committed stays.
+    """
+    first, last = shard_episodes(subset, shard)
+    group_path = root / subset_path(subset.name)
+    record = root / commit_path(subset.name, shard)
+    try:
+        record.unlink(missing_ok=True)
+        group = zarr.open_group(str(group_path), mode="r+", use_consolidated=False)
+        files = []
+        for name, values in arrays:
+            array = group[name]
+            file = group_path / name / array.metadata.encode_chunk_key((shard,) + (0,) * (array.ndim - 1))
+            for stale in file.parent.glob(f"{file.name}*.partial"):
+                stale.unlink(missing_ok=True)  # left by a killed writer
+            file.unlink(missing_ok=True)
+            array[first:last] = values
+            if file.exists():  # an array of nothing but fill values has no file
+                with file.open("rb") as handle:
+                    os.fsync(handle.fileno())
+                relative = file.relative_to(root).as_posix()
+                files.append(FileRecord(path=relative, bytes=file.stat().st_size, sha256=sha256_file(file)))
+        commit = CommitRecord(
+            subset=subset.name,
+            shard=shard,
+            episodes=(first, last),
+            steps=int(np.sum(lengths)),
+            files=tuple(sorted(files, key=lambda file: file.path)),
+        )
+        write_json_atomically(record, commit)
+    except OSError as error:
+        raise StoreError(
+            f"cannot write shard {shard} of {subset.name} to {root}: {error.strerror or error}; what was committed "
+            "is safe, make room and run the same command again"
+        ) from None
+    return commit
+
+
+def shard_count(subset: SubsetRecord) -> int:
+    return -(-subset.episodes // subset.episodes_per_shard)
+
+
+def shard_episodes(subset: SubsetRecord, shard: int) -> tuple[int, int]:
+    """First episode of a shard, and the one after its last."""
+    first = shard * subset.episodes_per_shard
+    return first, min(first + subset.episodes_per_shard, subset.episodes)
+
+
+def read_commits(root: Path, subset: SubsetRecord) -> dict[int, CommitRecord]:
+    """The committed shards of a subset, shard -> record (those whose files are all there at their size)."""
+    commits = {}
+    for shard in range(shard_count(subset)):
+        path = root / commit_path(subset.name, shard)
+        if not path.exists():
+            continue
+        commit = parse_commit(path.read_bytes(), str(path))
+        if commit.subset != subset.name or commit.shard != shard or commit.episodes != shard_episodes(subset, shard):
+            raise StoreError(f"{path} is the record of another shard; delete it and run the rollout again")
+        if all(_size(root / file.path) == file.bytes for file in commit.files):
+            commits[shard] = commit
+    return commits
+
+
+def _size(path: Path) -> int | None:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
+
+
+def subset_digest(commits: Mapping[int, CommitRecord]) -> str:
+    """One SHA-256 over the digests of all files of a subset, in the order of shards and paths."""
+    digest = hashlib.sha256()
+    for shard in sorted(commits):
+        for file in commits[shard].files:
+            digest.update(f"{file.sha256}  {file.path}\n".encode())
+    return digest.hexdigest()
+
+
+def finish_release(root: Path, manifest: Manifest) -> Manifest:
+    """Write digests of the subsets that are whole; the manifest is complete when all are."""
+    subsets, complete = [], True
+    for subset in manifest.subsets:
+        commits = read_commits(root, subset)
+        whole = len(commits) == shard_count(subset)
+        complete &= whole
+        subsets.append(subset.model_copy(update={"digest": subset_digest(commits) if whole else None}))
+    manifest = manifest.model_copy(update={"subsets": tuple(subsets), "complete": complete})
+    try:
+        write_json_atomically(root / MANIFEST, manifest)
+    except OSError as error:
+        raise StoreError(f"cannot write {root / MANIFEST}: {error.strerror or error}") from None
+    return manifest
