@@ -18,7 +18,7 @@ def task_ids() -> tuple[str, ...]:
     return LOCOMOTION_TASKS
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def get_task(task_id: str) -> Task:
     """The task named `task_id`.
 

@@ -172,11 +172,13 @@ class EpisodeBatch(abc.ABC):
             self._initialize(ids, generators)
         return self.state()
 
-    def step(self, actions: np.ndarray) -> StepResult:
-        """One agent step of every simulation.
+    def step(self, actions: np.ndarray, active: np.ndarray | None = None) -> StepResult:
+        """One agent step.
 
         Args:
           actions: (size, action), clipped to [-1, 1] by MuJoCo's control limits as in dm_control.
+          active: (size,) bool, the simulations to step; the others stay as they are and earn nothing.
+            All by default.
 
         An episode that terminates at its first control step is frozen for the second: its state stays
         what it was at the end and it earns nothing more (as an action-repeat wrapper that breaks).
@@ -184,17 +186,18 @@ class EpisodeBatch(abc.ABC):
         actions = np.asarray(actions, np.float64)
         if actions.shape != self._ctrl.shape:
             raise ValueError(f"actions have shape {actions.shape}, expected {self._ctrl.shape}")
-        self._ctrl[:] = actions
+        moving = np.ones(self.size, bool) if active is None else np.array(active, bool)
+        self._ctrl[moving] = actions[moving]
         reward = np.zeros(self.size)
         terminated = np.zeros(self.size, bool)
         for _ in range(ACTION_REPEAT):
-            alive = None if not terminated.any() else np.flatnonzero(~terminated)
-            if alive is not None and not len(alive):
+            if not moving.any():
                 break
-            self._advance(alive)
-            gain = self._control_reward()
-            reward += gain if alive is None else np.where(terminated, 0.0, gain)
-            terminated = terminated | self._control_terminated()
+            self._advance(None if moving.all() else np.flatnonzero(moving))
+            reward += np.where(moving, self._control_reward(), 0.0)
+            ended = self._control_terminated() & moving
+            terminated |= ended
+            moving &= ~ended
         return StepResult(self.state(), reward, terminated)
 
     def _advance(self, ids: np.ndarray | None) -> None:
