@@ -1,0 +1,278 @@
+"""Soft actor-critic on batched simulations: transitions in, a squashed Gaussian actor out.
+
+SAC (Haarnoja et al. 2018) with what makes humanoids learnable and CPUs fast: running observation
+normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products where the
+processor has them, compiled updates. scripts/bench_training.py sets it beside Stable-Baselines3's SAC.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from dmcvb_gen.behaviours.policy_file import LOG_STD_RANGE, Actor, PolicyHeader
+
+
+@dataclass(frozen=True)
+class SacSettings:
+    """Settings of `Sac`; the defaults of a task are in data/defaults.yaml.
+
+    Attributes:
+      simulations: episodes stepped side by side.
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
+      warmup_steps: agent steps of uniform random actions before the first update.
+      actor_every: an actor update every so many critic updates.
+      target_entropy_scale: the target entropy is minus this times the action size.
+      reward_scale: multiplies rewards before learning.
+      shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
+      bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
+      compile: compile the updates (needs a C++ compiler on the CPU).
+    """
+
+    simulations: int = 8
+    batch_size: int = 256
+    actor_hidden: tuple[int, ...] = (256, 256)
+    critic_hidden: tuple[int, ...] = (256, 256)
+    learning_rate: float = 1e-3
+    discount: float = 0.99
+    target_decay: float = 0.995
+    updates_per_step: float = 1.0
+    warmup_steps: int = 5000
+    actor_every: int = 2
+    target_entropy_scale: float = 0.5
+    initial_temperature: float = 0.1
+    reward_scale: float = 0.5
+    shaping: float = 0.0
+    buffer_size: int = 1_000_000
+    bfloat16: bool = True
+    compile: bool = True
+
+
+class CriticEnsemble(nn.Module):
+    """Two critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer."""
+
+    def __init__(
+        self, observation_size: int, action_size: int, hidden: tuple[int, ...], bfloat16: bool, critics: int = 2
+    ):
+        super().__init__()
+        self.bfloat16 = bfloat16
+        sizes = (observation_size + action_size, *hidden)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
+        for i, o in zip(sizes[:-1], sizes[1:], strict=True):
+            self.weights.append(nn.Parameter(torch.stack([_init(i, o) for _ in range(critics)])))
+            self.biases.append(nn.Parameter(torch.zeros(critics, 1, o)))
+            self.scales.append(nn.Parameter(torch.ones(critics, 1, o)))
+            self.shifts.append(nn.Parameter(torch.zeros(critics, 1, o)))
+        self.head = nn.Parameter(torch.stack([_init(sizes[-1], 1) for _ in range(critics)]) * 0.1)
+        self.head_bias = nn.Parameter(torch.zeros(critics, 1, 1))
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(n, observation), (n, action) -> (critic, n)."""
+        x = torch.cat([observation, action], dim=1).expand(len(self.head), -1, -1)
+        for weight, bias, scale, shift in zip(self.weights, self.biases, self.scales, self.shifts, strict=True):
+            if self.bfloat16:
+                x = torch.bmm(x.bfloat16(), weight.bfloat16()).float() + bias
+            else:
+                x = torch.baddbmm(bias, x, weight)
+            x = nn.functional.layer_norm(x, x.shape[-1:]) * scale + shift
+            x = nn.functional.relu(x)
+        return (torch.bmm(x, self.head) + self.head_bias).squeeze(-1)
+
+
+def _init(inputs: int, outputs: int) -> torch.Tensor:
+    bound = math.sqrt(3.0 / inputs)
+    return torch.empty(inputs, outputs).uniform_(-bound, bound)
+
+
+class ReplayBuffer:
+    """Transitions in memory-mapped files, so that a killed run finds them again.
+
+    Args:
+      folder: where the files are; None keeps them in memory.
+    """
+
+    def __init__(self, size: int, observation_size: int, action_size: int, folder=None):
+        self.size, self.position, self.full = size, 0, False
+        shapes = {
+            "observation": (size, observation_size),
+            "next_observation": (size, observation_size),
+            "action": (size, action_size),
+            "reward": (size,),
+            "terminated": (size,),
+        }
+        self.arrays = {}
+        for name, shape in shapes.items():
+            if folder is None:
+                self.arrays[name] = np.zeros(shape, np.float32)
+                continue
+            path = folder / f"{name}.f32"
+            expected = int(np.prod(shape)) * 4
+            mode = "r+" if path.exists() and path.stat().st_size == expected else "w+"
+            self.arrays[name] = np.memmap(path, np.float32, mode, shape=shape)
+
+    def __len__(self) -> int:
+        return self.size if self.full else self.position
+
+    def add(self, **values: np.ndarray) -> None:
+        """Append one transition of each simulation, (n, ...) a field."""
+        count = len(values["reward"])
+        rows = (self.position + np.arange(count)) % self.size
+        for name, value in values.items():
+            self.arrays[name][rows] = value
+        self.full |= self.position + count >= self.size
+        self.position = (self.position + count) % self.size
+
+    def sample(self, rng: np.random.Generator, count: int) -> dict[str, torch.Tensor]:
+        """`count` transitions drawn uniformly, float32 tensors."""
+        rows = rng.integers(0, len(self), count)
+        return {name: torch.from_numpy(np.asarray(array[rows])) for name, array in self.arrays.items()}
+
+
+class RunningNorm:
+    """Mean and variance of all observations seen (Welford, batched)."""
+
+    def __init__(self, size: int):
+        self.count, self.mean, self.m2 = 1e-4, np.zeros(size), np.ones(size) * 1e-4
+
+    def update(self, values: np.ndarray) -> None:
+        count, mean = len(values), values.mean(axis=0)
+        delta, total = mean - self.mean, self.count + count
+        self.m2 += values.var(axis=0) * count + delta**2 * self.count * count / total
+        self.mean += delta * count / total
+        self.count = total
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(self.m2 / self.count).clip(1e-2)
+
+
+class Sac:
+    """The learner: networks, optimizers, temperature; `update` does one step of all of them."""
+
+    def __init__(self, header: PolicyHeader, settings: SacSettings, seed: int):
+        torch.manual_seed(seed)
+        self.settings = settings
+        observation, action = header.observation_size, header.action_size
+        self.actor = Actor(header)
+        self.critic = CriticEnsemble(observation, action, settings.critic_hidden, settings.bfloat16)
+        self.target = CriticEnsemble(observation, action, settings.critic_hidden, settings.bfloat16)
+        self.target.load_state_dict(self.critic.state_dict())
+        self.target.requires_grad_(False)
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
+        self.target_entropy = -settings.target_entropy_scale * action
+        rate = settings.learning_rate
+        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=rate, fused=True)
+        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=rate, fused=True)
+        self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
+        self.norm = RunningNorm(observation)
+        self.updates = 0
+        self._critic_loss, self._actor_loss = self.critic_loss, self.actor_loss
+        if settings.compile:
+            self._critic_loss = torch.compile(self.critic_loss)
+            self._actor_loss = torch.compile(self.actor_loss)
+
+    def sync_norm(self) -> None:
+        """Put the running statistics into the actor, where every network reads them."""
+        self.actor.observation_mean.copy_(torch.from_numpy(self.norm.mean))
+        self.actor.observation_std.copy_(torch.from_numpy(self.norm.std))
+
+    def sample_action(self, normalized: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Reparametrized action and its log probability, (n, action), (n,)."""
+        x = normalized
+        for layer in self.actor.body:
+            if self.settings.bfloat16 and isinstance(layer, nn.Linear):
+                x = nn.functional.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
+            else:
+                x = layer(x)
+        mean, log_std = self.actor.mean(x), self.actor.log_std(x).clamp(*LOG_STD_RANGE)
+        noise = torch.randn_like(mean)
+        before = mean + log_std.exp() * noise
+        action = torch.tanh(before)
+        log_prob = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
+        log_prob = log_prob - 2 * (math.log(2) - before - nn.functional.softplus(-2 * before))
+        return action, log_prob.sum(dim=1)
+
+    def critic_loss(self, observation, action, reward, terminated, next_observation):
+        """Mean squared Bellman error of both critics, (1)."""
+        with torch.no_grad():
+            next_observation = self.actor.normalize(next_observation)
+            next_action, log_prob = self.sample_action(next_observation)
+            next_value = self.target(next_observation, next_action).min(dim=0).values
+            next_value = next_value - self.log_alpha.exp() * log_prob
+            target = reward + (1 - terminated) * self.settings.discount * next_value
+        values = self.critic(self.actor.normalize(observation), action)
+        return ((values - target) ** 2).mean(dim=1).sum()
+
+    def actor_loss(self, observation):
+        """E[alpha log pi - min Q] and the mean log probability."""
+        observation = self.actor.normalize(observation)
+        action, log_prob = self.sample_action(observation)
+        value = self.critic(observation, action).min(dim=0).values
+        return (self.log_alpha.exp().detach() * log_prob - value).mean(), log_prob.mean()
+
+    def update(self, batch: dict[str, torch.Tensor]) -> None:
+        """One gradient step."""
+        settings = self.settings
+        loss = self._critic_loss(
+            batch["observation"],
+            batch["action"],
+            batch["reward"] * settings.reward_scale,
+            batch["terminated"],
+            batch["next_observation"],
+        )
+        self.critic_optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.critic_optimizer.step()
+        self.updates += 1
+        if self.updates % settings.actor_every == 0:
+            self.critic.requires_grad_(False)
+            loss, log_prob = self._actor_loss(batch["observation"])
+            self.actor_optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            self.actor_optimizer.step()
+            self.critic.requires_grad_(True)
+            self.alpha_optimizer.zero_grad(set_to_none=True)
+            (-self.log_alpha.exp() * (log_prob.detach() + self.target_entropy)).backward()
+            self.alpha_optimizer.step()
+        torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Sampled actions for collecting, (n, observation) -> (n, action) float32."""
+        with torch.no_grad():
+            mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
+            return torch.tanh(mean + std * torch.randn_like(mean)).numpy()
+
+    def state(self) -> dict:
+        """Everything that learning continues from (tensors and plain numbers)."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "target": self.target.state_dict(),
+            "log_alpha": self.log_alpha.detach(),
+            "actor_optimizer": self.actor_optimizer.state_dict(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "alpha_optimizer": self.alpha_optimizer.state_dict(),
+            "norm": {
+                "count": self.norm.count,
+                "mean": torch.from_numpy(self.norm.mean),
+                "m2": torch.from_numpy(self.norm.m2),
+            },
+            "updates": self.updates,
+            "torch_rng": torch.get_rng_state(),
+        }
+
+    def load_state(self, state: dict) -> None:
+        """Continue from `state()`."""
+        for name in ("actor", "critic", "target", "actor_optimizer", "critic_optimizer", "alpha_optimizer"):
+            getattr(self, name).load_state_dict(state[name])
+        with torch.no_grad():
+            self.log_alpha.copy_(state["log_alpha"])
+        self.norm.count = float(state["norm"]["count"])
+        self.norm.mean, self.norm.m2 = state["norm"]["mean"].numpy().copy(), state["norm"]["m2"].numpy().copy()
+        self.updates = int(state["updates"])
+        torch.set_rng_state(state["torch_rng"])

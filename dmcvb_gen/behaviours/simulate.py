@@ -1,0 +1,180 @@
+"""Simulating episodes: task, policies and streams in; actions, rewards, states and physics out. No pixels here.
+
+An episode depends on its index alone, never on which episodes are simulated beside it: physics does not
+mix simulations, every random number comes from the episode's own streams, and the policy always sees
+tiles of `TILE` rows in which an episode has a fixed place (a matrix product may round differently at
+another batch size).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dmcvb_gen.behaviours.policy_file import Policy
+from dmcvb_gen.seeding import episode_seed, episode_stream
+from dmcvb_gen.tasks.base import Task
+
+TILE = 32
+"""Rows of every policy call. Part of the data: another value may change bits."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Episodes without their pictures; rows past an episode's end are zero.
+
+    Attributes:
+      episodes: (episode,) indices in the subset.
+      state: (episode, max_steps + 1, state) float32.
+      action: (episode, max_steps + 1, action) float32, zero in the last row.
+      reward, discount: (episode, max_steps + 1) float32, likewise.
+      physics: (episode, max_steps + 1, physics) float64.
+      length: (episode,) int32, transitions.
+      terminated: (episode,) bool, ended by the task.
+      seed: (episode,) uint64, label of the episode's streams.
+      behaviour: (episode,) int16, index of the policy.
+      goal_pair: (episode,) int16, index of the fixed start and goal, -1 where they are random.
+      seconds: time spent, by part.
+    """
+
+    episodes: np.ndarray
+    state: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    discount: np.ndarray
+    physics: np.ndarray
+    length: np.ndarray
+    terminated: np.ndarray
+    seed: np.ndarray
+    behaviour: np.ndarray
+    goal_pair: np.ndarray
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """(episode,) float64: sum of the stored rewards."""
+        return self.reward.astype(np.float64).sum(axis=1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """By the store's names."""
+        names = ("state", "action", "reward", "discount", "physics", "length", "terminated", "seed", "behaviour")
+        return {name: getattr(self, name) for name in names} | {"return": self.returns, "goal_pair": self.goal_pair}
+
+
+class TiledActor:
+    """Actions of a batch of episodes, each from its own policy, in calls of a fixed shape."""
+
+    def __init__(
+        self,
+        policies: Sequence[Policy],
+        assigned: np.ndarray,
+        episodes: np.ndarray,
+        generators: Sequence[np.random.Generator],
+        observation_size: int,
+        deterministic: bool = False,
+    ):
+        self._deterministic = deterministic
+        self._calls = []  # (policy, rows of the batch, their places in the tile, generators of the tile)
+        spare = np.random.default_rng(0)  # noise of unused rows, thrown away
+        for tile in np.unique(episodes // TILE):
+            for index in np.unique(assigned):
+                rows = np.flatnonzero((episodes // TILE == tile) & (assigned == index))
+                if not len(rows):
+                    continue
+                places = episodes[rows] % TILE
+                streams = [spare] * TILE
+                for row, place in zip(rows, places, strict=True):
+                    streams[place] = generators[row]
+                self._calls.append((policies[index], rows, places, streams))
+        self._tile = np.zeros((TILE, observation_size), np.float32)
+
+    def act(self, observations: np.ndarray, size: int, action_size: int) -> np.ndarray:
+        """(size, observation) -> (size, action) float32."""
+        actions = np.zeros((size, action_size), np.float32)
+        for policy, rows, places, streams in self._calls:
+            self._tile[:] = 0
+            self._tile[places] = observations[rows]
+            chosen = policy.act(self._tile, generators=streams, deterministic=self._deterministic)
+            actions[rows] = chosen[places]
+        return actions
+
+
+def simulate(
+    task: Task,
+    policies: Sequence[Policy],
+    episodes: Sequence[int],
+    seed: int,
+    names: tuple[str, ...],
+    *,
+    deterministic: bool = False,
+    goal_pairs: Sequence[tuple] | None = None,
+    episodes_per_goal: int | None = None,
+    threads: int = 1,
+    max_steps: int | None = None,
+) -> Simulation:
+    """Simulate episodes of a subset.
+
+    Args:
+      policies: behaviour policies; episode i takes number i modulo their count.
+      episodes: indices of the episodes.
+      seed, names: the recipe's seed and the names of the streams (see `seeding`).
+      deterministic: mean actions instead of samples.
+      goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
+      max_steps: stop earlier than the task's time limit (for estimates).
+    """
+    episodes = np.asarray(episodes, int)
+    size, limit = len(episodes), max_steps or task.max_steps
+    streams = {
+        name: [episode_stream(seed, names, int(i), name) for i in episodes] for name in ("initial_state", "policy")
+    }
+    behaviour = (episodes % len(policies)).astype(np.int16)
+    pair = np.full(size, -1, np.int16) if goal_pairs is None else (episodes // episodes_per_goal).astype(np.int16)
+    actor = TiledActor(policies, behaviour, episodes, streams["policy"], task.behaviour_size, deterministic)
+    seconds = {"physics": 0.0, "policy": 0.0}
+
+    started = time.perf_counter()
+    batch = task.batch(size, threads)
+    if goal_pairs is None:
+        state = batch.reset(streams["initial_state"])
+    else:
+        state = batch.reset_fixed(streams["initial_state"], [goal_pairs[k] for k in pair])
+    seconds["physics"] += time.perf_counter() - started
+
+    rows = task.max_steps + 1
+    out = Simulation(
+        episodes=episodes,
+        state=np.zeros((size, rows, task.state_size), np.float32),
+        action=np.zeros((size, rows, task.action_size), np.float32),
+        reward=np.zeros((size, rows), np.float32),
+        discount=np.zeros((size, rows), np.float32),
+        physics=np.zeros((size, rows, task.physics_size)),
+        length=np.full(size, limit, np.int32),
+        terminated=np.zeros(size, bool),
+        seed=np.array([episode_seed(seed, names, int(i)) for i in episodes], np.uint64),
+        behaviour=behaviour,
+        goal_pair=pair,
+        seconds=seconds,
+    )
+    columns, active = task.behaviour_indices, np.ones(size, bool)
+    for step in range(limit + 1):
+        out.state[active, step] = state[active]
+        out.physics[active, step] = batch.physics()[active]
+        active &= ~out.terminated
+        if step == limit or not active.any():
+            break
+        started = time.perf_counter()
+        actions = actor.act(state[:, columns].astype(np.float32), size, task.action_size)
+        acted = time.perf_counter()
+        result = batch.step(actions, active)
+        seconds["policy"] += acted - started
+        seconds["physics"] += time.perf_counter() - acted
+        state, ended = result.state, result.terminated
+        out.action[active, step] = actions[active]
+        out.reward[active, step] = result.reward[active]
+        out.discount[active, step] = np.where(ended[active], 0.0, 1.0)
+        out.terminated[ended] = True
+        out.length[ended] = step + 1
+    return out

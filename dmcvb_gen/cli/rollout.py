@@ -1,0 +1,326 @@
+"""rollout, info, preview, list."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from dmcvb_gen.cli.common import format_bytes, json_option, print_json
+
+
+def _out_default(name: str) -> Path:
+    return Path("releases") / name
+
+
+@click.command()
+@click.argument("tasks", nargs=-1, metavar="[TASK]...")
+@click.option("--recipe", metavar="FILE|NAME", help="A YAML recipe, or a shipped one (see `dmcvb-gen list`).")
+@click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/*/static'.")
+@click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
+@click.option("--distractor", "settings", multiple=True, help="none, static, dynamic. Repeatable.  [default: none]")
+@click.option("--difficulty", type=click.Choice(["easy", "medium", "hard"]), default="medium", show_default=True)
+@click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
+@click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
+@click.option("--episodes-per-goal", type=click.IntRange(1), default=10, show_default=True, help="With --fixed-goals.")
+@click.option("--layout", "layouts", multiple=True, help="Mazes: a layout's name or text file, instead of TASK.")
+@click.option("--episodes", type=click.IntRange(1), help="Episodes a subset.  [default: 20]")
+@click.option("--steps", type=click.IntRange(1), help="Steps a subset, instead of --episodes.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
+@click.option("--renderer", default="warp", show_default=True, help="warp or opengl.")
+@click.option("--samples", type=click.IntRange(1, 8), help="Samples a pixel and axis (warp).")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
+@click.option("--backgrounds", default="builtin", show_default=True, help="builtin, or a folder of videos.")
+@click.option("--split", type=click.Choice(["train", "val"]), default="train", help="Videos and styles: train or val.")
+@click.option("--behaviour", metavar="FILE|RUN", help="A policy file or training run, instead of the bundled one.")
+@click.option("--deterministic", is_flag=True, help="Mean actions instead of samples.")
+@click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option("--executor", type=click.Choice(["serial", "processes", "ray"]), help="Default: by --workers.")
+@click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
+@click.option("--out", type=click.Path(path_type=Path), help="The release's folder.  [default: releases/NAME]")
+@click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
+@json_option
+def rollout(tasks, recipe, only, out, workers, executor, device, dry_run, as_json, **options):
+    """Roll out behaviour policies into a release of painted episodes.
+
+    The same command goes on where it stopped: what is committed is kept.
+
+    \b
+    dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8
+    dmcvb-gen rollout walker-walk cheetah-run --level expert --level medium \\
+        --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
+    dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
+    dmcvb-gen rollout --recipe dmcvb-v1 --dry-run
+    """
+    from dmcvb_gen.rollout.estimate import estimate, raw_bytes
+    from dmcvb_gen.rollout.executors import run_jobs
+    from dmcvb_gen.rollout.plan import finish, make_plan, prepare
+    from dmcvb_gen.rollout.recipe import load_recipe
+
+    if bool(recipe) == bool(tasks or options["layouts"]):
+        raise click.UsageError("Give TASKs or --recipe (one of them); `dmcvb-gen list` shows the tasks and recipes.")
+    chosen = load_recipe(recipe) if recipe else _recipe_from_options(tasks, options)
+    out = out or _out_default(chosen.name)
+    plan = make_plan(chosen, out, only, device)
+    if dry_run:
+        return _show_plan(plan, estimate(plan), workers, as_json)
+    prepared = prepare(plan, raw_bytes(plan))
+    started, steps, seconds = time.time(), 0, {}
+    with _stop_on_sigterm(), _progress(prepared, as_json) as bar:
+        finished = 0
+        for result in run_jobs(prepared.jobs, workers, bar.update, executor):
+            finished += sum(commit.episodes[1] - commit.episodes[0] for commit in result.commits)
+            steps += result.steps
+            for part, value in result.seconds.items():
+                seconds[part] = seconds.get(part, 0.0) + value
+            bar.set_postfix_str(f"{finished}/{prepared.episodes} episodes", refresh=False)
+    manifest = finish(prepared)
+    elapsed = time.time() - started
+    if as_json:
+        print_json(
+            dict(
+                out=str(out),
+                complete=manifest.complete,
+                steps=steps,
+                seconds=round(elapsed, 2),
+                seconds_by_part={part: round(value, 2) for part, value in seconds.items()},
+                already_done=prepared.done,
+                digests={subset.name: subset.digest for subset in manifest.subsets},
+            )
+        )
+        return
+    state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
+    kept = f", {prepared.done} shards were there already" if prepared.done else ""
+    rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
+    click.echo(f"{out}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
+    click.echo(f"Look at it: dmcvb-gen info {out}; dmcvb-gen preview {out}")
+
+
+def _recipe_from_options(tasks, options):
+    from dmcvb_gen.distractors.base import DistractorSetting
+    from dmcvb_gen.rollout.plan import single_recipe
+    from dmcvb_gen.rollout.recipe import is_maze
+
+    tasks = (*tasks, *(_layout_task(layout) for layout in options["layouts"]))
+    levels = options["levels"] or ("random",)
+    mazes = [task for task in tasks if is_maze(task)]
+    if mazes and len(mazes) < len(tasks):
+        raise click.UsageError("Mazes and locomotion tasks take different settings; roll them out by a --recipe.")
+    if mazes:
+        if options["settings"]:
+            raise click.UsageError("Mazes vary in style, not by --distractor; use --goal visible|hidden.")
+        settings = ("fixed",) if options["fixed_goals"] else options["goals"] or None
+    else:
+        if options["goals"] or options["fixed_goals"]:
+            raise click.UsageError("--goal and --fixed-goals are for ant-maze tasks.")
+        difficulty = options["difficulty"]
+        settings = [
+            name if "_" in name else DistractorSetting(name, difficulty).name
+            for name in options["settings"] or ("none",)
+        ]
+    episodes = options["episodes"] or (None if options["steps"] else 20)
+    name = "-".join(dict.fromkeys([*(Path(task).stem for task in tasks), *levels]))
+    return single_recipe(
+        tasks,
+        levels,
+        settings,
+        name=name[:80].rstrip("-."),
+        episodes=episodes,
+        steps=options["steps"],
+        episodes_per_shard=options["episodes_per_shard"],
+        behaviour=options["behaviour"] and str(Path(options["behaviour"]).resolve()),
+        deterministic=options["deterministic"],
+        fixed_goals=options["fixed_goals"],
+        episodes_per_goal=options["episodes_per_goal"],
+        seed=options["seed"],
+        size=options["size"],
+        renderer={"backend": options["renderer"], "samples": options["samples"]},
+        trajectories="independent" if options["independent"] else "shared",
+        backgrounds=_background_source(options["backgrounds"]),
+        split=options["split"],
+    )
+
+
+def _background_source(given: str) -> str:
+    return given if given == "builtin" else str(Path(given).resolve())
+
+
+def _layout_task(layout: str) -> str:
+    return f"ant-maze:{layout}" if Path(layout).suffix or Path(layout).exists() else f"ant-maze-{layout}"
+
+
+def _progress(plan, as_json):
+    return tqdm(
+        total=plan.steps + plan.episodes,  # an episode has a frame more than it has steps
+        unit=" frames",
+        unit_scale=True,
+        desc=plan.manifest.name,
+        disable=as_json or None,
+        smoothing=0.1,
+    )
+
+
+class _stop_on_sigterm:
+    """SIGTERM ends a rollout as Ctrl-C does: workers stop, what is committed stays."""
+
+    def __enter__(self):
+        self._before = signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+
+    def __exit__(self, kind, *_):
+        signal.signal(signal.SIGTERM, self._before)
+        if kind is KeyboardInterrupt:
+            click.echo("\nstopped; what was committed is safe, the same command goes on from there", err=True)
+        return False
+
+
+def _show_plan(plan, cost, workers, as_json):
+    import os
+
+    cores = os.cpu_count() or 1
+    if as_json:
+        rates = {
+            name: dict(steps_per_second=1 / rate.seconds_per_step, bytes_per_step=rate.bytes_per_step)
+            for name, rate in cost.rates.items()
+        }
+        print_json(
+            dict(
+                jobs=cost.jobs,
+                shards_done=cost.done,
+                subsets=len(plan.manifest.subsets),
+                episodes=cost.episodes,
+                steps=cost.steps,
+                bytes=round(cost.bytes),
+                core_hours=cost.core_seconds / 3600,
+                hours=cost.seconds(workers) / 3600,
+                workers=workers,
+                rates=rates,
+            )
+        )
+        return
+    table = Table(title=f"{plan.manifest.name} {plan.manifest.version} -> {plan.root}")
+    for column in ("subset", "episodes", "steps", "bytes", "core-hours"):
+        table.add_column(column, justify="left" if column == "subset" else "right")
+    rows: dict[str, list[float]] = {}
+    for job in plan.jobs:
+        for record in job.subsets:
+            rate = cost.rates[f"{record.task}/{record.setting}"]
+            steps = job.frames // len(job.subsets)
+            row = rows.setdefault(record.name, [0, 0, 0.0, 0.0])
+            row[0] += len(job.episodes)
+            row[1] += steps
+            row[2] += steps * rate.bytes_per_step
+            row[3] += steps * rate.seconds_per_step / 3600
+    for name, (episodes, steps, size, hours) in rows.items():
+        table.add_row(name, f"{episodes:,}", f"{steps:,}", format_bytes(size), f"{hours:.2f}")
+    console = Console()
+    console.print(table)
+    console.print(
+        f"{cost.jobs} jobs to do, {cost.done} shards done; {cost.steps:,} steps, {format_bytes(cost.bytes)}, "
+        f"{cost.core_seconds / 3600:.2f} core-hours: {_duration(cost.seconds(workers))} with --workers {workers}, "
+        f"{_duration(cost.seconds(cores))} with the {cores} cores here, {_duration(cost.seconds(64))} with 64."
+    )
+
+
+def _duration(seconds: float) -> str:
+    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172800, "h", 3600)):
+        if seconds < limit:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400:.1f} days"
+
+
+@click.command()
+@click.argument("path")
+@json_option
+def info(path, as_json):
+    """Show what a release holds: subsets, episodes, bytes, returns beside the paper's.
+
+    \b
+    dmcvb-gen info releases/demo
+    """
+    from dmcvb_gen.rollout.info import describe_release
+
+    facts = describe_release(path)
+    if as_json:
+        return print_json(facts)
+    table = Table(title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"))
+    columns = ("subset", "episodes", "steps", "size", "B/step", "mean", "std", "min", "p25", "median", "p75", "max")
+    for column in columns:
+        table.add_column(column, justify="left" if column == "subset" else "right", no_wrap=True)
+    for subset in facts["subsets"]:
+        values = subset["returns"]
+        table.add_row(
+            subset["name"],
+            f"{subset['episodes']:,}" + ("" if subset["complete"] else f"/{subset['episodes_planned']:,}"),
+            f"{subset['steps']:,}",
+            format_bytes(subset["bytes"]),
+            f"{subset['bytes_per_step']:,.0f}",
+            *(f"{values[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max")),
+        )
+        paper = subset["paper"]
+        if paper:
+            numbers = (f"{paper[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max"))
+            table.add_row("  DMC-VB paper", "", f"{paper['steps']:,}", "", "", *numbers, style="dim")
+    console = Console()
+    console.print(table)
+    console.print(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
+
+
+@click.command()
+@click.argument("path")
+@click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the files.  [default: PATH/preview]")
+@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes of each subset.")
+@click.option("--scale", type=click.IntRange(1, 8), default=2, show_default=True, help="Enlarge the pictures.")
+@click.option("--gif", is_flag=True, help="Write a gif instead of an mp4.")
+@json_option
+def preview(path, only, out, episodes, scale, gif, as_json):
+    """Write a contact sheet (PNG) and a video of what is in a release.
+
+    \b
+    dmcvb-gen preview releases/demo
+    """
+    from dmcvb_gen.rollout.preview import write_preview
+
+    files = write_preview(path, out, only=only, episodes=episodes, scale=scale, gif=gif)
+    if as_json:
+        return print_json([str(file) for file in files])
+    for file in files:
+        click.echo(file)
+
+
+@click.command("list")
+@json_option
+def list_command(as_json):
+    """List tasks, levels, distractors, bundled behaviours, recipes and the renderers usable here."""
+    from dmcvb_gen.rollout.info import describe_package
+
+    facts = describe_package()
+    if as_json:
+        return print_json(facts)
+    console = Console()
+    table = Table(title="tasks")
+    for column in ("task", "state", "action", "steps", "views", "bundled behaviours"):
+        table.add_column(column)
+    for task in facts["tasks"]:
+        table.add_row(
+            task["id"],
+            str(task["state"]),
+            str(task["action"]),
+            str(task["max_steps"]),
+            ", ".join(task["views"]),
+            ", ".join(task["behaviours"]) or "-",
+        )
+    console.print(table)
+    console.print(f"levels: {', '.join(facts['levels'])}")
+    console.print(f"distractors: {', '.join(facts['distractors'])} (difficulty {', '.join(facts['difficulties'])})")
+    console.print(f"maze goals: {', '.join(facts['maze_settings'])}")
+    console.print(f"recipes: {', '.join(facts['recipes'])}")
+    for name, reason in facts["renderers"].items():
+        console.print(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")

@@ -1,0 +1,290 @@
+"""A recipe: checked YAML in, the list of subsets that it asks for out.
+
+::
+
+    name: my-release            # the release's name and version, for its card
+    version: 1.0.0
+    seed: 0
+    size: 64                    # pixels a side
+    subsets:                    # every task x level x setting of each entry
+      - tasks: [walker-walk, cheetah-run]
+        levels: [expert, medium]
+        settings: [none, static, dynamic]
+        episodes: 20
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+import yaml
+
+from dmcvb_gen.distractors.base import DistractorSetting
+from dmcvb_gen.errors import DmcvbError, RecipeError, UnknownNameError
+from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
+from dmcvb_gen.tasks import get_task, task_ids
+from dmcvb_gen.tasks.base import Task
+
+LEVELS = ("expert", "medium", "mixed", "random")
+MAZE_SETTINGS = ("visible", "hidden", "fixed")
+DEFAULT_EPISODES_PER_SHARD = {"locomotion": 50, "maze": 10}
+"""Episodes a shard: what a worker holds in memory and what a crash can cost."""
+
+
+class _Model(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+def _as_tuple(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Names = Annotated[tuple[str, ...], pydantic.BeforeValidator(_as_tuple), pydantic.Field(min_length=1)]
+
+
+class RendererChoice(_Model):
+    """Which renderer paints: backend "warp" or "opengl"; samples a pixel and axis (None: the task's default)."""
+
+    backend: str = "warp"
+    samples: int | None = pydantic.Field(default=None, ge=1, le=8)
+
+
+class SubsetPattern(_Model):
+    """Subsets that share everything but their names: all tasks x levels x settings.
+
+    Attributes:
+      settings: distractors for locomotion ("none", "static", "dynamic_hard", ...), goal settings for mazes
+        ("visible", "hidden", "fixed").
+      episodes, steps: how much of each subset; give one. Steps are for tasks of fixed length.
+      policies: level -> policy file or run folder, where not the bundled ones.
+      deterministic: take the policy's mean action instead of a sample.
+      fixed_goals, episodes_per_goal: for the setting "fixed" (benchmark B3).
+    """
+
+    tasks: Names
+    levels: Names
+    settings: Names
+    episodes: int | None = pydantic.Field(default=None, gt=0)
+    steps: int | None = pydantic.Field(default=None, gt=0)
+    episodes_per_shard: int | None = pydantic.Field(default=None, gt=0, le=1000)
+    policies: dict[str, str] = {}
+    deterministic: bool = False
+    fixed_goals: int = pydantic.Field(default=5, gt=0)
+    episodes_per_goal: int = pydantic.Field(default=10, gt=0)
+
+
+class Recipe(_Model):
+    """What a release is made from.
+
+    Attributes:
+      seed: of every random stream.
+      size: pixels a side.
+      trajectories: "shared": the settings of a task and level show the same episodes; "independent": each its own.
+      backgrounds: "builtin" or a folder of videos.
+      split: which videos (and maze styles): "train" for data, "val" for evaluation.
+    """
+
+    name: str = pydantic.Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    version: str = pydantic.Field(default="1.0.0", pattern=r"^\d+\.\d+\.\d+$")
+    description: str = ""
+    license: str = "CC-BY-4.0"
+    authors: tuple[str, ...] = ()
+    seed: int = pydantic.Field(default=0, ge=0)
+    size: int = 64
+    renderer: RendererChoice = RendererChoice()
+    trajectories: Literal["shared", "independent"] = "shared"
+    backgrounds: str = "builtin"
+    split: Literal["train", "val"] = "train"
+    subsets: tuple[SubsetPattern, ...] = pydantic.Field(min_length=1)
+
+
+class SubsetRequest(_Model):
+    """One subset of a recipe, names checked.
+
+    Attributes:
+      name: "<task>/<level>/<setting>".
+      policy: where its policy comes from, None for the bundled ones (or random).
+    """
+
+    name: str
+    task: str
+    level: str
+    setting: str
+    episodes: int
+    episodes_per_shard: int
+    policy: str | None = None
+    deterministic: bool = False
+    episodes_per_goal: int | None = None
+
+
+def is_maze(task: str) -> bool:
+    return task.startswith("ant-maze")
+
+
+def normalize_setting(task: str, setting: str) -> str:
+    """The setting's canonical name ("dynamic_medium" -> "dynamic").
+
+    Raises:
+      UnknownNameError: the task has no such setting.
+    """
+    if is_maze(task):
+        if setting not in MAZE_SETTINGS:
+            raise UnknownNameError(f"goal setting of {task}", setting, MAZE_SETTINGS)
+        return setting
+    return DistractorSetting.parse(setting).name
+
+
+def distractor_of(task: str, setting: str) -> DistractorSetting:
+    """The distractors of a subset's setting; mazes have none but their styles."""
+    return DistractorSetting() if is_maze(task) else DistractorSetting.parse(setting)
+
+
+def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
+    """All subsets that a recipe asks for, in its order.
+
+    Raises:
+      RecipeError, UnknownNameError: a name, a size or a count that makes no sense.
+    """
+    check_size(recipe.size)
+    requests: dict[str, SubsetRequest] = {}
+    for pattern in recipe.subsets:
+        for task_id in pattern.tasks:
+            task = get_task(task_id)
+            for level in pattern.levels:
+                if level not in LEVELS:
+                    raise UnknownNameError("level", level, LEVELS)
+                for given in pattern.settings:
+                    setting = normalize_setting(task_id, given)
+                    name = f"{_folder(task_id)}/{level}/{setting}"
+                    if name in requests:
+                        raise RecipeError(f"recipe {recipe.name!r} asks for {name} twice; keep one of the entries")
+                    requests[name] = _request(pattern, task, name, level, setting)
+    unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
+    if unused:
+        raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
+    return tuple(requests.values())
+
+
+def _folder(task_id: str) -> str:
+    """A task id as a folder name (a layout given by its file is named after the file)."""
+    return re.sub(
+        r"[^A-Za-z0-9_.-]",
+        "-",
+        Path(task_id).stem if ":" not in task_id else task_id.split(":")[0] + "-" + Path(task_id).stem,
+    )
+
+
+def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting: str) -> SubsetRequest:
+    maze = is_maze(task.id)
+    per_goal = None
+    if setting == "fixed":
+        episodes, per_goal = pattern.fixed_goals * pattern.episodes_per_goal, pattern.episodes_per_goal
+    elif pattern.episodes is not None and pattern.steps is not None:
+        raise RecipeError(f"{name}: give episodes or steps, not both")
+    elif pattern.episodes is not None:
+        episodes = pattern.episodes
+    elif pattern.steps is None:
+        raise RecipeError(f"{name}: say how much: episodes: N (or steps: N)")
+    elif maze:
+        raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
+    else:
+        episodes = -(-pattern.steps // task.max_steps)
+    shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD["maze" if maze else "locomotion"]
+    return SubsetRequest(
+        name=name,
+        task=task.id,
+        level=level,
+        setting=setting,
+        episodes=episodes,
+        episodes_per_shard=min(shard, episodes),
+        policy=pattern.policies.get(level),
+        deterministic=pattern.deterministic,
+        episodes_per_goal=per_goal,
+    )
+
+
+def check_size(size: int) -> None:
+    """Raises RecipeError for a picture size that no renderer takes."""
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise RecipeError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)")
+
+
+def matches(name: str, patterns: tuple[str, ...] | list[str]) -> bool:
+    """Whether a subset's name fits one of the patterns: "walker-walk/*/static", "walker-walk/expert", "*"."""
+    return any(
+        fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(name, f"{pattern.rstrip('/')}/*")
+        for pattern in patterns
+    )
+
+
+def select(names: list[str], patterns: tuple[str, ...] | list[str]) -> list[str]:
+    """The names that fit the patterns (all of them when there are no patterns).
+
+    Raises:
+      UnknownNameError: a pattern that fits nothing.
+    """
+    for pattern in patterns:
+        if not any(matches(name, [pattern]) for name in names):
+            raise UnknownNameError("subset pattern", pattern, names)
+    return [name for name in names if not patterns or matches(name, patterns)]
+
+
+def shipped_recipes() -> tuple[str, ...]:
+    """Names of the recipes in the package."""
+    folder = resources.files("dmcvb_gen.rollout") / "data" / "recipes"
+    return tuple(sorted(path.name.removesuffix(".yaml") for path in folder.iterdir() if path.name.endswith(".yaml")))
+
+
+def load_recipe(source: str | Path) -> Recipe:
+    """A recipe from a YAML file, or a shipped one by its name.
+
+    Raises:
+      RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
+    """
+    path = Path(source)
+    if not path.exists() and str(source) in shipped_recipes():
+        text = (resources.files("dmcvb_gen.rollout") / "data" / "recipes" / f"{source}.yaml").read_text()
+    else:
+        try:
+            text = path.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise RecipeError(
+                f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of {', '.join(shipped_recipes())}"
+            ) from None
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise RecipeError(f"{source} is not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise RecipeError(f"{source} holds no mapping of recipe fields; see `dmcvb-gen rollout --help`")
+    return make_recipe(data, str(source))
+
+
+def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
+    """A recipe from plain values.
+
+    Raises:
+      RecipeError: a field is unknown or wrong.
+    """
+    try:
+        return Recipe.model_validate(data)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the top"
+        raise RecipeError(f"{where}: {place}: {first['msg']}") from None
+
+
+def check_tasks(tasks: tuple[str, ...]) -> None:
+    """Raises UnknownNameError for the first unknown task."""
+    for task in tasks:
+        try:
+            get_task(task)
+        except DmcvbError:
+            raise
+        except KeyError:
+            raise UnknownNameError("task", task, task_ids()) from None
