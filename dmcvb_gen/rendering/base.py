@@ -50,7 +50,7 @@ class Renderer(abc.ABC):
     def describe(self) -> dict[str, Any]:
         """Name, version and every setting that decides a pixel, for the manifest."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  (a renderer may hold nothing)
         """Free what the renderer holds; it cannot be used afterwards."""
 
 

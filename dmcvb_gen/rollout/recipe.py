@@ -254,7 +254,8 @@ def load_recipe(source: str | Path) -> Recipe:
             text = path.read_text()
         except (OSError, UnicodeDecodeError) as error:
             raise RecipeError(
-                f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of {', '.join(shipped_recipes())}"
+                f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of the shipped: "
+                + ", ".join(shipped_recipes())
             ) from None
     try:
         data = yaml.safe_load(text)

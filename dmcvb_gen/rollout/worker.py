@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.behaviours.simulate import Simulation, simulate
 from dmcvb_gen.distractors import make_exogenous
 from dmcvb_gen.distractors.base import Exogenous
 from dmcvb_gen.rendering.base import Renderer
-from dmcvb_gen.rollout.plan import FIXED_GOAL_STREAM, Job, load_policies, renderer_for
+from dmcvb_gen.rollout.plan import Job, load_policies, renderer_for
 from dmcvb_gen.rollout.recipe import distractor_of
-from dmcvb_gen.behaviours.simulate import Simulation, simulate
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord
 from dmcvb_gen.store.schema import pixel_array_names

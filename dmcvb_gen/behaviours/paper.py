@@ -1,0 +1,35 @@
+"""The paper's table of episode returns: task and level in, its row out."""
+
+from __future__ import annotations
+
+import csv
+import functools
+from importlib import resources
+
+MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "medium": "ant-maze/multi-obstacle"}
+"""Layout's difficulty -> the paper's row, which pools the layouts of a difficulty."""
+
+
+@functools.cache
+def _table() -> dict[tuple[str, str], dict[str, float]]:
+    path = resources.files("dmcvb_gen.behaviours") / "data" / "paper_episode_returns.csv"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return {
+        (row.pop("task"), row.pop("level")): {name: float(value) for name, value in row.items()}
+        for row in csv.DictReader(lines)
+    }
+
+
+def paper_task(task_id: str) -> str:
+    """The name of a task's row: mazes are pooled by difficulty."""
+    layout = task_id.removeprefix("ant-maze-")
+    for difficulty, row in MAZE_GROUPS.items():
+        if task_id != layout and layout.startswith(difficulty):
+            return row
+    return task_id
+
+
+def paper_returns(task_id: str, level: str) -> dict[str, float] | None:
+    """Steps, mean, std, min, p25, median, p75, max of the episode returns that the paper reports; None without a row."""
+    row = _table().get((paper_task(task_id), level))
+    return dict(row) if row else None

@@ -1,0 +1,135 @@
+"""A look at a release: episodes in, a contact sheet (PNG) and a video out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.rollout.recipe import select
+from dmcvb_gen.store import Subset, open_release
+
+SHEET_COLUMNS = 10
+"""Frames of an episode on the contact sheet, evenly spaced."""
+VIDEO_SECONDS = 8.0
+LABEL_HEIGHT = 14
+
+
+def _enlarge(frames: np.ndarray, scale: int) -> np.ndarray:
+    """(..., height, width, 3) nearest-neighbor enlargement."""
+    return frames.repeat(scale, axis=-3).repeat(scale, axis=-2)
+
+
+def _label(text: str, width: int) -> np.ndarray:
+    """(LABEL_HEIGHT, width, 3): a caption."""
+    picture = Image.new("RGB", (width, LABEL_HEIGHT), (255, 255, 255))
+    ImageDraw.Draw(picture).text((2, 1), text, fill=(0, 0, 0))
+    return np.asarray(picture)
+
+
+def _views(subset: Subset) -> list[str]:
+    """Picture arrays to show: all visible views, and the hidden ones where the release is about those."""
+    visible = [name for name in subset.pixel_arrays if not name.startswith("pixels_hidden_goal")]
+    hidden = [name for name in subset.pixel_arrays if name.startswith("pixels_hidden_goal")]
+    return hidden if hidden and subset.setting in ("hidden", "fixed") else visible
+
+
+def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
+    """Evenly spaced frames of one episode side by side, a row a view, under a caption; (h, w, 3) uint8."""
+    length = int(subset.read("length", [episode])[0])
+    steps = np.linspace(0, length, columns).round().astype(int)
+    rows = []
+    for name in _views(subset):
+        frames = subset.episode(episode, [name, "length"])[name][steps]
+        rows.append(np.concatenate(list(_enlarge(frames, scale)), axis=1))
+    picture = np.concatenate(rows)
+    value = float(subset.read("return", [episode])[0])
+    caption = f"{subset.name}  episode {episode}  {length} steps  return {value:.1f}"
+    return np.concatenate([_label(caption, picture.shape[1]), picture])
+
+
+def contact_sheet(
+    subsets: Sequence[Subset], episodes: int = 4, columns: int = SHEET_COLUMNS, scale: int = 2
+) -> np.ndarray:
+    """Strips of the first episodes of each subset under each other; (height, width, 3) uint8."""
+    strips = [
+        episode_strip(subset, int(episode), columns, scale)
+        for subset in subsets
+        for episode in subset.episodes[:episodes]
+    ]
+    width = max(strip.shape[1] for strip in strips)
+    strips = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]
+    return np.concatenate(strips)
+
+
+def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = 200) -> np.ndarray:
+    """The first episode of every subset side by side; (frame, height, width, 3) uint8."""
+    columns = []
+    for subset in subsets:
+        episode = int(subset.episodes[0])
+        values = subset.episode(episode)
+        views = [values[name] for name in _views(subset)]
+        steps = np.minimum(np.arange(frames), len(views[0]) - 1)
+        picture = np.concatenate([_enlarge(view[steps], scale) for view in views], axis=1)
+        label = _label(subset.name, picture.shape[2])
+        columns.append(np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1))
+    per_row = max(1, int(np.ceil(np.sqrt(len(columns) * 1.5))))
+    height = max(column.shape[1] for column in columns)
+    width = max(column.shape[2] for column in columns)
+    columns = [
+        np.pad(c, ((0, 0), (0, height - c.shape[1]), (0, width - c.shape[2]), (0, 0)), constant_values=255)
+        for c in columns
+    ]
+    while len(columns) % per_row:
+        columns.append(np.full_like(columns[0], 255))
+    rows = [np.concatenate(columns[i : i + per_row], axis=2) for i in range(0, len(columns), per_row)]
+    return np.concatenate(rows, axis=1)
+
+
+def write_preview(
+    path: str | Path,
+    out: str | Path | None = None,
+    *,
+    only: Sequence[str] = (),
+    episodes: int = 4,
+    scale: int = 2,
+    gif: bool = False,
+) -> list[Path]:
+    """Write contact_sheet.png and preview.mp4 (or .gif) of a release.
+
+    Args:
+      out: folder of the files; `<release>/preview` by default.
+      only: subset patterns.
+      episodes: of each subset on the sheet.
+
+    Returns:
+      The files.
+
+    Raises:
+      StoreError: the release has no episodes yet, or the folder cannot be written.
+    """
+    import imageio.v3 as iio
+
+    release = open_release(path)
+    names = select(list(release.subsets), list(only)) if release.subsets else []
+    subsets = [release.subsets[name] for name in names if len(_views(release.subsets[name]))]
+    if not subsets:
+        raise StoreError(f"{path} has no committed episodes with pictures yet; run the rollout first")
+    folder = Path(out) if out else release.path / "preview"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        sheet = folder / "contact_sheet.png"
+        Image.fromarray(contact_sheet(subsets, episodes, scale=scale)).save(sheet)
+        frames = video_frames(subsets, scale)
+        video = folder / ("preview.gif" if gif else "preview.mp4")
+        if gif:
+            iio.imwrite(video, frames, duration=1000 / 20, loop=0)
+        else:
+            frames = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)))
+            iio.imwrite(video, frames, plugin="FFMPEG", fps=20, macro_block_size=2, quality=8)
+    except OSError as error:
+        raise StoreError(f"cannot write to {folder}: {error.strerror or error}; give another --out") from None
+    return [sheet, video]
