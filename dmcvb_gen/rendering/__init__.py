@@ -1,1 +1,62 @@
+"""Rendering: `make_renderer("warp", task, 64)` gives a renderer; physics states and labels become pictures."""
 
+from __future__ import annotations
+
+from typing import Any
+
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.rendering.base import Renderer, floor_alpha_for
+from dmcvb_gen.rendering.cameras import centers_of_mass, nominal_cameras
+from dmcvb_gen.tasks.base import Task
+
+RENDERERS = ("warp", "opengl")
+
+
+def make_renderer(
+    name: str,
+    task: Task,
+    size: int,
+    *,
+    backgrounds=None,
+    floor_alpha: float = 1.0,
+    device: str = "cpu",
+    samples: int | None = None,
+) -> Renderer:
+    """A renderer by its name.
+
+    Args:
+      size: pixels a side.
+      backgrounds: the videos that labels may name (`load_backgrounds`).
+      floor_alpha: opacity of the ground plane (`floor_alpha_for`).
+      device: "cpu" or "cuda" (warp).
+      samples: samples a pixel and axis (warp), multisampling (opengl); None: the default.
+
+    Raises:
+      UnknownNameError, RenderingError: no such renderer, or it cannot start here.
+    """
+    if name == "warp":
+        from dmcvb_gen.rendering.warp import WarpRenderer as chosen
+    elif name == "opengl":
+        from dmcvb_gen.rendering.opengl import OpenglRenderer as chosen
+    else:
+        raise UnknownNameError("renderer", name, RENDERERS)
+    return chosen(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha, device=device, samples=samples)
+
+
+def available_renderers() -> dict[str, str | None]:
+    """Renderer -> None if it can start here, else why not and what to do."""
+    from dmcvb_gen.rendering import opengl
+
+    facts: dict[str, Any] = {"warp": None, "opengl": opengl.unavailable()}
+    return facts
+
+
+__all__ = [
+    "RENDERERS",
+    "Renderer",
+    "available_renderers",
+    "centers_of_mass",
+    "floor_alpha_for",
+    "make_renderer",
+    "nominal_cameras",
+]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.distractors.base import DistractorSetting, Exogenous
+from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.tasks.base import Task
 
 MIN_SIZE, MAX_SIZE = 8, 1024
@@ -62,3 +63,19 @@ def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
     if setting.kind == "none" or task.id in ("walker-walk", "cheetah-run"):
         return 1.0
     return 0.3
+
+
+def check_size(size: int) -> None:
+    """Raises RenderingError for a size that no renderer takes."""
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise RenderingError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side")
+
+
+def check_frames(task: Task, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None) -> list[int]:
+    """Indices of the asked views; raises where frames and labels do not belong together."""
+    if physics.ndim != 2 or physics.shape[1] != task.physics_size or len(physics) != len(exogenous):
+        raise ValueError(f"physics {physics.shape} and {len(exogenous)} labels are not frames of {task.id}")
+    for view in views or ():
+        if view not in task.views:
+            raise UnknownNameError(f"view of {task.id}", view, task.views)
+    return [task.views.index(view) for view in views or task.views]

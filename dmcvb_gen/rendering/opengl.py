@@ -1,0 +1,215 @@
+"""The reference renderer: MuJoCo's own OpenGL through EGL; frames in, pictures as dm_control's out.
+
+Against the usual wrapper it takes what costs no pixel: an off-screen buffer of the picture's own size,
+one render an agent step, kinematics without a physics step.
+"""
+
+from __future__ import annotations
+
+import copy
+import ctypes.util
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+from typing import Any
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from dmcvb_gen.distractors.base import Exogenous
+from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
+from dmcvb_gen.rendering.cameras import camera_ids, matrices
+from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
+
+SKY_WIDTH = 800
+"""Texels a side of a background on the sky (the skybox's own width)."""
+_PROBE = "from mujoco.egl import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
+
+
+@functools.cache
+def unavailable() -> str | None:
+    """Why EGL cannot start here (and the cure), or None. Tried in a process of its own: a failure can abort."""
+    if ctypes.util.find_library("EGL") is None:
+        return "libEGL is missing; install it (Debian: apt-get install libegl1 libgl1) or use --renderer warp"
+    run = subprocess.run(
+        [sys.executable, "-c", _PROBE],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYOPENGL_PLATFORM": "egl", "MUJOCO_GL": "egl"},
+    )
+    if run.returncode:
+        last = (run.stderr.strip().splitlines() or ["no message"])[-1]
+        return f"EGL does not start ({last}); install libegl1 and libgl1 (Debian) or use --renderer warp"
+    return None
+
+
+class OpenglRenderer(Renderer):
+    """See the module and `Renderer`."""
+
+    name = "opengl"
+
+    def __init__(
+        self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
+    ):
+        check_size(size)
+        reason = unavailable()
+        if reason:
+            raise RenderingError(f"renderer 'opengl' cannot start here: {reason}")
+        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+        from mujoco.egl import GLContext
+
+        self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
+        self._backgrounds = backgrounds
+        self._model = copy.deepcopy(task.model)  # materials and textures change frame by frame
+        self._model.vis.global_.offwidth = self._model.vis.global_.offheight = size
+        self._model.vis.quality.offsamples = 4 if samples is None else samples
+        self._samples = int(self._model.vis.quality.offsamples)
+        skies = np.flatnonzero(self._model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+        self._sky = int(skies[0]) if len(skies) else -1
+        self._own_sky = None
+        if self._sky >= 0:
+            address = int(self._model.tex_adr[self._sky])
+            height, width = int(self._model.tex_height[self._sky]), int(self._model.tex_width[self._sky])
+            self._sky_range = slice(address, address + height * width * int(self._model.tex_nchannel[self._sky]))
+            self._own_sky = (height, self._model.tex_data[self._sky_range].copy())
+        self._floors = np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+        for geom in self._floors:
+            material = self._model.geom_matid[geom]
+            if self.floor_alpha < 1 and material >= 0:
+                self._model.mat_rgba[material, 3] = self.floor_alpha
+        self._data = mujoco.MjData(self._model)
+        self._gl = GLContext(size, size)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=1000)
+        self._option = mujoco.MjvOption()
+        self._perturb = mujoco.MjvPerturb()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._shown: tuple[int, int] = (-1, -1)
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "samples": self._samples,
+            "floor_alpha": self.floor_alpha,
+            "mujoco": metadata.version("mujoco"),
+        }
+
+    def render(
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
+    ) -> np.ndarray:
+        indices = check_frames(self.task, physics, exogenous, views)
+        out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
+        self._gl.make_current()
+        rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
+        # Frames with the same background follow each other: a texture is uploaded once.
+        order = np.lexsort((exogenous.background_frame, exogenous.background_video))
+        for frame in order:
+            self._pose(physics[frame], exogenous, frame, hide_goal)
+            for column, view in enumerate(indices):
+                out[frame, column] = self._shoot(view, exogenous.camera_position[frame], rotations[frame])
+        return out
+
+    def render_labels(
+        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
+        indices = check_frames(self.task, physics, exogenous, views)
+        shape = (len(physics), len(indices), self.size, self.size)
+        depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
+        self._gl.make_current()
+        rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
+        near = self._model.vis.map.znear * self._model.stat.extent
+        far = self._model.vis.map.zfar * self._model.stat.extent
+        for frame in range(len(physics)):
+            self._pose(physics[frame], exogenous, frame, False)
+            for column, view in enumerate(indices):
+                raw = np.empty((self.size, self.size), np.float32)
+                self._shoot(view, exogenous.camera_position[frame], rotations[frame], depth=raw)
+                meters = near * far / (far - raw[::-1].astype(np.float64) * (far - near))
+                depth[frame, column] = np.where(raw[::-1] >= 1, 0, meters)
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+                colors = self._shoot(view, exogenous.camera_position[frame], rotations[frame]).astype(np.int32)
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 0
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
+                ids = colors[..., 0] + colors[..., 1] * 256 + colors[..., 2] * 65536
+                table = np.full(self._scene.ngeom + 2, -1, np.int16)
+                for geom in self._scene.geoms[: self._scene.ngeom]:
+                    if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
+                        table[geom.segid + 1] = geom.objid
+                segmentation[frame, column] = table[np.minimum(ids, len(table) - 1)]
+        return {"depth": depth, "segmentation": segmentation}
+
+    def _pose(self, physics, exogenous, frame, hide_goal):
+        model, data = self._model, self._data
+        mujoco.mj_setState(model, data, np.asarray(physics, np.float64), PHYSICS_SPEC)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        model.mat_rgba[:, :3] = exogenous.material_rgb[frame]
+        style = int(exogenous.style[frame])
+        materials = self.task.style_geom_matid(style) if style >= 0 else None
+        model.geom_matid[:] = self.task.model.geom_matid if materials is None else materials
+        model.geom_rgba[:] = self.task.model.geom_rgba
+        if hide_goal:
+            model.geom_rgba[list(self.task.goal_geoms)] = 0
+        self._show_background(int(exogenous.background_video[frame]), int(exogenous.background_frame[frame]))
+
+    def _show_background(self, video: int, frame: int) -> None:
+        """Put a video frame on the sky: a square texture, which MuJoCo repeats on the six faces."""
+        if self._sky < 0 or (video, frame) == self._shown:
+            return
+        if video < 0:
+            height, pixels = self._own_sky
+            self._model.tex_height[self._sky] = height
+            self._model.tex_data[self._sky_range] = pixels
+        else:
+            if self._backgrounds is None:
+                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
+            width = int(self._model.tex_width[self._sky])
+            picture = Image.fromarray(self._backgrounds.frames(video)[frame])
+            picture = np.asarray(picture.resize((width, width), Image.Resampling.BILINEAR))
+            self._model.tex_height[self._sky] = width
+            start = self._sky_range.start
+            self._model.tex_data[start : start + picture.size] = picture.ravel()
+        mujoco.mjr_uploadTexture(self._model, self._context, self._sky)
+        self._shown = (video, frame)
+
+    def _shoot(self, view, positions, rotations, depth=None) -> np.ndarray:
+        camera = camera_ids(self.task)[view]
+        self._data.cam_xpos[camera] = positions[view]
+        self._data.cam_xmat[camera] = rotations[view].ravel()
+        self._camera.fixedcamid = camera
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            self._option,
+            self._perturb,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        rectangle = mujoco.MjrRect(0, 0, self.size, self.size)
+        mujoco.mjr_render(rectangle, self._scene, self._context)
+        picture = np.empty((self.size, self.size, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, depth, rectangle, self._context)
+        return picture[::-1]
+
+    def close(self) -> None:
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None

@@ -1,0 +1,274 @@
+"""The default renderer: MuJoCo Warp's batch ray tracer on CPU or CUDA; frames in, pictures out.
+
+One world of the ray tracer is one frame. Kinematics is computed by MuJoCo in float64 and copied in, so
+no Warp physics runs. What OpenGL does and the tracer does not is made up for here: distant floor textures
+are averaged (supersampling and a softened texture), a see-through floor is two passes blended, the
+background's picture is put on all six faces of the sky.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from dmcvb_gen.distractors.base import Exogenous
+from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
+from dmcvb_gen.rendering.cameras import Kinematics, camera_ids, matrices
+from dmcvb_gen.tasks.base import Task
+
+WORLDS = 256
+"""Frames a launch; the last launch of a call is padded."""
+DEFAULT_SAMPLES = 2
+"""Samples a pixel and axis (scripts/bench_render.py)."""
+TEXTURE_TEXELS = 64
+"""Texels a side that larger repeating textures are averaged to, for pictures of 64 pixels; grows with the size."""
+
+
+def _warp():
+    import warp
+
+    warp.config.quiet = True
+    return warp
+
+
+class WarpRenderer(Renderer):
+    """See the module and `Renderer`."""
+
+    name = "warp"
+
+    def __init__(
+        self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
+    ):
+        check_size(size)
+        self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
+        self.samples = samples or DEFAULT_SAMPLES
+        self._backgrounds = backgrounds
+        wp = _warp()
+        try:
+            wp.init()
+            self._device = wp.get_device("cuda:0" if device == "cuda" else device)
+        except (RuntimeError, ValueError) as error:
+            raise RenderingError(f"device {device!r} is not usable ({error}); use --device cpu") from None
+        self._kinematics = Kinematics(task, ("geom_xpos", "geom_xmat", "light_xpos", "light_xdir"))
+        self._contexts: dict[int, Any] = {}
+        self._skies: dict[tuple[int, int], Any] = {}
+        self._model = None
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "samples": self.samples,
+            "floor_alpha": self.floor_alpha,
+            "device": "cpu" if self._device.is_cpu else "cuda",
+            "texture_texels": self._texels(),
+            "mujoco-warp": metadata.version("mujoco-warp"),
+            "warp-lang": metadata.version("warp-lang"),
+        }
+
+    # -- building -----------------------------------------------------------------------------
+
+    def _texels(self) -> int:
+        return TEXTURE_TEXELS * -(-self.size // 64)
+
+    def _sky_width(self) -> int:
+        """Texels a side of a sky face: a face spans 90 degrees, about two pictures at 45 degrees of view."""
+        return min(2 * self.size, 512)
+
+    def _build(self) -> None:
+        import mujoco_warp as mjw
+
+        wp, mjm = _warp(), self.task.model
+        with wp.ScopedDevice(self._device):
+            self._model = mjw.put_model(mjm)
+            self._data = mjw.make_data(mjm, nworld=WORLDS)
+            self._textures = [self._texture(i) for i in range(mjm.ntex)]
+        self._floor_materials = np.unique(mjm.geom_matid[mjm.geom_type == 0])
+        self._floor_materials = self._floor_materials[self._floor_materials >= 0]
+
+    def _texture(self, index: int):
+        """A texture of the model; repeating ones are averaged down, so that far away they do not sparkle."""
+        from mujoco_warp._src.render_util import texture_pixels
+
+        pixels = np.asarray(texture_pixels(self.task.model, index))[..., :3]
+        is_sky = self.task.model.tex_type[index] == 2
+        width = 2 * self._sky_width() if is_sky else self._texels()
+        if pixels.shape[1] > width:
+            faces = pixels.shape[0] // pixels.shape[1]
+            parts = pixels.reshape(faces, -1, *pixels.shape[1:]) if faces > 1 else pixels[None]
+            parts = [np.asarray(Image.fromarray(part).resize((width, width), Image.Resampling.BOX)) for part in parts]
+            pixels = np.concatenate(parts)
+        return self._upload(pixels)
+
+    def _upload(self, pixels: np.ndarray):
+        wp = _warp()
+        rgba = np.ones((*pixels.shape[:2], 4), np.float32)
+        rgba[..., :3] = pixels / np.float32(255)
+        with wp.ScopedDevice(self._device):
+            return wp.Texture2D(wp.array(rgba, dtype=float), filter_mode=wp.TextureFilterMode.LINEAR)
+
+    def _context(self, camera: int):
+        if self._model is None:
+            self._build()
+        if camera not in self._contexts:
+            import mujoco_warp as mjw
+
+            with _warp().ScopedDevice(self._device):
+                self._contexts[camera] = mjw.create_render_context(
+                    self.task.model,
+                    nworld=WORLDS,
+                    cam_res=(self.size, self.size),
+                    cam_active=[camera],
+                    render_rgb=True,
+                    render_depth=True,
+                    render_seg=True,
+                    use_fast_math=False,
+                    use_shadows=True,
+                    render_skybox=True,
+                    shadow_light_fraction=0.0,
+                    samples_per_pixel=self.samples,
+                )
+        return self._contexts[camera]
+
+    # -- painting -----------------------------------------------------------------------------
+
+    def render(
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
+    ) -> np.ndarray:
+        indices = check_frames(self.task, physics, exogenous, views)
+        out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
+        for first in range(0, len(physics), WORLDS):
+            part = slice(first, min(first + WORLDS, len(physics)))
+            for column, view in enumerate(indices):
+                out[part, column] = self._launch(physics[part], exogenous[part], view, hide_goal)[0]
+        return out
+
+    def render_labels(
+        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
+        indices = check_frames(self.task, physics, exogenous, views)
+        shape = (len(physics), len(indices), self.size, self.size)
+        depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
+        for first in range(0, len(physics), WORLDS):
+            part = slice(first, min(first + WORLDS, len(physics)))
+            for column, view in enumerate(indices):
+                _, depth[part, column], segmentation[part, column] = self._launch(
+                    physics[part], exogenous[part], view, False, labels=True
+                )
+        return {"depth": depth, "segmentation": segmentation}
+
+    def _launch(self, physics, exogenous, view, hide_goal, labels=False):
+        """Up to WORLDS frames of one view: pictures, and depth and segmentation if asked for."""
+        import mujoco_warp as mjw
+
+        wp, mjm, count = _warp(), self.task.model, len(physics)
+        camera = camera_ids(self.task)[view]
+        context, data = self._context(camera), self._data
+        rows = np.minimum(np.arange(WORLDS), count - 1)  # unused worlds repeat the last frame
+        exogenous = exogenous[rows]
+        pose = self._kinematics(physics)
+
+        with wp.ScopedDevice(self._device):
+
+            def put(target, value):
+                target.assign(np.ascontiguousarray(value, np.float32))
+
+            put(data.geom_xpos, pose["geom_xpos"][rows])
+            put(data.geom_xmat, pose["geom_xmat"][rows].reshape(WORLDS, -1, 3, 3))
+            if mjm.nlight:
+                put(data.light_xpos, pose["light_xpos"][rows])
+                put(data.light_xdir, pose["light_xdir"][rows])
+            cam_xpos = np.zeros((WORLDS, mjm.ncam, 3))
+            cam_xmat = np.zeros((WORLDS, mjm.ncam, 3, 3))
+            cam_xpos[:, camera] = exogenous.camera_position[:, view]
+            cam_xmat[:, camera] = matrices(exogenous.camera_quaternion[:, view].astype(np.float64))
+            put(data.cam_xpos, cam_xpos)
+            put(data.cam_xmat, cam_xmat)
+
+            rgba = np.empty((WORLDS, mjm.nmat, 4), np.float32)
+            rgba[..., :3] = exogenous.material_rgb
+            rgba[..., 3] = np.where(mjm.mat_rgba[:, 3] > 0, 1.0, 0.0)
+            self._model.mat_rgba = wp.array(rgba, dtype=wp.vec4)
+            self._model.geom_rgba = wp.array(self._geom_rgba(hide_goal), dtype=wp.vec4)
+            self._model.geom_matid = wp.array(self._geom_matid(exogenous.style), dtype=int)
+            self._set_sky(context, exogenous)
+            mjw.refit_bvh(self._model, data, context)
+            mjw.render(self._model, data, context)
+            picture = self._read(context, count)
+            depth = segmentation = None
+            if labels:
+                depth = context.depth_data.numpy()[:count].reshape(count, self.size, self.size)
+                seg = context.seg_data.numpy()[:count].reshape(count, self.size, self.size, 2)
+                segmentation = seg[..., 0].astype(np.int16)
+            if self.floor_alpha < 1 and not labels:
+                rgba[:, self._floor_materials, 3] = 0
+                self._model.mat_rgba = wp.array(rgba, dtype=wp.vec4)
+                mjw.render(self._model, data, context)
+                through = self._read(context, count)
+                blend = self.floor_alpha * picture.astype(np.float32) + (1 - self.floor_alpha) * through
+                picture = np.rint(blend).astype(np.uint8)
+        return picture, depth, segmentation
+
+    def _read(self, context, count: int) -> np.ndarray:
+        packed = context.rgb_data.numpy()[:count]
+        return packed.view(np.uint8).reshape(count, self.size, self.size, 4)[..., 2::-1].copy()
+
+    def _geom_rgba(self, hide_goal: bool) -> np.ndarray:
+        rgba = np.array(self.task.model.geom_rgba, np.float32)
+        if hide_goal:
+            rgba[list(self.task.goal_geoms)] = 0
+        return rgba[None]
+
+    def _geom_matid(self, style: np.ndarray) -> np.ndarray:
+        own = np.array(self.task.model.geom_matid)
+        if (style < 0).all():
+            return own[None].astype(np.int32)
+        known = {int(s): self.task.style_geom_matid(int(s)) for s in np.unique(style)}
+        return np.stack([own if known[int(s)] is None else known[int(s)] for s in style]).astype(np.int32)
+
+    def _set_sky(self, context, exogenous: Exogenous) -> None:
+        """Each world's sky: the model's own, or a video frame on every face."""
+        wp, mjm = _warp(), self.task.model
+        skies = np.flatnonzero(mjm.tex_type == 2)
+        own = int(skies[0]) if len(skies) else -1
+        textures, index = list(self._textures), np.full(WORLDS, own)
+        keys = {}
+        for world, key in enumerate(zip(exogenous.background_video, exogenous.background_frame, strict=True)):
+            if key[0] < 0:
+                continue
+            if key not in keys:
+                keys[key] = len(textures)
+                textures.append(self._sky(*map(int, key)))
+            index[world] = keys[key]
+        context.textures_registry = textures  # keeps them alive
+        context.textures = wp.array(textures, dtype=wp.Texture2D)
+        context.skybox_tex_id = wp.array(index, dtype=int)
+        widths = [texture.width for texture in textures]
+        context.skybox_face_width = wp.array(np.array([widths[i] if i >= 0 else 1 for i in index]), dtype=int)
+
+    def _sky(self, video: int, frame: int):
+        if (video, frame) not in self._skies:
+            if self._backgrounds is None:
+                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
+            if len(self._skies) > 256:
+                self._skies.clear()
+            width = self._sky_width()
+            picture = Image.fromarray(self._backgrounds.frames(video)[frame]).resize(
+                (width, width), Image.Resampling.BOX
+            )
+            self._skies[video, frame] = self._upload(np.tile(np.asarray(picture), (6, 1, 1)))
+        return self._skies[video, frame]
+
+    def close(self) -> None:
+        self._contexts.clear()
+        self._skies.clear()
+        self._model = self._data = None
