@@ -29,6 +29,9 @@ class SacSettings:
       target_entropy_scale: the target entropy is minus this times the action size.
       reward_scale: multiplies rewards before learning.
       shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
+      standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
+        instead of the task's initial states; evaluations always start as the task does.
+      train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
       compile: compile the updates (needs a C++ compiler on the CPU).
     """
@@ -47,6 +50,8 @@ class SacSettings:
     initial_temperature: float = 0.1
     reward_scale: float = 0.5
     shaping: float = 0.0
+    standing_starts: float = 0.0
+    train_episode_steps: int = 0
     buffer_size: int = 1_000_000
     bfloat16: bool = True
     compile: bool = True

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 
@@ -26,7 +27,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.store.manifest import environment, write_json_atomically
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 
 EVALUATION_EPISODES = 20
 """Episodes of the evaluations along the way; selection evaluates its picks again on 100."""
@@ -77,7 +78,19 @@ def shaping_of(task: Task) -> Callable[[np.ndarray], np.ndarray]:
     if task.id != "humanoid-walk":
         return lambda state: np.zeros(len(state))
     height, vertical = task.state_slices["head_height"].start, task.state_slices["torso_vertical"].start + 2
-    return lambda state: np.clip(state[:, height] / 1.4, 0, 1) * (1 + state[:, vertical]) / 2
+    return lambda state: np.clip(state[:, height] / 1.4, 0, 1) ** 2 * (1 + state[:, vertical]) / 2
+
+
+def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, physics) float64: the model's own pose with a little noise on every joint, at rest."""
+    data = mujoco.MjData(task.model)
+    rows = np.empty((count, task.physics_size))
+    for row in rows:
+        mujoco.mj_resetData(task.model, data)
+        data.qpos[7:] += rng.normal(0, 0.05, task.model.nq - 7)
+        data.qvel[:] = rng.normal(0, 0.05, task.model.nv)
+        mujoco.mj_getState(task.model, data, row, PHYSICS_SPEC)
+    return rows
 
 
 class Run:
@@ -127,9 +140,17 @@ class Run:
             episode = self.step * settings.simulations + simulation  # never the same stream twice in a run
             return episode_stream(config.seed, (task.id, "training"), episode, "initial_state")
 
-        state = batch.reset([generator(i) for i in range(settings.simulations)])
+        def start(ids: np.ndarray) -> np.ndarray:
+            batch.reset([generator(int(i)) for i in ids], ids)
+            standing = ids[rng.random(len(ids)) < settings.standing_starts]
+            if len(standing):
+                batch.set_physics(standing_states(task, rng, len(standing)), standing)
+            return batch.state()
+
+        limit = settings.train_episode_steps or task.max_steps
+        state = start(np.arange(settings.simulations))
         # The first episodes are cut short at different steps, so that ends do not fall together.
-        elapsed = (np.arange(settings.simulations) * task.max_steps) // settings.simulations
+        elapsed = (np.arange(settings.simulations) * limit) // settings.simulations
         owed, since_saved, started = 0.0, time.time(), time.time()
         next_evaluation = (self.step // config.evaluate_every + 1) * config.evaluate_every
         while self.step < config.steps:
@@ -153,10 +174,10 @@ class Run:
             )
             self.step += settings.simulations
             state = result.state
-            ended = np.flatnonzero(result.terminated | (elapsed >= task.max_steps))
+            ended = np.flatnonzero(result.terminated | (elapsed >= limit))
             if len(ended):
                 episodes[ended] += 1
-                state = batch.reset([generator(int(i)) for i in ended], ended)
+                state = start(ended)
                 elapsed[ended] = 0
             learner.sync_norm()
             if len(buffer) >= settings.warmup_steps:

@@ -1,1 +1,133 @@
+"""Distractors: what varies in the picture and nowhere else.
 
+`make_exogenous` expands a setting into per-frame labels, from random streams that physics never touches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dmcvb_gen.distractors.background import background_walk
+from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
+from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, Exogenous
+from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at
+from dmcvb_gen.distractors.color import color_walk
+from dmcvb_gen.rendering.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
+from dmcvb_gen.tasks.base import Task
+
+TRAIN_STYLES, VAL_STYLES = (2, 3, 4, 5), (1,)
+"""Maze styles of data and of evaluation (paper, section 3.1: unseen distractors)."""
+
+
+class ExogenousWalk:
+    """An episode batch's distractors, drawn ahead of the trajectory.
+
+    The random walks need only the streams; where the agent is comes in frame by frame (`frame`) when
+    an agent is evaluated, or for whole episodes at once (`whole`).
+
+    Args:
+      generators: stream name -> one generator an episode; "camera", "color", "background", "style" are used.
+      frames: frames an episode at most.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        setting: DistractorSetting,
+        frames: int,
+        generators: Mapping[str, Sequence[np.random.Generator]],
+        backgrounds: Backgrounds | None,
+        split: str = "train",
+    ):
+        self.task, self.setting, self.frames = task, setting, frames
+        episodes = len(generators["style"])
+        own = np.asarray(task.model.mat_rgba[:, :3], np.float64)
+        self._video = np.full((episodes, frames), -1, np.int16)
+        self._index = np.full((episodes, frames), -1, np.int16)
+        self._style = np.full((episodes, frames), -1, np.int16)
+        if task.style_geom_matid(TRAIN_STYLES[0]) is not None:
+            styles = TRAIN_STYLES if split == "train" else VAL_STYLES
+            self._style[:] = [[styles[int(rng.integers(len(styles)))]] for rng in generators["style"]]
+        if setting.kind == "none":
+            self._colors = np.broadcast_to(own, (episodes, frames, *own.shape))
+            self._offset = None
+            return
+        if backgrounds is None:
+            raise ValueError(f"distractor {setting.name!r} needs backgrounds")
+        self._colors = color_walk(own, setting, frames, generators["color"])
+        offset = np.asarray(task.model.cam_poscom0[camera_ids(task)[0]])
+        self._offset, roll = camera_walk(camera_range(offset, setting), setting, frames, generators["camera"])
+        self._quaternion = quaternions(look_at(self._offset, roll))
+        self._video, self._index = background_walk(backgrounds.lengths, setting, frames, generators["background"])
+
+    def frame(self, frame: int, physics: np.ndarray) -> Exogenous:
+        """Labels of one frame of all episodes, leading shape (episode,).
+
+        Args:
+          physics: (episode, physics) float64, the states at that frame.
+        """
+        return self._labels(physics, slice(None), frame)
+
+    def whole(self, physics: np.ndarray) -> Exogenous:
+        """Labels of whole episodes, leading shape (episode, frame).
+
+        Args:
+          physics: (episode, frame, physics) float64.
+        """
+        return self._labels(physics, slice(None), slice(physics.shape[1]))
+
+    def _labels(self, physics, episodes, frames) -> Exogenous:
+        lead = physics.shape[:-1]
+        flat = physics.reshape(-1, physics.shape[-1])
+        if self._offset is None:
+            position, quaternion = nominal_cameras(self.task, flat)
+            position, quaternion = position.reshape(*lead, -1, 3), quaternion.reshape(*lead, -1, 4)
+        else:
+            agent = centers_of_mass(self.task, flat).reshape(*lead, 3)
+            position = (agent + self._offset[episodes, frames])[..., None, :]
+            quaternion = self._quaternion[episodes, frames][..., None, :]
+        return Exogenous(
+            camera_position=position.astype(np.float32),
+            camera_quaternion=quaternion.astype(np.float32),
+            material_rgb=self._colors[episodes, frames].astype(np.float32),
+            background_video=self._video[episodes, frames],
+            background_frame=self._index[episodes, frames],
+            style=self._style[episodes, frames],
+        )
+
+
+def make_exogenous(
+    task: Task,
+    setting: DistractorSetting,
+    physics: np.ndarray,
+    generators: Mapping[str, Sequence[np.random.Generator]],
+    backgrounds: Backgrounds | None = None,
+    split: str = "train",
+) -> Exogenous:
+    """Per-frame labels of whole episodes (Distracting Control Suite; DMC-VB, section 3.1).
+
+    Args:
+      physics: (episode, frame, physics) float64 states.
+      generators: stream name -> one generator an episode.
+      backgrounds: the videos, needed unless the setting is "none".
+      split: "train" or "val", which maze styles.
+
+    Returns:
+      Labels with leading shape (episode, frame); an episode's labels depend on its own streams and states only,
+      and a longer episode begins with the labels of a shorter one.
+    """
+    return ExogenousWalk(task, setting, physics.shape[1], generators, backgrounds, split).whole(physics)
+
+
+__all__ = [
+    "KINDS",
+    "SCALES",
+    "Backgrounds",
+    "DistractorSetting",
+    "Exogenous",
+    "ExogenousWalk",
+    "load_backgrounds",
+    "make_exogenous",
+]

@@ -6,13 +6,14 @@ one render an agent step, kinematics without a physics step.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import ctypes.util
 import functools
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from typing import Any
 
@@ -213,3 +214,33 @@ class OpenglRenderer(Renderer):
             self._context.free()
             self._gl.free()
             self._gl = None
+
+
+@contextlib.contextmanager
+def offscreen(model: mujoco.MjModel, size: int) -> Iterator[Callable[[mujoco.MjData, str], np.ndarray]]:
+    """A function (data, camera name) -> (size, size, 3) uint8 for any model, while the context lasts."""
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    from mujoco.egl import GLContext
+
+    gl = GLContext(size, size)
+    gl.make_current()
+    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+    scene, option, camera = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption(), mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    rectangle = mujoco.MjrRect(0, 0, size, size)
+
+    def shoot(data: mujoco.MjData, name: str) -> np.ndarray:
+        camera.fixedcamid = model.camera(name).id
+        mujoco.mj_forward(model, data)
+        mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+        mujoco.mjr_render(rectangle, scene, context)
+        picture = np.empty((size, size, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, rectangle, context)
+        return picture[::-1]
+
+    try:
+        yield shoot
+    finally:
+        context.free()
+        gl.free()

@@ -214,9 +214,23 @@ class WarpRenderer(Renderer):
                 self._model.mat_rgba = wp.array(rgba, dtype=wp.vec4)
                 mjw.render(self._model, data, context)
                 through = self._read(context, count)
-                blend = self.floor_alpha * picture.astype(np.float32) + (1 - self.floor_alpha) * through
-                picture = np.rint(blend).astype(np.uint8)
+                picture = self._see_through(picture, through)
         return picture, depth, segmentation
+
+    def _see_through(self, floor: np.ndarray, behind: np.ndarray) -> np.ndarray:
+        """Blend the pictures with an opaque floor and without a floor.
+
+        OpenGL draws a reflective plane twice, once darkened by its reflectance: the weights follow from that
+        (and agree with a regression of OpenGL's pixels on the two pictures).
+        """
+        alpha = self.floor_alpha
+        reflectance = float(self.task.model.mat_reflectance[self._floor_materials].max(initial=0.0))
+        if reflectance:
+            weights = alpha * (1 - reflectance) + alpha * (1 - alpha), (1 - alpha) ** 2
+        else:
+            weights = alpha, 1 - alpha
+        blend = np.rint(np.float32(weights[0]) * floor + np.float32(weights[1]) * behind).astype(np.uint8)
+        return np.where((floor != behind).any(axis=-1, keepdims=True), blend, floor)
 
     def _read(self, context, count: int) -> np.ndarray:
         packed = context.rgb_data.numpy()[:count]

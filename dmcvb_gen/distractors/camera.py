@@ -1,0 +1,116 @@
+"""The camera distractor: an episode's own stream in, a camera that drifts around the agent out.
+
+The camera moves in spherical coordinates around the agent's centre of mass, so its walk is drawn without
+the trajectory; the centre of mass of each frame is added last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmcvb_gen.distractors.base import DistractorSetting
+from dmcvb_gen.tasks.base import ACTION_REPEAT
+
+VELOCITY_STD = 0.1  # of a tick's change of velocity, times s and r0 / 4, meters a tick
+MAX_SPEED = 0.4  # times s and r0 / 4, meters a tick
+ROLL_VELOCITY_STD = np.pi / 300  # times s, radians a tick
+MAX_ROLL_SPEED = np.pi / 50  # times s, radians a tick
+ANGLE_RANGE = np.pi / 2  # times s: half width of azimuth, elevation and roll, radians
+RADIUS_RANGE = (0.5, 1.5)  # times s: how much nearer and farther than r0, as a share of r0
+
+
+@dataclass(frozen=True)
+class CameraRange:
+    """Where the camera may be: radius (m), polar angle from +z in [0, pi/2], azimuth in [-pi, 0], roll (radians)."""
+
+    low: np.ndarray
+    high: np.ndarray
+    nominal_radius: float
+    roll: float
+
+
+def spherical(position: np.ndarray) -> np.ndarray:
+    """(..., 3) x y z -> (..., 3) radius, polar angle, azimuth in [-pi, pi)."""
+    x, y, z = np.moveaxis(np.asarray(position, np.float64), -1, 0)
+    radius = np.sqrt(x * x + y * y + z * z)
+    azimuth = np.arctan2(y, x)
+    azimuth = np.where(azimuth >= np.pi - 1e-9, azimuth - 2 * np.pi, azimuth)
+    return np.stack([radius, np.arccos(np.clip(z / radius, -1, 1)), azimuth], axis=-1)
+
+
+def cartesian(coordinates: np.ndarray) -> np.ndarray:
+    """(..., 3) radius, polar angle, azimuth -> (..., 3) x y z."""
+    radius, polar, azimuth = np.moveaxis(coordinates, -1, 0)
+    flat = radius * np.sin(polar)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.cos(polar)], axis=-1)
+
+
+def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
+    """The ranges around a nominal camera.
+
+    Args:
+      offset: (3,) nominal camera minus centre of mass, meters.
+    """
+    radius, polar, azimuth = spherical(offset)
+    scale, angle = setting.scale, ANGLE_RANGE * setting.scale
+    low = np.array([radius * (1 - RADIUS_RANGE[0] * scale), max(polar - angle, 0.0), max(azimuth - angle, -np.pi)])
+    high = np.array([radius * (1 + RADIUS_RANGE[1] * scale), min(polar + angle, np.pi / 2), min(azimuth + angle, 0.0)])
+    return CameraRange(low, high, float(radius), angle)
+
+
+def camera_walk(
+    bounds: CameraRange, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the camera's walk, relative to the agent.
+
+    Returns:
+      offset (episode, frame, 3) meters from the centre of mass, roll (episode, frame) radians. A longer
+      walk begins with the shorter one.
+    """
+    start = np.stack([rng.random(4) for rng in generators])
+    place = bounds.low + start[:, :3] * (bounds.high - bounds.low)
+    roll = (2 * start[:, 3] - 1) * bounds.roll
+    offsets = np.empty((len(generators), frames, 3))
+    rolls = np.empty((len(generators), frames))
+    offsets[:], rolls[:] = cartesian(place)[:, None], roll[:, None]
+    if setting.kind != "dynamic":
+        return offsets, rolls
+    ticks = ACTION_REPEAT * (frames - 1)
+    noise = np.stack([rng.standard_normal((ticks, 4)) for rng in generators], axis=1)
+    unit = setting.scale * bounds.nominal_radius / 4
+    position, velocity = cartesian(place), np.zeros((len(generators), 3))
+    roll_velocity = np.zeros(len(generators))
+    for tick in range(ticks):
+        velocity = velocity + VELOCITY_STD * unit * noise[tick, :, :3]
+        speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+        velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(speed, 1e-12))
+        position = cartesian(np.clip(spherical(position + velocity), bounds.low, bounds.high))
+        limit = MAX_ROLL_SPEED * setting.scale
+        roll_velocity = np.clip(roll_velocity + ROLL_VELOCITY_STD * setting.scale * noise[tick, :, 3], -limit, limit)
+        roll = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
+        if (tick + 1) % ACTION_REPEAT == 0:
+            frame = (tick + 1) // ACTION_REPEAT
+            offsets[:, frame], rolls[:, frame] = position, roll
+    return offsets, rolls
+
+
+def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Camera matrices that look at the agent, then roll about the line of sight.
+
+    Args:
+      offset: (..., 3) from the agent to the camera.
+      roll: (...,) radians.
+
+    Returns:
+      (..., 3, 3), columns: the camera's x (right), y (up) and z (away from the agent) in the world frame.
+    """
+    back = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
+    right = np.stack([-back[..., 1], back[..., 0], np.zeros(back.shape[:-1])], axis=-1)  # z cross back
+    norm = np.linalg.norm(right, axis=-1, keepdims=True)
+    right = np.where(norm > 1e-9, right / np.maximum(norm, 1e-9), np.array([0.0, -1.0, 0.0]))  # straight above
+    up = np.cross(back, right)
+    cos, sin = np.cos(roll)[..., None], np.sin(roll)[..., None]
+    return np.stack([cos * right + sin * up, cos * up - sin * right, back], axis=-1)
