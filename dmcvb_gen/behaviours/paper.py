@@ -30,6 +30,6 @@ def paper_task(task_id: str) -> str:
 
 
 def paper_returns(task_id: str, level: str) -> dict[str, float] | None:
-    """Steps, mean, std, min, p25, median, p75, max of the episode returns that the paper reports; None without a row."""
+    """Steps, mean, std, min, p25, median, p75, max of the paper's episode returns; None where it has no row."""
     row = _table().get((paper_task(task_id), level))
     return dict(row) if row else None

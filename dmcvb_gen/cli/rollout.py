@@ -268,6 +268,7 @@ def info(path, as_json):
             numbers = (f"{paper[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max"))
             table.add_row("  DMC-VB paper", "", f"{paper['steps']:,}", "", "", *numbers, style="dim")
     console = Console()
+    console.width = max(console.width, 132)  # a cut number is worse than a wrapped line
     console.print(table)
     console.print(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
 

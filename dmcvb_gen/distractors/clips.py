@@ -94,7 +94,7 @@ _MESHES = (_revolution, _torus, _rock, _superquadric)
 
 def _object(rng: np.random.Generator, index: int, material: str) -> tuple[str, str]:
     """Geoms of one object, and the meshes they need."""
-    size = rng.uniform(0.16, 0.42)
+    size = rng.uniform(0.22, 0.55)
     look = f'material="{material}"'
     kind = rng.random()
     if kind < 0.4:
@@ -120,6 +120,17 @@ def _object(rng: np.random.Generator, index: int, material: str) -> tuple[str, s
     return "".join(parts), ""
 
 
+def _light(rng: np.random.Generator, sun: bool) -> str:
+    """The sun (casts shadows) or a lamp."""
+    place, aim = [*rng.uniform(-4, 4, 2), rng.uniform(4, 8)], [*rng.normal(0, 0.3, 2), -1]
+    color = rng.uniform(0.25, 0.6) * (1 + rng.normal(0, 0.08, 3))
+    flag = str(sun).lower()
+    return (
+        f'<light pos="{_numbers(place)}" dir="{_numbers(aim)}" diffuse="{_numbers(color)}" '
+        f'directional="{flag}" castshadow="{flag}"/>'
+    )
+
+
 def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes]]:
     """The XML of a clip and its texture files."""
     count = int(rng.integers(10, 24))
@@ -134,35 +145,32 @@ def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes]]:
         )
         geoms, mesh = _object(rng, index, f"o{index}")
         meshes.append(mesh)
-        lifted = rng.random() < 0.55
+        lifted = rng.random() < 0.65
         place = [
             rng.uniform(-1.7, 1.7),
             rng.uniform(-1.7, 1.7),
             rng.uniform(1.2, 4.5) if lifted else rng.uniform(0.4, 0.8),
         ]
         bodies.append(f'<body pos="{_numbers(place)}" quat="{_numbers(rng.normal(size=4))}"><freejoint/>{geoms}</body>')
-    angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(4.5, 6.5)
+    angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(3.8, 5.2)
     eye = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(0.9, 3.2)])
     target = np.array([*rng.normal(0, 0.3, 2), rng.uniform(0.5, 1.1)])
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0, 0, 1.0], back)
     right /= np.linalg.norm(right)
-    lights = "".join(
-        f'<light pos="{_numbers([*rng.uniform(-4, 4, 2), rng.uniform(4, 8)])}" dir="{_numbers([*rng.normal(0, 0.3, 2), -1])}" '
-        f'diffuse="{_numbers(rng.uniform(0.25, 0.6) * (1 + rng.normal(0, 0.08, 3)))}" directional="{"true" if k == 0 else "false"}" '
-        f'castshadow="{"true" if k == 0 else "false"}"/>'
-        for k in range(2)
-    )
+    lights = "".join(_light(rng, sun) for sun in (True, False))
+    repeat, fovy = rng.uniform(0.1, 0.5, 2), rng.uniform(35, 55)
+    up = np.cross(back, right)
     xml = f"""<mujoco><option timestep="0.004"/>
     <visual><headlight ambient="0.35 0.35 0.35" diffuse="0.25 0.25 0.25" specular="0.1 0.1 0.1"/>
     <quality shadowsize="2048" offsamples="8"/><map znear="0.02"/>
     <global offwidth="{FRAME_SIZE}" offheight="{FRAME_SIZE}"/></visual><statistic extent="6" center="0 0 1"/>
     <asset><texture name="sky" type="skybox" file="sky.png"/><texture name="floor" type="2d" file="floor.png"/>
-    <material name="floor" texture="floor" texrepeat="{rng.uniform(0.1, 0.5):.2f} {rng.uniform(0.1, 0.5):.2f}" texuniform="true"
+    <material name="floor" texture="floor" texrepeat="{_numbers(repeat)}" texuniform="true"
      reflectance="{rng.uniform(0, 0.15):.2f}"/>{"".join(textures)}{"".join(materials)}{"".join(meshes)}</asset>
     <default><geom density="400" friction="0.8 0.02 0.002"/></default>
     <worldbody><geom type="plane" size="30 30 1" material="floor"/>{lights}
-    <camera name="film" pos="{_numbers(eye)}" xyaxes="{_numbers(right)} {_numbers(np.cross(back, right))}" fovy="{rng.uniform(35, 55):.1f}"/>
+    <camera name="film" pos="{_numbers(eye)}" xyaxes="{_numbers(right)} {_numbers(up)}" fovy="{fovy:.1f}"/>
     {"".join(bodies)}</worldbody></mujoco>"""
     return xml, assets
 

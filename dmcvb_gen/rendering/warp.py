@@ -29,10 +29,17 @@ TEXTURE_TEXELS = 64
 """Texels a side that larger repeating textures are averaged to, for pictures of 64 pixels; grows with the size."""
 
 
+def _mjw():
+    _warp()
+    import mujoco_warp
+
+    return mujoco_warp
+
+
 def _warp():
     import warp
 
-    warp.config.quiet = True
+    warp.config.log_level = 30  # warnings alone: kernels announce themselves otherwise
     return warp
 
 
@@ -80,9 +87,7 @@ class WarpRenderer(Renderer):
         return min(2 * self.size, 512)
 
     def _build(self) -> None:
-        import mujoco_warp as mjw
-
-        wp, mjm = _warp(), self.task.model
+        mjw, wp, mjm = _mjw(), _warp(), self.task.model
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(mjm)
             self._data = mjw.make_data(mjm, nworld=WORLDS)
@@ -115,8 +120,7 @@ class WarpRenderer(Renderer):
         if self._model is None:
             self._build()
         if camera not in self._contexts:
-            import mujoco_warp as mjw
-
+            mjw = _mjw()
             with _warp().ScopedDevice(self._device):
                 self._contexts[camera] = mjw.create_render_context(
                     self.task.model,
@@ -168,9 +172,7 @@ class WarpRenderer(Renderer):
 
     def _launch(self, physics, exogenous, view, hide_goal, labels=False):
         """Up to WORLDS frames of one view: pictures, and depth and segmentation if asked for."""
-        import mujoco_warp as mjw
-
-        wp, mjm, count = _warp(), self.task.model, len(physics)
+        mjw, wp, mjm, count = _mjw(), _warp(), self.task.model, len(physics)
         camera = camera_ids(self.task)[view]
         context, data = self._context(camera), self._data
         rows = np.minimum(np.arange(WORLDS), count - 1)  # unused worlds repeat the last frame

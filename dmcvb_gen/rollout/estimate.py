@@ -14,7 +14,7 @@ from dmcvb_gen.behaviours.simulate import simulate
 from dmcvb_gen.rollout.plan import Job, Plan, load_policies, renderer_for
 from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
 from dmcvb_gen.store.manifest import SubsetRecord
-from dmcvb_gen.store.schema import array_specs, create_arrays
+from dmcvb_gen.store.schema import array_specs, create_arrays, picture_layout_for
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES, SAMPLE_STEPS = 4, 48
@@ -57,7 +57,8 @@ def measure(job: Job, record: SubsetRecord) -> Rate:
         rows = task.max_steps + 1
         with tempfile.TemporaryDirectory() as folder:
             group = zarr.create_group(folder)
-            create_arrays(group, array_specs(task, record.size), SAMPLE_EPISODES, rows, SAMPLE_EPISODES)
+            specs, layout = array_specs(task, record.size), picture_layout_for(record.setting)
+            create_arrays(group, specs, SAMPLE_EPISODES, rows, SAMPLE_EPISODES, layout)
             for name, value in paint(
                 task, renderer, out.physics[:, : len_rows(exogenous)], exogenous, out.length, rows
             ):

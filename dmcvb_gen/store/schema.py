@@ -136,16 +136,23 @@ def picture_codecs(layout: str) -> dict[str, Any]:
         "time-zstd": dict(filters=(time_last,), compressors=(ZstdCodec(level=3),)),
         "time-delta-zstd": dict(filters=(time_last, delta), compressors=(ZstdCodec(level=3),)),
         "width-delta-zstd": dict(filters=(width_last, delta), compressors=(ZstdCodec(level=3),)),
-        "width-time-delta-zstd": dict(
-            filters=(width_last, delta, TransposeCodec(order=(0, 2, 3, 4, 1)), delta),
-            compressors=(ZstdCodec(level=3),),
+        "width-delta-blosc": dict(
+            filters=(width_last, delta),
+            compressors=(BloscCodec(cname="zstd", clevel=3, shuffle="noshuffle", typesize=1),),
         ),
+        "zstd-9": dict(filters=(), compressors=(ZstdCodec(level=9),)),
+        "width-delta-zstd-9": dict(filters=(width_last, delta), compressors=(ZstdCodec(level=9),)),
     }
     return layouts[layout]
 
 
-PICTURE_LAYOUT = "width-delta-zstd"
-"""The layout that releases use (measured with scripts/bench_store.py)."""
+def picture_layout_for(setting: str) -> str:
+    """The codec layout of a setting's pictures, as measured with scripts/bench_store.py.
+
+    Moving pictures are smaller as differences of neighboring pixels; where the camera stands still, zstd finds
+    the repeated rows by itself, and is faster to read.
+    """
+    return "width-delta-zstd" if setting.startswith("dynamic") else "zstd"
 
 
 def create_arrays(
@@ -154,7 +161,7 @@ def create_arrays(
     episodes: int,
     rows: int,
     episodes_per_shard: int,
-    picture_layout: str | None = None,
+    picture_layout: str = "zstd",
     chunk_steps: int | None = None,
 ) -> None:
     """Create the (empty) arrays of a subset: metadata only, no data.
@@ -175,7 +182,7 @@ def create_arrays(
             chunks = (1, steps, *spec.shape)
             shards = (episodes_per_shard, -(-rows // steps) * steps, *spec.shape)
         if spec.picture:
-            codecs = dict(picture_codecs(picture_layout or PICTURE_LAYOUT))
+            codecs = dict(picture_codecs(picture_layout))
         else:
             codecs = dict(filters=(), compressors=(ZstdCodec(level=3),))
         codecs["compressors"] = (*codecs["compressors"], Crc32cCodec())

@@ -25,7 +25,7 @@ from dmcvb_gen.store.manifest import (
     parse_manifest,
     write_json_atomically,
 )
-from dmcvb_gen.store.schema import ArraySpec, create_arrays
+from dmcvb_gen.store.schema import ArraySpec, create_arrays, picture_layout_for
 
 
 def subset_path(name: str) -> str:
@@ -106,7 +106,9 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
         return
     try:
         group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
-        create_arrays(group, specs, subset.episodes, rows, subset.episodes_per_shard)
+        create_arrays(
+            group, specs, subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting)
+        )
         zarr.consolidate_metadata(str(path))
         (path / ".created").touch()  # an interrupted creation is done again from the start
     except OSError as error:
