@@ -143,6 +143,11 @@ class Policy:
     def __init__(self, header: PolicyHeader, actor: Actor, digest: str):
         self.header, self._actor, self.digest = header, actor.eval().requires_grad_(False), digest
 
+    @property
+    def weights(self) -> dict[str, torch.Tensor]:
+        """The actor's weights, float32."""
+        return self._actor.state_dict()
+
     def act(
         self,
         observation: np.ndarray,

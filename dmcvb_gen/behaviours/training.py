@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from dmcvb_gen.behaviours.evaluation import evaluate
+from dmcvb_gen.behaviours.paper import paper_returns
 from dmcvb_gen.behaviours.policy_file import Evaluation, Policy, PolicyHeader, load_policy, save_policy
 from dmcvb_gen.behaviours.sac import ReplayBuffer, Sac, SacSettings
 from dmcvb_gen.errors import DmcvbError
@@ -38,7 +39,9 @@ class RunConfig:
     """What a run trains; written once to run.json, a resumed run must have the same.
 
     Attributes:
-      evaluate_every: agent steps between evaluations (and policy files) while the return is low.
+      evaluate_every: agent steps between evaluations (and policy files) while the return is low, where medium and
+        mixed checkpoints are picked from.
+      evaluate_sparse: the same once 60 % of the paper's expert return is reached.
       init_from: policy file or run whose actor, critics and normalization it starts from.
     """
 
@@ -47,7 +50,8 @@ class RunConfig:
     steps: int
     seed: int
     settings: dict[str, Any]
-    evaluate_every: int = 10_000
+    evaluate_every: int = 2_000
+    evaluate_sparse: int = 10_000
     init_from: str | None = None
 
 
@@ -152,6 +156,7 @@ class Run:
         # The first episodes are cut short at different steps, so that ends do not fall together.
         elapsed = (np.arange(settings.simulations) * limit) // settings.simulations
         owed, since_saved, started = 0.0, time.time(), time.time()
+        expected = (paper_returns(task.id, "expert") or {"mean": 0.0})["mean"]
         next_evaluation = (self.step // config.evaluate_every + 1) * config.evaluate_every
         while self.step < config.steps:
             observation = state[:, columns].astype(np.float32)
@@ -187,11 +192,13 @@ class Run:
                     owed -= 1
             tick(settings.simulations)
             if self.step >= next_evaluation:
-                next_evaluation += config.evaluate_every
                 now = time.time()
                 self.seconds += now - started
-                started = now
-                report(self._evaluate(learner))
+                progress = self._evaluate(learner)
+                report(progress)
+                started = time.time()  # evaluations are not training time
+                low = expected <= 0 or progress.evaluation.mean < 0.6 * expected
+                next_evaluation = self.step + (config.evaluate_every if low else config.evaluate_sparse)
                 if time.time() - since_saved > 240 or self.step >= config.steps:
                     self._save(learner, buffer, rng)
                     since_saved = time.time()
@@ -271,7 +278,7 @@ def _start_from(learner: Sac, source: str) -> None:
         state = torch.load(state_path, weights_only=True)["learner"]
         learner.load_state(state)
         return
-    learner.actor.load_state_dict(load_policy(path)._actor.state_dict())
+    learner.actor.load_state_dict(load_policy(path).weights)
     learner.norm.mean = learner.actor.observation_mean.numpy().astype(float)
     learner.norm.count = 1e5
     learner.norm.m2 = learner.actor.observation_std.numpy().astype(float) ** 2 * learner.norm.count

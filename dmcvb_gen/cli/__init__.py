@@ -11,26 +11,16 @@ from dmcvb_gen import __version__
 from dmcvb_gen.errors import DmcvbError
 
 COMMANDS = {
-    "rollout": "rollout:rollout",
-    "info": "rollout:info",
-    "preview": "rollout:preview",
-    "list": "rollout:list_command",
-    "backgrounds": "backgrounds:backgrounds",
-    "train-behaviour": "behaviours:train_behaviour",
-    "select-checkpoints": "behaviours:select_checkpoints",
-    "evaluate-behaviour": "behaviours:evaluate_behaviour",
-    "show-maze": "maze:show_maze",
-    "validate": "validate:validate",
-    "verify": "release:verify",
-    "regenerate": "release:regenerate",
-    "repaint": "release:repaint",
-    "card": "release:card",
-    "publish": "release:publish",
-    "fetch": "release:fetch",
-    "export": "release:export",
-    "import": "release:import_command",
+    "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of painted episodes."),
+    "info": ("rollout:info", "Show what a release holds, returns beside the paper's."),
+    "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
+    "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
+    "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
+    "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
+    "select-checkpoints": ("behaviours:select_checkpoints", "Pick a run's expert, medium and mixed checkpoints."),
+    "evaluate-behaviour": ("behaviours:evaluate_behaviour", "Returns of behaviour policies, beside the paper's."),
 }
-"""Command -> "module:attribute" under `dmcvb_gen.cli`."""
+"""Command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""
 
 
 class LazyGroup(click.Group):
@@ -42,8 +32,12 @@ class LazyGroup(click.Group):
     def get_command(self, ctx, name):
         if name not in COMMANDS:
             return None
-        module, attribute = COMMANDS[name].split(":")
+        module, attribute = COMMANDS[name][0].split(":")
         return getattr(importlib.import_module(f"dmcvb_gen.cli.{module}"), attribute)
+
+    def format_commands(self, ctx, formatter):
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
     def invoke(self, ctx):
         try:

@@ -1,0 +1,167 @@
+"""train-behaviour, select-checkpoints, evaluate-behaviour."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from dmcvb_gen.cli.common import json_option, print_json
+
+
+@click.command("train-behaviour")
+@click.argument("task")
+@click.option("--out", type=click.Path(path_type=Path), help="The run's folder.  [default: runs/TASK]")
+@click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--algo", default="sac", show_default=True, help="sac.")
+@click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="Override a setting. Repeatable.")
+@click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
+@click.option("--init-from", metavar="RUN|FILE", help="Start from another run's networks (or a policy file).")
+@click.option("--evaluate-every", type=click.IntRange(1), help="Agent steps between evaluations while returns are low.")
+@click.option("--resume", is_flag=True, help="Go on with the run in --out.")
+@json_option
+def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, resume, as_json):
+    """Train a behaviour policy online on states.
+
+    \b
+    dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
+    dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
+    dmcvb-gen select-checkpoints runs/walker-walk
+    """
+    import torch
+
+    from dmcvb_gen.behaviours.defaults import ALGORITHMS, default_run, parse_settings
+    from dmcvb_gen.behaviours.training import RunConfig, open_run
+    from dmcvb_gen.errors import UnknownNameError
+    from dmcvb_gen.tasks import get_task
+
+    get_task(task)
+    if algo not in ALGORITHMS:
+        raise UnknownNameError("algorithm", algo, ALGORITHMS)
+    defaults = default_run(task)
+    given = parse_settings(pairs, config, algo)
+    settings = (defaults["settings"] if algo == "sac" else {}) | given
+    total = steps or defaults["steps"]
+    folder = out or Path("runs") / task
+    configuration = RunConfig(
+        task=task,
+        algorithm=algo,
+        steps=total,
+        seed=seed,
+        settings=settings,
+        evaluate_every=evaluate_every or defaults["evaluate_every"],
+        evaluate_sparse=max(evaluate_every or 0, defaults["evaluate_sparse"]),
+        init_from=init_from,
+    )
+    torch.set_num_threads(1)
+    run = open_run(folder, configuration, resume)
+    with tqdm(total=total, unit=" steps", unit_scale=True, desc=task, disable=as_json or None) as bar:
+
+        def report(progress):
+            bar.set_postfix_str(f"return {progress.evaluation.mean:.1f}", refresh=False)
+
+        run.train(report, bar.update)
+    if as_json:
+        return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1)))
+    click.echo(f"{folder}: trained to {run.step:,} agent steps. Next: dmcvb-gen select-checkpoints {folder}")
+
+
+@click.command("select-checkpoints")
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes a pick.")
+@click.option("--seed", type=click.IntRange(0), default=20_000, show_default=True)
+@click.option("--deterministic", is_flag=True, help="Judge mean actions instead of sampled ones.")
+@json_option
+def select_checkpoints(run, episodes, seed, deterministic, as_json):
+    """Pick the expert (95 %), medium (50 %) and mixed (0 to 50 %) checkpoints of a run.
+
+    \b
+    dmcvb-gen select-checkpoints runs/walker-walk
+    dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk --episodes 20
+    """
+    from dmcvb_gen.behaviours import selection as module
+
+    picked = module.select_checkpoints(run, episodes, seed, deterministic)
+    if as_json:
+        return print_json(module.selection_json(picked))
+    console = Console()
+    state = "converged" if picked.convergence.converged else f"not converged ({picked.convergence.reason})"
+    end = picked.convergence
+    console.print(f"{picked.task}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
+    table = Table()
+    for column in ("pick", "agent step", "share aimed at", "mean", "std"):
+        table.add_column(column, justify="right" if column != "pick" else "left")
+    for picks in picked.picks.values():
+        for pick in picks:
+            table.add_row(
+                pick.name,
+                f"{pick.step:,}",
+                f"{pick.target:.0%}",
+                f"{pick.evaluation.mean:.1f}",
+                f"{pick.evaluation.std:.1f}",
+            )
+    console.print(table)
+    for level, reason in picked.reasons.items():
+        console.print(f"{level} cannot be picked yet: {reason}", style="yellow")
+    console.print(f"wrote {run}/selected, {run}/selection.json, {run}/curve.png")
+
+
+@click.command("evaluate-behaviour")
+@click.argument("tasks", nargs=-1, metavar="[TASK]...")
+@click.option(
+    "--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: all bundled]"
+)
+@click.option("--behaviour", metavar="FILE|RUN", help="A policy file or run instead of the bundled one.")
+@click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@click.option("--deterministic", is_flag=True)
+@json_option
+def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, as_json):
+    """Returns of behaviour policies over fresh episodes, beside the paper's.
+
+    Without TASK: every bundled policy.
+
+    \b
+    dmcvb-gen evaluate-behaviour
+    dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
+    """
+    from dmcvb_gen.behaviours.bundled import bundled_levels, resolve_policies
+    from dmcvb_gen.behaviours.paper import paper_returns
+    from dmcvb_gen.behaviours.policy_file import load_policy, random_policy
+    from dmcvb_gen.behaviours.simulate import simulate
+    from dmcvb_gen.rollout.info import return_statistics
+    from dmcvb_gen.tasks import get_task, task_ids
+
+    rows = []
+    for task_id in tasks or task_ids():
+        task = get_task(task_id)
+        for level in levels or [*bundled_levels(task_id), "random"]:
+            if level == "random":
+                policies = [random_policy(task)]
+            else:
+                policies = [load_policy(path, task) for path in resolve_policies(task_id, level, behaviour)]
+            out = simulate(
+                task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=deterministic, threads=2
+            )
+            row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
+            row |= dict(mode="deterministic" if deterministic else "sampled", returns=return_statistics(out.returns))
+            if task.return_range[1] <= 0:
+                row["success"] = float(out.terminated.mean())
+            rows.append(row | dict(paper=paper_returns(task_id, level)))
+    if as_json:
+        return print_json(rows)
+    table = Table(title=f"{episodes} episodes each, seed {seed}")
+    columns = ("mean", "std", "min", "p25", "median", "p75", "max")
+    for column in ("task", "level", *columns):
+        table.add_column(column, justify="left" if column in ("task", "level") else "right")
+    for row in rows:
+        table.add_row(row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in columns))
+        if row["paper"]:
+            table.add_row("", "  DMC-VB paper", *(f"{row['paper'][key]:.1f}" for key in columns), style="dim")
+    console = Console()
+    console.width = max(console.width, 110)
+    console.print(table)
