@@ -161,5 +161,5 @@ def square(picture: Image.Image) -> np.ndarray:
     left, top = (width - side) // 2, (height - side) // 2
     if (width, height) == (FRAME_SIZE, FRAME_SIZE):
         return np.asarray(picture)
-    box = (left, top, left + side, top + side)
-    return np.asarray(picture.resize((FRAME_SIZE, FRAME_SIZE), Image.Resampling.LANCZOS, box=box))
+    middle = picture.crop((left, top, left + side, top + side))
+    return np.asarray(middle.resize((FRAME_SIZE, FRAME_SIZE), Image.Resampling.LANCZOS))

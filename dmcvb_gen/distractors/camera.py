@@ -87,7 +87,7 @@ def camera_walk(
         velocity = velocity + VELOCITY_STD * unit * noise[tick, :, :3]
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(speed, 1e-12))
-        position = cartesian(np.clip(spherical(position + velocity), bounds.low, bounds.high))
+        position = cartesian(_clip(spherical(position + velocity), bounds))
         limit = MAX_ROLL_SPEED * setting.scale
         roll_velocity = np.clip(roll_velocity + ROLL_VELOCITY_STD * setting.scale * noise[tick, :, 3], -limit, limit)
         roll = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
@@ -95,6 +95,13 @@ def camera_walk(
             frame = (tick + 1) // ACTION_REPEAT
             offsets[:, frame], rolls[:, frame] = position, roll
     return offsets, rolls
+
+
+def _clip(coordinates: np.ndarray, bounds: CameraRange) -> np.ndarray:
+    """Clip into the ranges; a camera just past the azimuth's seam at pi is past its near end, not its far one."""
+    middle = (bounds.low[2] + bounds.high[2]) / 2
+    azimuth = middle + (coordinates[:, 2] - middle + np.pi) % (2 * np.pi) - np.pi
+    return np.clip(np.column_stack([coordinates[:, :2], azimuth]), bounds.low, bounds.high)
 
 
 def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:

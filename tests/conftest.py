@@ -1,0 +1,49 @@
+"""Shared fixtures: a small release that many tests read."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linux-gnu/libEGL.so.1") else "disable")
+
+import pytest  # noqa: E402
+
+from dmcvb_gen.rollout.executors import run_jobs  # noqa: E402
+from dmcvb_gen.rollout.plan import finish, make_plan, prepare  # noqa: E402
+from dmcvb_gen.rollout.recipe import make_recipe  # noqa: E402
+
+
+def small_recipe(**changes):
+    """Walker, random actions, three settings, 3 episodes in shards of 2, small pictures."""
+    fields = {
+        "name": "small",
+        "seed": 3,
+        "size": 16,
+        "renderer": {"backend": "warp", "samples": 1},
+        "subsets": [
+            {
+                "tasks": "walker-walk",
+                "levels": "random",
+                "settings": ["none", "static", "dynamic"],
+                "episodes": 3,
+                "episodes_per_shard": 2,
+            }
+        ],
+    }
+    return make_recipe(fields | changes)
+
+
+def roll_out(recipe, folder, jobs=lambda jobs: jobs, workers=1, only=()):
+    """Make a release in this process (or in workers) and give its finished manifest."""
+    plan = prepare(make_plan(recipe, folder, only))
+    for _ in run_jobs(jobs(plan.jobs), workers):
+        pass
+    return finish(plan)
+
+
+@pytest.fixture(scope="session")
+def small_release(tmp_path_factory):
+    """Folder of a finished small release."""
+    folder = tmp_path_factory.mktemp("release") / "small"
+    roll_out(small_recipe(), folder)
+    return folder

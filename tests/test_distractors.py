@@ -1,0 +1,179 @@
+"""Distractors: ranges, statistics, independence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous
+from dmcvb_gen.distractors.background import ping_pong
+from dmcvb_gen.distractors.camera import camera_range, camera_walk, cartesian, look_at, spherical
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.rendering.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
+from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+
+STREAMS = ("camera", "color", "background", "style")
+DIFFICULTIES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
+
+
+def physics_of(task, episodes=2, frames=41):
+    batch = task.batch(episodes)
+    batch.reset([np.random.default_rng(i) for i in range(episodes)])
+    rng, rows = np.random.default_rng(9), [batch.physics()]
+    for _ in range(frames - 1):
+        batch.step(rng.uniform(-1, 1, (episodes, task.action_size)))
+        rows.append(batch.physics())
+    return np.stack(rows, axis=1)
+
+
+def generators(episodes, seed=0):
+    return {name: [episode_stream(seed, ("test",), i, name) for i in episodes] for name in STREAMS}
+
+
+def labels(task, setting, physics, episodes=None, seed=0):
+    episodes = range(len(physics)) if episodes is None else episodes
+    backgrounds = load_backgrounds("builtin", "train")
+    return make_exogenous(task, DistractorSetting.parse(setting), physics, generators(episodes, seed), backgrounds)
+
+
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_none_is_the_models_own_look(task_id):
+    task = get_task(task_id)
+    physics = physics_of(task, frames=5)
+    found = labels(task, "none", physics)
+    position, quaternion = nominal_cameras(task, physics.reshape(-1, physics.shape[-1]))
+    np.testing.assert_array_equal(found.camera_position.reshape(-1, 1, 3), position)
+    np.testing.assert_array_equal(found.camera_quaternion.reshape(-1, 1, 4), quaternion)
+    assert (found.background_video == -1).all() and (found.style == -1).all()
+    np.testing.assert_array_equal(found.material_rgb[1, 3], task.model.mat_rgba[:, :3].astype(np.float32))
+
+
+@pytest.mark.parametrize("difficulty, scale", DIFFICULTIES.items())
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_dynamic_stays_in_its_ranges(task_id, difficulty, scale):
+    task = get_task(task_id)
+    physics = physics_of(task, episodes=4, frames=120)
+    found = labels(task, f"dynamic_{difficulty}", physics)
+    agent = centers_of_mass(task, physics.reshape(-1, physics.shape[-1])).reshape(4, 120, 3)
+    radius, polar, azimuth = np.moveaxis(spherical(found.camera_position[:, :, 0] - agent), -1, 0)
+    azimuth = np.where(azimuth > 3, azimuth - 2 * np.pi, azimuth)  # the seam: pi is -pi
+    nominal = task.model.cam_poscom0[camera_ids(task)[0]]
+    r0, polar0, azimuth0 = spherical(nominal)
+    slack = 1e-5  # labels are float32
+    assert radius.min() >= r0 * (1 - 0.5 * scale) - slack and radius.max() <= r0 * (1 + 1.5 * scale) + slack
+    assert np.abs(polar - polar0).max() <= np.pi / 2 * scale + slack and polar.max() <= np.pi / 2 + slack
+    assert np.abs(azimuth - azimuth0).max() <= np.pi / 2 * scale + slack
+    assert azimuth.min() >= -np.pi - slack and azimuth.max() <= slack
+    own = task.model.mat_rgba[:, :3]
+    assert np.abs(found.material_rgb - own).max() <= scale + slack
+    assert found.material_rgb.min() >= 0 and found.material_rgb.max() <= 1
+    speed = np.linalg.norm(np.diff(found.camera_position[:, :, 0] - agent, axis=1), axis=-1)
+    assert speed.max() <= 2 * 0.4 * scale * r0 / 4 + slack  # two ticks a frame
+
+
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_the_camera_looks_at_the_agent(task_id):
+    task = get_task(task_id)
+    physics = physics_of(task, frames=60)
+    found = labels(task, "dynamic", physics)
+    agent = centers_of_mass(task, physics.reshape(-1, physics.shape[-1])).reshape(2, 60, 3)
+    rotation = matrices(found.camera_quaternion[:, :, 0].astype(float))
+    to_agent = agent - found.camera_position[:, :, 0]
+    to_agent /= np.linalg.norm(to_agent, axis=-1, keepdims=True)
+    np.testing.assert_allclose(-rotation[..., 2], to_agent, atol=1e-5)
+
+
+def test_static_varies_between_episodes_and_never_within_one():
+    task = get_task("walker-walk")
+    physics = physics_of(task, episodes=6, frames=30)
+    found = labels(task, "static", physics)
+    agent = centers_of_mass(task, physics.reshape(-1, physics.shape[-1])).reshape(6, 30, 3)
+    offset = found.camera_position[:, :, 0] - agent
+    for values in (offset, found.camera_quaternion, found.material_rgb, found.background_video, found.background_frame):
+        np.testing.assert_allclose(values, np.broadcast_to(values[:, :1], values.shape), atol=1e-5)
+    assert len(np.unique(found.material_rgb[:, 0].reshape(6, -1), axis=0)) == 6
+
+
+def test_walks_have_the_standard_deviations_they_should():
+    setting = DistractorSetting("dynamic", "hard")
+    rngs = [np.random.default_rng(i) for i in range(400)]
+    bounds = camera_range(np.array([0.0, -4.0, 2.0]), setting)
+    _, roll = camera_walk(bounds, setting, 2, rngs)
+    # One frame is two ticks of a velocity walk: v1 + (v1 + dv2) has standard deviation sqrt(5) of a step.
+    step = np.diff(roll, axis=1)[:, 0]
+    inside = np.abs(roll[:, 0]) < 0.9 * bounds.roll
+    expected = np.sqrt(5) * np.pi / 300 * 0.3
+    assert step[inside].std() == pytest.approx(expected, rel=0.15)
+    start = roll[:, 0] / bounds.roll
+    assert abs(start.mean()) < 0.1 and start.std() == pytest.approx(1 / np.sqrt(3), rel=0.1)  # uniform in [-1, 1]
+
+    task = get_task("walker-walk")
+    physics = np.repeat(physics_of(task, 1, 3), 60, axis=0)
+    colors = labels(task, "dynamic_hard", physics).material_rgb.astype(float)
+    own, low, high = task.model.mat_rgba[:, :3], 0.1, 0.9
+    free = (own - 0.3 > low) & (own + 0.3 < high)  # channels that the limits of [0, 1] do not touch
+    change = np.diff(colors, axis=1)[:, 0][:, free]
+    middle = np.abs(colors[:, 0][:, free] - own[free]) < 0.2
+    assert change[middle].std() == pytest.approx(np.sqrt(2) * 0.03 * 0.3, rel=0.1)
+
+
+@given(st.integers(1, 40), st.data())
+def test_ping_pong_walks_to_the_ends_and_back(length, data):
+    start, direction = data.draw(st.integers(0, length - 1)), data.draw(st.sampled_from([-1, 1]))
+    found = ping_pong(start, direction, np.arange(3 * length), length)
+    place, expected = start, []  # the same by hand
+    for _ in range(3 * length):
+        expected.append(place)
+        if length > 1:
+            if not 0 <= place + direction < length:
+                direction = -direction
+            place += direction
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_video_moves_a_frame_every_ten_ticks():
+    task = get_task("walker-walk")
+    found = labels(task, "dynamic", physics_of(task, episodes=3, frames=101))
+    moved = np.abs(np.diff(found.background_frame.astype(int), axis=1))
+    steps = np.flatnonzero(moved[0])
+    assert set(np.unique(moved)) == {0, 1}
+    np.testing.assert_array_equal((steps + 1) % 5, 0)  # five agent steps of two ticks
+    assert len(steps) == 20
+    assert (found.background_video == found.background_video[:, :1]).all()
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(2, 30), st.sampled_from(["static", "dynamic"]))
+def test_an_episodes_labels_depend_on_nothing_but_itself(frames, setting):
+    task = get_task("walker-walk")
+    physics = physics_of(task, episodes=3, frames=30)
+    whole = labels(task, setting, physics)
+    alone = labels(task, setting, physics[1:2, :frames], episodes=[1])
+    for (name, a), (_, b) in zip(whole.items(), alone.items(), strict=True):
+        np.testing.assert_array_equal(a[1:2, :frames], b, err_msg=name)
+
+
+def test_difficulty_decides_how_many_videos_are_in_play():
+    task = get_task("walker-walk")
+    physics = np.repeat(physics_of(task, 1, 2), 200, axis=0)
+    backgrounds = load_backgrounds("builtin", "train")
+    for difficulty, videos in (("easy", 4), ("medium", 8), ("hard", len(backgrounds))):
+        seen = labels(task, f"static_{difficulty}", physics).background_video
+        assert set(np.unique(seen)) == set(range(videos))
+
+
+def test_look_at_without_roll_keeps_the_horizon_level():
+    offset = cartesian(np.array([[3.0, 1.0, -1.2], [2.0, 0.5, -3.0]]))
+    frame = look_at(offset, np.zeros(2))
+    np.testing.assert_allclose(frame[:, 2, 0], 0, atol=1e-12)  # right is horizontal
+    assert (frame[:, 2, 1] > 0).all()  # up points up
+    np.testing.assert_allclose(np.linalg.det(frame), 1)
+
+
+@pytest.mark.parametrize("name", ["dynamik", "static_extreme"])
+def test_an_unknown_setting_is_refused(name):
+    with pytest.raises(UnknownNameError, match="Known"):
+        DistractorSetting.parse(name)
