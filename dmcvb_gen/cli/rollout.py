@@ -31,6 +31,7 @@ def _out_default(name: str) -> Path:
 @click.option("--layout", "layouts", multiple=True, help="Mazes: a layout's name or text file, instead of TASK.")
 @click.option("--episodes", type=click.IntRange(1), help="Episodes a subset.  [default: 20]")
 @click.option("--steps", type=click.IntRange(1), help="Steps a subset, instead of --episodes.")
+@click.option("--range", "episode_range", metavar="A:B", help="Only the shards that hold episodes A to B - 1.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
 @click.option("--renderer", default="warp", show_default=True, help="warp or opengl.")
@@ -47,7 +48,7 @@ def _out_default(name: str) -> Path:
 @click.option("--out", type=click.Path(path_type=Path), help="The release's folder.  [default: releases/NAME]")
 @click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
 @json_option
-def rollout(tasks, recipe, only, out, workers, executor, device, dry_run, as_json, **options):
+def rollout(tasks, recipe, only, episode_range, out, workers, executor, device, dry_run, as_json, **options):
     """Roll out behaviour policies into a release of painted episodes.
 
     The same command goes on where it stopped: what is committed is kept.
@@ -68,7 +69,7 @@ def rollout(tasks, recipe, only, out, workers, executor, device, dry_run, as_jso
         raise click.UsageError("Give TASKs or --recipe (one of them); `dmcvb-gen list` shows the tasks and recipes.")
     chosen = load_recipe(recipe) if recipe else _recipe_from_options(tasks, options)
     out = out or _out_default(chosen.name)
-    plan = make_plan(chosen, out, only, device)
+    plan = make_plan(chosen, out, only, device, parse_range(episode_range))
     if dry_run:
         return _show_plan(plan, estimate(plan), workers, as_json)
     prepared = prepare(plan, raw_bytes(plan))
@@ -101,6 +102,20 @@ def rollout(tasks, recipe, only, out, workers, executor, device, dry_run, as_jso
     rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
     click.echo(f"{out}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
     click.echo(f"Look at it: dmcvb-gen info {out}; dmcvb-gen preview {out}")
+
+
+def parse_range(text: str | None) -> tuple[int, int] | None:
+    """"100:150" -> (100, 150).
+
+    Raises:
+      click.UsageError: not two numbers, or an empty range.
+    """
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
+        raise click.UsageError(f"--range {text!r} is not A:B with A < B, e.g. 100:150")
+    return int(first), int(last)
 
 
 def _recipe_from_options(tasks, options):

@@ -32,9 +32,6 @@ from dmcvb_gen.store.writer import (
 )
 from dmcvb_gen.tasks import get_task
 
-FIXED_GOAL_STREAM = "fixed-goals"
-
-
 @dataclass(frozen=True)
 class Job:
     """One shard of subsets that share a trajectory, to be simulated once and painted for each of them.
@@ -125,12 +122,19 @@ def renderer_for(
     return renderer, videos
 
 
-def make_plan(recipe: Recipe, out: str | Path, only: Sequence[str] = (), device: str = "cpu") -> Plan:
+def make_plan(
+    recipe: Recipe,
+    out: str | Path,
+    only: Sequence[str] = (),
+    device: str = "cpu",
+    episodes: tuple[int, int] | None = None,
+) -> Plan:
     """Check a recipe and list its jobs.
 
     Args:
       out: the release's folder; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
+      episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
 
     Raises:
       DmcvbError: anything that would fail later, found before any work.
@@ -189,10 +193,10 @@ def make_plan(recipe: Recipe, out: str | Path, only: Sequence[str] = (), device:
         subsets=tuple(records),
         environments=(environment(),),
     )
-    return _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device)
+    return _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, episodes)
 
 
-def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device) -> Plan:
+def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, episodes) -> Plan:
     groups: dict[tuple, list[SubsetRecord]] = {}
     facts: dict[tuple, dict] = {}
     done = 0
@@ -204,7 +208,8 @@ def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device) -
         shared = recipe.trajectories == "shared" and request.setting != "fixed"
         names = (record.task, record.level) if shared else (record.task, record.level, record.setting)
         for shard in range(shard_count(record)):
-            if shard in commits:
+            first, last = shard_episodes(record, shard)
+            if shard in commits or (episodes and not (first < episodes[1] and episodes[0] < last)):
                 continue
             key = (names, shard, record.episodes, record.episodes_per_shard, record.deterministic)
             key += (tuple(policy.digest for policy in record.policies),)

@@ -1,0 +1,185 @@
+"""Both renderers through one suite, and each against what it should look like."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous
+from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.rendering import available_renderers, floor_alpha_for, make_renderer
+from dmcvb_gen.rendering.opengl import unavailable
+from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+
+needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
+RENDERERS = ["warp", pytest.param("opengl", marks=needs_opengl)]
+FRAMES = 12
+LARGEST_DIFFERENCE = {"none": 8.0, "static": 8.0, "dynamic": 8.0}
+"""Mean absolute difference of the renderers in grey levels of 255: no mirror image on the floor in warp."""
+
+
+def frames_of(task_id, setting_name, count=FRAMES):
+    task, setting = get_task(task_id), DistractorSetting.parse(setting_name)
+    batch = task.batch(2)
+    batch.reset([np.random.default_rng(i) for i in range(2)])
+    rng, rows = np.random.default_rng(3), []
+    for _ in range(count // 2):
+        for _ in range(3):
+            batch.step(rng.uniform(-1, 1, (2, task.action_size)))
+        rows.append(batch.physics())
+    physics = np.stack(rows, axis=1)
+    generators = {
+        name: [episode_stream(1, ("render",), i, name) for i in range(2)]
+        for name in ("camera", "color", "background", "style")
+    }
+    labels = make_exogenous(task, setting, physics, generators, load_backgrounds()).flat()
+    return task, setting, physics.reshape(-1, physics.shape[-1]), labels
+
+
+def renderer_of(name, task, setting, size=64, **options):
+    return make_renderer(
+        name, task, size, backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting), **options
+    )
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+@pytest.mark.parametrize("setting_name", ["none", "dynamic"])
+def test_a_frame_does_not_depend_on_the_frames_beside_it(name, setting_name):
+    task, setting, physics, labels = frames_of("humanoid-walk", setting_name)
+    renderer = renderer_of(name, task, setting, 32)
+    whole = renderer.render(physics, labels)
+    assert whole.shape == (FRAMES, 1, 32, 32, 3) and whole.dtype == np.uint8
+    order = np.random.default_rng(0).permutation(FRAMES)
+    np.testing.assert_array_equal(renderer.render(physics[order], labels[order]), whole[order])
+    np.testing.assert_array_equal(renderer.render(physics[5:6], labels[5:6]), whole[5:6])
+    renderer.close()
+    other = renderer_of(name, task, setting, 32)
+    np.testing.assert_array_equal(other.render(physics[:3], labels[:3]), whole[:3])
+    other.close()
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_a_material_color_changes_its_pixels(name):
+    task, setting, physics, labels = frames_of("walker-walk", "none", 2)
+    renderer = renderer_of(name, task, setting)
+    before = renderer.render(physics, labels).astype(int)
+    labels.material_rgb[:, task.model.material("self").id] = (0.0, 1.0, 0.0)
+    after = renderer.render(physics, labels).astype(int)
+    changed = np.abs(after - before).sum(-1) > 30
+    greener = (after - before)[changed][:, 1] - (after - before)[changed][:, 0]
+    assert 0.01 < changed.mean() < 0.4 and (greener > 0).mean() > 0.9
+    renderer.close()
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_a_background_changes_the_sky_alone_under_an_opaque_floor(name):
+    task, setting, physics, labels = frames_of("walker-walk", "static", 4)
+    renderer = renderer_of(name, task, setting)
+    segmentation = renderer.render_labels(physics, labels)["segmentation"]
+    first = renderer.render(physics, labels).astype(int)
+    labels.background_video[:] = (labels.background_video + 1) % 8
+    second = renderer.render(physics, labels).astype(int)
+    changed = np.abs(second - first).sum(-1) > 0
+    inside = ~_near(segmentation == -1)  # pixels away from the sky's edge, which samples may touch
+    assert changed[segmentation == -1].mean() > 0.9
+    reflections = 0.02 if name == "opengl" else 0.0
+    assert changed[inside].mean() <= reflections
+    renderer.close()
+
+
+def _near(mask):
+    """The mask grown by one pixel."""
+    out = mask.copy()
+    for axis in (-1, -2):
+        for shift in (-1, 1):
+            out |= np.roll(mask, shift, axis)
+            mask = out.copy()
+    return out
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_the_background_shows_through_humanoids_floor(name):
+    task, setting, physics, labels = frames_of("humanoid-walk", "static", 2)
+    renderer = renderer_of(name, task, setting)
+    segmentation = renderer.render_labels(physics, labels)["segmentation"]
+    floor = task.model.geom("floor").id
+    first = renderer.render(physics, labels).astype(int)
+    labels.background_video[:] = (labels.background_video + 1) % 8
+    second = renderer.render(physics, labels).astype(int)
+    assert (np.abs(second - first).sum(-1) > 0)[segmentation == floor].mean() > 0.8
+    renderer.close()
+
+
+@needs_opengl
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_depth_and_segmentation_of_the_renderers_agree(task_id):
+    task, setting, physics, labels = frames_of(task_id, "none", 4)
+    found = {}
+    for name in ("warp", "opengl"):
+        renderer = renderer_of(name, task, setting)
+        found[name] = renderer.render_labels(physics, labels)
+        renderer.close()
+    same = found["warp"]["segmentation"] == found["opengl"]["segmentation"]
+    assert same.mean() > 0.93
+    # Warp's labels are of a pixel's first sample, so the floor seen at a low angle is at another distance.
+    both = same & (found["warp"]["segmentation"] > task.model.geom("floor").id)
+    ratio = found["warp"]["depth"][both] / found["opengl"]["depth"][both]
+    assert np.median(np.abs(ratio - 1)) < 0.02
+
+
+@needs_opengl
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_opengl_without_distractors_is_dm_controls_picture(task_id):
+    import mujoco
+    from dm_control import suite
+
+    from dmcvb_gen.tasks import PHYSICS_SPEC
+
+    task, setting, physics, labels = frames_of(task_id, "none", 4)
+    renderer = renderer_of("opengl", task, setting)
+    ours = renderer.render(physics, labels)[:, 0]
+    renderer.close()
+    environment = suite.load(*task_id.split("-"))
+    environment.reset()
+    for row, picture in zip(physics, ours, strict=True):
+        mujoco.mj_setState(environment.physics.model.ptr, environment.physics.data.ptr, row, PHYSICS_SPEC)
+        environment.physics.forward()
+        theirs = environment.physics.render(64, 64, camera_id=0)
+        # Labels are float32: a pixel on an edge may fall to the other side.
+        assert (np.abs(picture.astype(int) - theirs) > 2).mean() < 0.01
+
+
+@needs_opengl
+@pytest.mark.parametrize("setting_name", ["none", "static", "dynamic"])
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_warp_stays_close_to_opengl(task_id, setting_name):
+    task, setting, physics, labels = frames_of(task_id, setting_name)
+    pictures = {}
+    for name in ("warp", "opengl"):
+        renderer = renderer_of(name, task, setting)
+        pictures[name] = renderer.render(physics, labels).astype(int)
+        renderer.close()
+    difference = np.abs(pictures["warp"] - pictures["opengl"]).mean()
+    assert difference < LARGEST_DIFFERENCE[setting_name]
+    shuffled = np.abs(pictures["warp"] - np.roll(pictures["opengl"], 5, axis=0)).mean()
+    assert difference < shuffled  # the bound would mean nothing if any frame met it
+
+
+@pytest.mark.parametrize("size", [0, 7, 5000])
+@pytest.mark.parametrize("name", RENDERERS)
+def test_sizes_out_of_range_are_refused(name, size):
+    with pytest.raises(RenderingError, match="8 to 1024"):
+        make_renderer(name, get_task("walker-walk"), size)
+
+
+def test_unknown_renderers_and_devices_name_the_cure():
+    with pytest.raises(UnknownNameError, match="warp"):
+        make_renderer("vulkan", get_task("walker-walk"), 64)
+    with pytest.raises(RenderingError, match="--device cpu"):
+        make_renderer("warp", get_task("walker-walk"), 64, device="cuda:7")
+
+
+def test_available_renderers_say_why_not():
+    found = available_renderers()
+    assert found["warp"] is None and (found["opengl"] is None or "libegl1" in found["opengl"])
