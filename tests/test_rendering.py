@@ -123,9 +123,9 @@ def test_depth_and_segmentation_of_the_renderers_agree(task_id):
     same = found["warp"]["segmentation"] == found["opengl"]["segmentation"]
     assert same.mean() > 0.93
     # Warp's labels are of a pixel's first sample, so the floor seen at a low angle is at another distance.
-    both = same & (found["warp"]["segmentation"] > task.model.geom("floor").id)
+    both = same & (found["warp"]["segmentation"] > 0)  # 0 is the floor
     ratio = found["warp"]["depth"][both] / found["opengl"]["depth"][both]
-    assert np.median(np.abs(ratio - 1)) < 0.02
+    assert len(ratio) > 20 and np.median(np.abs(ratio - 1)) < 0.02
 
 
 @needs_opengl

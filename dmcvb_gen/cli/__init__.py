@@ -15,6 +15,7 @@ COMMANDS = {
     "info": ("rollout:info", "Show what a release holds, returns beside the paper's."),
     "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
     "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
+    "verify": ("release:verify", "Check that a release is what it says."),
     "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
     "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
     "select-checkpoints": ("behaviours:select_checkpoints", "Pick a run's expert, medium and mixed checkpoints."),

@@ -105,7 +105,7 @@ def rollout(tasks, recipe, only, episode_range, out, workers, executor, device, 
 
 
 def parse_range(text: str | None) -> tuple[int, int] | None:
-    """"100:150" -> (100, 150).
+    """ "100:150" -> (100, 150).
 
     Raises:
       click.UsageError: not two numbers, or an empty range.

@@ -32,6 +32,7 @@ from dmcvb_gen.store.writer import (
 )
 from dmcvb_gen.tasks import get_task
 
+
 @dataclass(frozen=True)
 class Job:
     """One shard of subsets that share a trajectory, to be simulated once and painted for each of them.

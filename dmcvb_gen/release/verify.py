@@ -1,0 +1,227 @@
+"""Is a release what it says? A folder in, findings out: bytes, shapes, values, physics, pixels, returns.
+
+Every finding names subset, episode and step. Digests and values are checked everywhere; a sample of steps is
+simulated again and a sample of frames painted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dmcvb_gen.distractors.backgrounds import load_backgrounds
+from dmcvb_gen.distractors.base import Exogenous
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.rollout.plan import renderer_for
+from dmcvb_gen.store import Release, Subset, open_release
+from dmcvb_gen.store.schema import EXOGENOUS_NAMES, array_specs
+from dmcvb_gen.store.writer import read_commits, sha256_file, shard_count, subset_digest
+from dmcvb_gen.tasks import get_task
+
+SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
+"""How much of each subset is simulated and painted again."""
+REWARD_TOLERANCE, STATE_TOLERANCE = 1e-4, 1e-3
+"""Largest difference that another CPU or library version may cause in one step; on the same machine it is 0."""
+PIXEL_TOLERANCE = 2.0
+"""Mean absolute difference of a repainted frame, grey levels of 255; on the same machine it is 0."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something wrong: which check, where, and what."""
+
+    check: str
+    subset: str
+    message: str
+    episode: int | None = None
+    step: int | None = None
+
+    def __str__(self) -> str:
+        place = self.subset
+        if self.episode is not None:
+            place += f", episode {self.episode}"
+        if self.step is not None:
+            place += f", step {self.step}"
+        return f"{self.check}: {place}: {self.message}"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was looked at, and what was found wrong."""
+
+    checked: dict[str, int]
+    findings: tuple[Finding, ...]
+
+    @property
+    def sound(self) -> bool:
+        return not self.findings
+
+
+def _sample(count: int, wanted: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
+
+
+def check_files(release: Release) -> Iterator[Finding]:
+    """Every committed file has its bytes; every shard of a complete release is there."""
+    for record in release.manifest.subsets:
+        commits = read_commits(release.path, record)
+        if release.manifest.complete:
+            for shard in range(shard_count(record)):
+                if shard not in commits:
+                    yield Finding("files", record.name, f"shard {shard} is missing or has files of another size")
+        for shard, commit in commits.items():
+            for file in commit.files:
+                if sha256_file(release.path / file.path) != file.sha256:
+                    yield Finding("files", record.name, f"{file.path} of shard {shard} does not have its digest")
+        if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
+            yield Finding("files", record.name, "its commit records do not give the digest of the manifest")
+
+
+def check_values(subset: Subset) -> Iterator[Finding]:
+    """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
+    task = get_task(subset.task)
+    episodes = subset.episodes
+    for spec in array_specs(task, subset.record.size, pixels=bool(subset.pixel_arrays)):
+        if spec.name not in subset.group:
+            yield Finding("shapes", subset.name, f"array {spec.name} is missing")
+            return
+        array = subset.group[spec.name]
+        rows = (task.max_steps + 1,) if spec.steps else ()
+        wanted = (subset.record.episodes, *rows, *spec.shape)
+        if array.shape != wanted or array.dtype != np.dtype(spec.dtype):
+            yield Finding("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
+            return
+    seen: dict[bytes, int] = {}
+    for episode, length in zip(map(int, episodes), map(int, subset.lengths), strict=True):
+        if not 0 < length <= task.max_steps:
+            yield Finding("lengths", subset.name, f"length {length} is not in 1..{task.max_steps}", episode)
+            continue
+        values = subset.episode(episode, ["state", "action", "reward", "physics", "discount", "return", "terminated"])
+        for name in ("state", "action", "reward", "physics", "discount"):
+            bad = ~np.isfinite(values[name].reshape(len(values[name]), -1)).all(axis=1)
+            if bad.any():
+                yield Finding("finite", subset.name, f"{name} is not finite", episode, int(bad.argmax()))
+        if np.abs(values["action"]).max() > 1:
+            step = int(np.abs(values["action"]).max(axis=1).argmax())
+            yield Finding("actions", subset.name, "an action is outside [-1, 1]", episode, step)
+        total = float(values["reward"].astype(np.float64).sum())
+        if not abs(total - float(values["return"])) <= 1e-6 * max(1.0, abs(total)):
+            yield Finding(
+                "returns", subset.name, f"rewards sum to {total:.4f}, return is {values['return']:.4f}", episode
+            )
+        low, high = task.return_range
+        if not low <= total <= high:
+            yield Finding("returns", subset.name, f"return {total:.2f} is outside {low:g}..{high:g}", episode)
+        if (
+            bool(values["terminated"]) != (values["discount"][-1] == 0)
+            or (length < task.max_steps) > values["terminated"]
+        ):
+            yield Finding("lengths", subset.name, "length, discount and terminated do not agree", episode)
+        key = values["action"].tobytes()
+        if key in seen:
+            yield Finding("duplicates", subset.name, f"has the actions of episode {seen[key]}", episode)
+        seen[key] = episode
+
+
+def check_physics(subset: Subset) -> Iterator[Finding]:
+    """Sampled steps simulated again: state, reward and next physics state are the stored ones."""
+    task = get_task(subset.task)
+    for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
+        episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+        values = subset.episode(episode, ["state", "action", "reward", "physics"])
+        steps = _sample(length, SAMPLE_STEPS)
+        batch = task.batch(len(steps))
+        with np.errstate(invalid="ignore"):
+            state = batch.set_physics(values["physics"][steps])
+            for row, step in enumerate(steps):
+                gap = np.abs(state[row] - values["state"][step]).max()
+                if not gap <= STATE_TOLERANCE:
+                    yield Finding("states", subset.name, f"physics gives a state {gap:.3g} away", episode, int(step))
+            result = batch.step(values["action"][steps])
+            after = batch.set_physics(values["physics"][steps + 1])
+            for row, step in enumerate(steps):
+                gap = abs(result.reward[row] - values["reward"][step])
+                if not gap <= REWARD_TOLERANCE:
+                    yield Finding(
+                        "rewards",
+                        subset.name,
+                        f"reward is {values['reward'][step]:.5f}, the physics gives {result.reward[row]:.5f}",
+                        episode,
+                        int(step),
+                    )
+                gap = np.abs(result.state[row] - after[row]).max()
+                if not gap <= STATE_TOLERANCE * 10:
+                    yield Finding("physics", subset.name, f"the action leads {gap:.3g} away", episode, int(step))
+
+
+def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Finding]:
+    """Sampled frames painted again from physics and labels; frames that are black or never change."""
+    recorded = subset.record.backgrounds
+    source = backgrounds or (recorded["source"] if recorded else "builtin")
+    split = recorded["split"] if recorded else "train"
+    if recorded:
+        digest = load_backgrounds(source, split).digest
+        if digest != recorded["digest"]:
+            yield Finding(
+                "pixels", subset.name, f"backgrounds {source!r} are not those of the manifest; give --backgrounds"
+            )
+            return
+    renderer, _ = renderer_for(subset.record, source, split)
+    task = get_task(subset.task)
+    try:
+        for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
+            episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+            values = subset.episode(episode)
+            steps = _sample(length + 1, SAMPLE_FRAMES)
+            labels = Exogenous(**{name: values[f"exogenous/{name}"] for name in EXOGENOUS_NAMES})
+            for name in subset.pixel_arrays:
+                stored = values[name][steps]
+                view = name.split("/")[1] if "/" in name else task.views[0]
+                hidden = name.startswith("pixels_hidden_goal")
+                painted = renderer.render(values["physics"][steps], labels[steps], [view], hide_goal=hidden)[:, 0]
+                gaps = np.abs(painted.astype(int) - stored).reshape(len(steps), -1).mean(axis=1)
+                for step, gap in zip(steps, gaps, strict=True):
+                    if gap > PIXEL_TOLERANCE:
+                        yield Finding("pixels", subset.name, f"{name} is {gap:.1f} grey levels off", episode, int(step))
+                if stored.max() == 0:
+                    yield Finding("pixels", subset.name, f"{name} is black", episode)
+                elif (stored == stored[:1]).all() and len(steps) > 1:
+                    yield Finding("pixels", subset.name, f"{name} never changes", episode)
+    finally:
+        renderer.close()
+
+
+def verify(
+    path: str | Path, backgrounds: str | None = None, tick: Callable[[str], None] = lambda subset: None
+) -> Verification:
+    """Check a release.
+
+    Args:
+      backgrounds: where the manifest's videos are now, if they moved.
+
+    Raises:
+      DmcvbError: there is no release, or nothing is committed.
+    """
+    release = open_release(path)
+    if not release.subsets:
+        raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
+    findings = list(check_files(release))
+    damaged = {finding.subset for finding in findings}
+    counts = {"subsets": 0, "episodes": 0, "steps": 0}
+    for name, subset in release.subsets.items():
+        tick(name)
+        counts["subsets"] += 1
+        counts["episodes"] += len(subset.episodes)
+        counts["steps"] += subset.steps
+        if name in damaged:
+            continue  # its bytes cannot be trusted, so what they say is not worth reporting
+        found = list(check_values(subset))
+        findings += found
+        if any(finding.check in ("shapes", "lengths") for finding in found):
+            continue
+        findings += check_physics(subset)
+        findings += check_pixels(subset, backgrounds)
+    return Verification(counts, tuple(findings))

@@ -1,0 +1,6 @@
+#!/usr/bin/env bash
+# Sets everything up on a fresh machine (Python 3.11, pip) and runs the tests: bash scripts/test.sh [pytest options]
+. "$(dirname "$0")/setup.sh"
+ruff check .
+ruff format --check .
+exec python -m pytest "$@"

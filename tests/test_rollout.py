@@ -1,0 +1,234 @@
+"""Rollouts: the same bits however they are made, interrupted and resumed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from dmcvb_gen.behaviours.policy_file import random_policy
+from dmcvb_gen.behaviours.simulate import simulate
+from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
+from dmcvb_gen.rollout.estimate import estimate
+from dmcvb_gen.rollout.plan import make_plan, prepare
+from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, select, shipped_recipes
+from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.store import open_release
+from dmcvb_gen.tasks import get_task
+from tests.conftest import roll_out, small_recipe
+
+
+def digests(manifest):
+    return {subset.name: subset.digest for subset in manifest.subsets}
+
+
+def reference(small_release):
+    return digests(open_release(small_release).manifest)
+
+
+def test_shards_in_any_order_give_the_same_digests(small_release, tmp_path):
+    found = roll_out(small_recipe(), tmp_path / "r", jobs=lambda jobs: jobs[::-1])
+    assert found.complete and digests(found) == reference(small_release)
+
+
+def test_two_workers_give_the_same_digests(small_release, tmp_path):
+    assert digests(roll_out(small_recipe(), tmp_path / "r", workers=2)) == reference(small_release)
+
+
+def test_a_range_of_episodes_made_alone_gives_the_same_files(small_release, tmp_path):
+    plan = prepare(make_plan(small_recipe(), tmp_path / "r", ["*/*/dynamic"], episodes=(2, 3)))
+    assert [job.shard for job in plan.jobs] == [1] and len(plan.jobs[0].subsets) == 1
+    from dmcvb_gen.rollout.executors import run_jobs
+
+    [result] = run_jobs(plan.jobs)
+    whole = open_release(small_release)["walker-walk/random/dynamic"].commits[1]
+    assert result.commits == (whole,)
+
+
+def test_an_episode_depends_on_its_index_alone():
+    task = get_task("cheetah-run")
+    policies = [random_policy(task)]
+    together = simulate(task, policies, [3, 4, 40], 0, ("a", "b"), max_steps=20)
+    alone = simulate(task, policies, [40], 0, ("a", "b"), max_steps=20)
+    np.testing.assert_array_equal(together.physics[2:], alone.physics)
+    np.testing.assert_array_equal(together.action[2:], alone.action)
+    other = simulate(task, policies, [40], 1, ("a", "b"), max_steps=20)
+    assert (other.action != alone.action).any() and other.seed != alone.seed
+
+
+def test_streams_of_an_episode_are_independent_of_each_other():
+    draws = {name: episode_stream(0, ("t",), 5, name).random(4) for name in ("initial_state", "policy", "camera")}
+    assert len({tuple(values) for values in draws.values()}) == 3
+
+
+COMMAND = [sys.executable, "-m", "dmcvb_gen", "rollout", "walker-walk", "--level", "random", "--distractor", "none"]
+COMMAND += ["--distractor", "dynamic", "--episodes", "5", "--episodes-per-shard", "1", "--size", "16", "--samples", "1"]
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_it_goes_on_and_ends_with_the_same_bytes(tmp_path):
+    quiet = dict(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    subprocess.run([*COMMAND, "--out", str(tmp_path / "whole")], check=True, **quiet)
+    broken, rng, kills = tmp_path / "broken", random.Random(1), 0
+    for _ in range(4):
+        process = subprocess.Popen([*COMMAND, "--out", str(broken), "--workers", "2"], start_new_session=True, **quiet)
+        wanted = len(list(broken.glob("commits/**/*.json"))) + 1
+        deadline = time.time() + 120
+        while process.poll() is None and time.time() < deadline:
+            if len(list(broken.glob("commits/**/*.json"))) >= wanted:
+                time.sleep(rng.uniform(0, 0.3))
+                break
+            time.sleep(0.01)
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            kills += 1
+        process.wait()
+        if broken.joinpath("manifest.json").exists():
+            for subset in open_release(broken).subsets.values():  # never a readable lie
+                whole = open_release(tmp_path / "whole")[subset.name]
+                np.testing.assert_array_equal(subset.read("pixels"), whole.read("pixels", subset.episodes))
+    assert kills >= 2
+    subprocess.run([*COMMAND, "--out", str(broken)], check=True, **quiet)
+    first, second = open_release(tmp_path / "whole").manifest, open_release(broken).manifest
+    assert second.complete and digests(first) == digests(second)
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path):
+    process = subprocess.Popen(
+        [*COMMAND, "--episodes", "40", "--out", str(tmp_path / "r"), "--workers", "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.time() + 120
+    while not list((tmp_path / "r").glob("commits/**/*.json")) and time.time() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode != 0 and "the same command goes on" in errors and "Traceback" not in errors
+    assert len(open_release(tmp_path / "r").subsets) >= 1
+
+
+def test_what_is_committed_is_not_made_again(small_release):
+    plan = make_plan(small_recipe(), small_release)
+    assert plan.jobs == () and plan.done == 6
+
+
+def test_another_recipe_is_refused_and_touches_nothing(small_release):
+    before = {path: path.stat().st_mtime_ns for path in small_release.rglob("*") if path.is_file()}
+    with pytest.raises(StoreError, match="another recipe's release.*seed"):
+        prepare(make_plan(small_recipe(seed=4), small_release))
+    assert before == {path: path.stat().st_mtime_ns for path in small_release.rglob("*") if path.is_file()}
+
+
+def test_a_folder_with_other_things_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(StoreError, match="not empty"):
+        prepare(make_plan(small_recipe(), tmp_path))
+
+
+def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, tmp_path):
+    import shutil
+
+    from dmcvb_gen.rollout.executors import run_jobs
+
+    copy = tmp_path / "copy"
+    shutil.copytree(small_release, copy)
+    (copy / "commits/walker-walk/random/dynamic/00001.json").unlink()
+    plan = prepare(make_plan(small_recipe(), copy))
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))  # every longer file fails to be written
+        with pytest.raises(StoreError, match="what was committed is safe"):
+            list(run_jobs(plan.jobs))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert list(open_release(copy)["walker-walk/random/dynamic"].episodes) == [0, 1]
+    assert digests(roll_out(small_recipe(), copy)) == reference(small_release)
+
+
+def test_more_than_the_disk_holds_is_refused_before_any_work(tmp_path):
+    with pytest.raises(StoreError, match="GB are needed"):
+        prepare(make_plan(small_recipe(), tmp_path / "r"), expected_bytes=1e18)
+
+
+def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path):
+    cost = estimate(make_plan(small_recipe(), tmp_path / "r"))
+    release = open_release(small_release)
+    assert cost.jobs == 2 and cost.episodes == 9 and cost.steps == 4500
+    actual = sum(subset.bytes for subset in release.subsets.values())
+    assert 0.4 * actual < cost.bytes < 2.5 * actual
+    assert cost.core_seconds > 0 and not (tmp_path / "r").exists()
+
+
+def test_shipped_recipes_expand_to_what_the_paper_has():
+    assert {"quickstart", "dmcvb-mini", "dmcvb-v1"} <= set(shipped_recipes())
+    mini = expand(load_recipe("dmcvb-mini"))
+    assert len(mini) == 36 and all(request.episodes == 20 for request in mini)
+
+
+@pytest.mark.parametrize(
+    "changes, error, words",
+    [
+        ({"size": 0}, RecipeError, "8 to 1024"),
+        ({"size": 5000}, RecipeError, "8 to 1024"),
+        ({"seed": -1}, RecipeError, "seed"),
+        ({"name": "a/b"}, RecipeError, "name"),
+        ({"colour": "red"}, RecipeError, "colour"),
+        ({"renderer": {"backend": "povray"}}, UnknownNameError, "warp"),
+        ({"backgrounds": "/nowhere"}, DmcvbError, "does not exist"),
+        ({"subsets": []}, RecipeError, "subsets"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused_before_any_work(tmp_path, changes, error, words):
+    with pytest.raises(error, match=words):
+        make_plan(small_recipe(**changes), tmp_path / "r")
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"tasks": "walker-fly"}, "walker-walk"),
+        ({"levels": "master"}, "expert"),
+        ({"settings": "blurry"}, "dynamic"),
+        ({"episodes": 0}, "greater than 0"),
+        ({"episodes": None}, "say how much"),
+        ({"steps": 500}, "not both"),
+        ({"policies": {"expert": "x"}}, "does not ask for"),
+        ({"levels": "expert", "policies": {"expert": "/nowhere.safetensors"}}, "nowhere"),
+    ],
+)
+def test_subsets_that_make_no_sense_are_refused(tmp_path, changes, words):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2} | changes
+    with pytest.raises(DmcvbError, match=words):
+        make_plan(make_recipe({"name": "x", "subsets": [pattern]}), tmp_path / "r")
+
+
+def test_patterns_select_and_unknown_ones_are_refused():
+    names = ["walker-walk/expert/none", "walker-walk/expert/static", "cheetah-run/random/none"]
+    assert select(names, ["walker-walk/*/static"]) == names[1:2]
+    assert select(names, ["walker-walk"]) == names[:2] and select(names, []) == names
+    with pytest.raises(UnknownNameError, match="walker-walk/expert/none"):
+        select(names, ["walker-walk/*/dynamic"])
+
+
+def test_the_manifest_names_everything_needed_to_make_it_again(small_release):
+    data = json.loads((small_release / "manifest.json").read_text())
+    subset = next(subset for subset in data["subsets"] if subset["setting"] == "dynamic")
+    assert data["recipe"]["seed"] == 3 and subset["renderer"]["name"] == "warp" and subset["renderer"]["samples"] == 1
+    assert len(subset["backgrounds"]["digest"]) == 64 and subset["digest"]
+    assert {"mujoco", "mujoco-warp", "torch", "cpu", "system", "zarr"} <= set(data["environments"][0])
+    assert make_recipe(data["recipe"]) == small_recipe()

@@ -1,0 +1,126 @@
+"""A sound release passes; each kind of damage is found by the check that is meant for it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import zarr
+
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
+from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
+
+NAME = "walker-walk/random/dynamic"
+
+
+@pytest.fixture
+def copy(small_release, tmp_path):
+    shutil.copytree(small_release, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def rewrite(folder, change):
+    """Change arrays of a subset and make its digests again, as a careless (or dishonest) hand would."""
+    change(zarr.open_group(str(folder / f"{NAME}.zarr"), mode="r+", use_consolidated=False))
+    for shard in range(2):
+        path = folder / commit_path(NAME, shard)
+        commit = parse_commit(path.read_text())
+        files = [
+            file.model_copy(
+                update={"bytes": (folder / file.path).stat().st_size, "sha256": sha256_file(folder / file.path)}
+            )
+            for file in commit.files
+        ]
+        write_json_atomically(path, commit.model_copy(update={"files": tuple(files)}))
+    finish_release(folder, open_release(folder).manifest)
+
+
+def checks(folder):
+    return {(finding.check, finding.subset) for finding in verify(folder).findings}
+
+
+def test_a_sound_release_passes(small_release):
+    result = verify(small_release)
+    assert result.sound and result.checked == {"subsets": 3, "episodes": 9, "steps": 4500}
+
+
+def test_a_flipped_byte_is_found_by_its_digest(copy):
+    file = next(file for file in open_release(copy)[NAME].commits[1].files if "/pixels/" in file.path)
+    data = bytearray((copy / file.path).read_bytes())
+    data[len(data) // 2] ^= 1
+    (copy / file.path).write_bytes(data)
+    [finding] = verify(copy).findings
+    assert finding.check == "files" and "pixels" in finding.message and "shard 1" in finding.message
+
+
+def test_a_truncated_shard_is_found(copy):
+    file = next(file for file in open_release(copy)[NAME].commits[0].files if "/state/" in file.path)
+    (copy / file.path).write_bytes((copy / file.path).read_bytes()[:100])
+    assert ("files", NAME) in checks(copy)
+
+
+def test_a_swapped_reward_is_found_by_simulating_again(copy):
+    def swap(group):
+        rewards = group["reward"][0]
+        rewards[:500] = np.roll(rewards[:500], 7)  # the return stays the same
+        group["reward"][0] = rewards
+
+    rewrite(copy, swap)
+    found = verify(copy).findings
+    assert {finding.check for finding in found} <= {"rewards", "returns"} and any(f.check == "rewards" for f in found)
+    assert all(finding.episode == 0 and finding.subset == NAME for finding in found)
+
+
+def test_pixels_of_another_episode_are_found_by_painting_again(copy):
+    def swap(group):
+        group["pixels"][1] = group["pixels"][0]
+
+    rewrite(copy, swap)
+    found = verify(copy).findings
+    assert {finding.check for finding in found} == {"pixels"} and {finding.episode for finding in found} == {1}
+
+
+def test_a_nan_state_is_found_with_its_step(copy):
+    def spoil(group):
+        state = group["state"][2]
+        state[123, 4] = np.nan
+        group["state"][2] = state
+
+    rewrite(copy, spoil)
+    found = [finding for finding in verify(copy).findings if finding.check == "finite"]
+    assert [(finding.episode, finding.step) for finding in found] == [(2, 123)]
+
+
+def test_a_return_that_does_not_match_is_found(copy):
+    def inflate(group):
+        returns = group["return"][:]
+        returns[1] += 100
+        group["return"][:] = returns
+
+    rewrite(copy, inflate)
+    assert checks(copy) == {("returns", NAME)}
+
+
+def test_a_duplicated_episode_is_found(copy):
+    def duplicate(group):
+        for name in ("state", "action", "reward", "physics", "return"):
+            group[name][2] = group[name][0]
+
+    rewrite(copy, duplicate)
+    assert ("duplicates", NAME) in checks(copy)
+
+
+def test_a_missing_shard_of_a_complete_release_is_found(copy):
+    (copy / commit_path(NAME, 1)).unlink()
+    assert ("files", NAME) in checks(copy)
+
+
+def test_a_manifest_that_names_another_digest_is_found(copy):
+    data = json.loads((copy / "manifest.json").read_text())
+    data["subsets"][0]["digest"] = "0" * 64
+    (copy / "manifest.json").write_text(json.dumps(data))
+    assert {check for check, _ in checks(copy)} == {"files"}
