@@ -232,7 +232,7 @@ class Run:
                     round(evaluation.mean, 3),
                     round(evaluation.std, 3),
                     "" if evaluation.success is None else evaluation.success,
-                    round(float(learner.log_alpha.exp()), 5),
+                    round(float(learner.log_alpha.detach().exp()), 5),
                     learner.updates,
                 ]
             )

@@ -1,0 +1,171 @@
+"""Policy files: round trips, and everything that is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from dmcvb_gen.behaviours.bundled import bundled_policies, resolve_policies
+from dmcvb_gen.behaviours.policy_file import (
+    Actor,
+    Evaluation,
+    PolicyHeader,
+    load_policy,
+    random_policy,
+    read_header,
+    save_policy,
+)
+from dmcvb_gen.behaviours.simulate import TILE, TiledActor
+from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.tasks import get_task
+
+
+def header_of(task_id="walker-walk", **changes):
+    task = get_task(task_id)
+    fields = dict(
+        task=task_id,
+        observation_size=task.behaviour_size,
+        action_size=task.action_size,
+        algorithm="sac",
+        agent_step=1000,
+        hidden=(16, 16),
+        evaluation=Evaluation(mean=1.0, std=0.5, episodes=3, mode="sampled", seed=0),
+    )
+    return PolicyHeader(**fields | changes)
+
+
+@pytest.fixture
+def policy_path(tmp_path):
+    torch.manual_seed(0)
+    header = header_of()
+    actor = Actor(header)
+    actor.observation_mean += 0.5
+    actor.observation_std *= 2.0
+    save_policy(tmp_path / "policy.safetensors", header, actor.state_dict())
+    return tmp_path / "policy.safetensors"
+
+
+def observations(count=5):
+    return np.random.default_rng(0).normal(size=(count, 24)).astype(np.float32)
+
+
+def test_a_policy_comes_back_as_it_was_saved(policy_path):
+    first, second = load_policy(policy_path, get_task("walker-walk")), load_policy(policy_path)
+    assert first.header == header_of() == read_header(policy_path) and first.digest == second.digest
+    np.testing.assert_array_equal(
+        first.act(observations(), deterministic=True), second.act(observations(), deterministic=True)
+    )
+
+
+def test_actions_are_the_networks_by_hand(policy_path):
+    weights = {name: value.numpy() for name, value in load_file(policy_path).items()}
+    x = ((observations() - 0.5) / 2.0).clip(-10, 10)
+    for layer in (0, 2):
+        x = np.maximum(x @ weights[f"body.{layer}.weight"].T + weights[f"body.{layer}.bias"], 0)
+    mean = x @ weights["mean.weight"].T + weights["mean.bias"]
+    std = np.exp((x @ weights["log_std.weight"].T + weights["log_std.bias"]).clip(-20, 2))
+    policy = load_policy(policy_path)
+    np.testing.assert_allclose(policy.act(observations(), deterministic=True), np.tanh(mean), atol=1e-6)
+    rngs = [np.random.default_rng(i) for i in range(5)]
+    noise = np.stack([np.random.default_rng(i).standard_normal(6, np.float32) for i in range(5)])
+    np.testing.assert_allclose(policy.act(observations(), rngs), np.tanh(mean + std * noise), atol=1e-6)
+
+
+@pytest.mark.parametrize("distribution", ["squashed_gaussian", "gaussian", "deterministic"])
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_every_kind_of_actor_acts_in_range(tmp_path, distribution, layer_norm):
+    header = header_of(distribution=distribution, layer_norm=layer_norm, noise=0.1, activation="elu")
+    save_policy(tmp_path / "p", header, Actor(header).state_dict())
+    policy = load_policy(tmp_path / "p")
+    sampled = policy.act(100 * observations(), [np.random.default_rng(i) for i in range(5)])
+    assert sampled.dtype == np.float32 and np.abs(sampled).max() <= 1
+    assert (sampled != policy.act(100 * observations(), deterministic=True)).any()
+
+
+def test_a_tiled_action_depends_on_nothing_but_its_episode(policy_path):
+    policy, seen = load_policy(policy_path), observations(40)
+
+    def act(episodes):
+        episodes = np.asarray(episodes)
+        rngs = [np.random.default_rng(int(i)) for i in episodes]
+        actor = TiledActor([policy], np.zeros(len(episodes), int), episodes, rngs, 24)
+        return actor.act(seen[episodes], len(episodes), 6)
+
+    whole = act(np.arange(40))
+    assert TILE < 40
+    np.testing.assert_array_equal(act([3, 39, 17]), whole[[3, 39, 17]])
+
+
+def test_random_actions_are_uniform_from_each_stream():
+    policy = random_policy(get_task("humanoid-walk"))
+    draws = np.concatenate(
+        [policy.act(np.zeros((2, 67)), [np.random.default_rng(i), np.random.default_rng(99)]) for i in range(400)]
+    )
+    assert np.abs(draws).max() <= 1 and draws[::2].std() == pytest.approx(1 / np.sqrt(3), rel=0.02)
+    np.testing.assert_array_equal(draws[1], draws[3])
+
+
+def tamper(path, out, change):
+    """Write a policy file again with something changed."""
+    weights = load_file(path)
+    header = json.loads(header_of().model_dump_json())
+    change(weights, header)
+    save_file(weights, out, metadata={"header": json.dumps(header)})
+    return out
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda w, h: w["mean.weight"].__setitem__((0, 0), float("nan")), "not finite"),
+        (lambda w, h: w["observation_std"].zero_(), "observation_std"),
+        (lambda w, h: w.pop("mean.bias"), "mean.bias"),
+        (lambda w, h: w.update(extra=torch.zeros(2)), "extra"),
+        (lambda w, h: w.update({"mean.bias": torch.zeros(7)}), "mean.bias"),
+        (lambda w, h: w.update({"mean.bias": torch.zeros(6, dtype=torch.float64)}), "mean.bias"),
+        (lambda w, h: h.update(hidden=[8, 8]), "shape"),
+        (lambda w, h: h.update(action_size=7), "train it again"),
+        (lambda w, h: h.update(task="cheetah-run"), "not for walker-walk"),
+        (lambda w, h: h.update(format_version=99), "newer dmcvb-gen"),
+        (lambda w, h: h.update(code="import os"), "not a whole policy file"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(policy_path, tmp_path, change, words):
+    path = tamper(policy_path, tmp_path / "changed.safetensors", change)
+    with pytest.raises(PolicyFileError, match=words):
+        load_policy(path, get_task("walker-walk"))
+
+
+@pytest.mark.parametrize("keep", [0, 4, 40, 0.5, 0.999])
+def test_a_truncated_file_is_refused(policy_path, keep):
+    data = policy_path.read_bytes()
+    policy_path.write_bytes(data[: int(keep * len(data)) if isinstance(keep, float) else keep])
+    with pytest.raises(PolicyFileError, match="not a whole policy file"):
+        load_policy(policy_path)
+
+
+def test_a_pickle_is_refused_unread(tmp_path):
+    torch.save({"a": torch.zeros(3)}, tmp_path / "policy.safetensors")
+    with pytest.raises(PolicyFileError):
+        load_policy(tmp_path / "policy.safetensors")
+
+
+def test_a_missing_level_says_how_to_get_it(tmp_path):
+    with pytest.raises(DmcvbError, match="train-behaviour"):
+        bundled_policies("walker-walk", "grandmaster")
+    with pytest.raises(PolicyFileError, match="select-checkpoints"):
+        resolve_policies("walker-walk", "expert", tmp_path)
+
+
+@pytest.mark.parametrize("level, count", [("expert", 1), ("medium", 1), ("mixed", 8)])
+def test_walkers_policies_are_bundled_and_fit(level, count):
+    files = bundled_policies("walker-walk", level)
+    assert len(files) == count
+    for path in files:
+        policy = load_policy(path, get_task("walker-walk"))
+        assert policy.header.evaluation.episodes == 100 and policy.header.level == level
+        assert policy.header.command.startswith("dmcvb-gen train-behaviour walker-walk")
