@@ -174,7 +174,7 @@ def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path
 
 
 def test_shipped_recipes_expand_to_what_the_paper_has():
-    assert {"quickstart", "dmcvb-mini", "dmcvb-v1"} <= set(shipped_recipes())
+    assert {"quickstart", "dmcvb-mini"} <= set(shipped_recipes())
     mini = expand(load_recipe("dmcvb-mini"))
     assert len(mini) == 36 and all(request.episodes == 20 for request in mini)
 

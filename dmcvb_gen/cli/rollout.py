@@ -58,7 +58,6 @@ def rollout(tasks, recipe, only, episode_range, out, workers, executor, device, 
     dmcvb-gen rollout walker-walk cheetah-run --level expert --level medium \\
         --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
-    dmcvb-gen rollout --recipe dmcvb-v1 --dry-run
     """
     from dmcvb_gen.rollout.estimate import estimate, raw_bytes
     from dmcvb_gen.rollout.executors import run_jobs

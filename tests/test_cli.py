@@ -1,0 +1,170 @@
+"""The command line: what it prints, and how it says no."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from click.testing import CliRunner
+from PIL import Image
+
+from dmcvb_gen.behaviours.bundled import bundled_policies
+from dmcvb_gen.behaviours.policy_file import load_policy, save_policy
+from dmcvb_gen.cli import COMMANDS, main
+from dmcvb_gen.store import open_release
+
+SMALL = ["rollout", "walker-walk", "--episodes", "1", "--size", "16", "--samples", "1"]
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example(name):
+    result = run(name, "--help")
+    assert result.exit_code == 0 and "Usage" in result.output
+    assert f"dmcvb-gen {name}" in result.output or name == "list"
+
+
+def test_help_names_every_command():
+    output = run("--help").output
+    assert all(name in output for name in COMMANDS)
+
+
+def test_rollout_info_preview_verify_one_after_the_other(tmp_path):
+    out = tmp_path / "demo"
+    made = run(*SMALL, "--level", "expert", "--distractor", "dynamic", "--out", out, "--json")
+    assert made.exit_code == 0, made.output
+    facts = json.loads(made.output)
+    assert facts["complete"] and facts["steps"] == 500
+    info = json.loads(run("info", out, "--json").output)
+    [subset] = info["subsets"]
+    assert subset["name"] == "walker-walk/expert/dynamic" and subset["paper"]["mean"] == 957.8
+    assert subset["returns"]["mean"] == pytest.approx(float(open_release(out)["walker-walk/expert/dynamic"].returns[0]))
+    assert "DMC-VB paper" in run("info", out).output
+    files = json.loads(run("preview", out, "--episodes", "1", "--json").output)
+    assert Image.open(files[0]).size[0] == 10 * 16 * 2
+    assert (tmp_path / "demo/preview/preview.mp4").stat().st_size > 1000
+    assert run("preview", out, "--gif", "--out", tmp_path / "gif").exit_code == 0
+    verified = run("verify", out, "--json")
+    assert verified.exit_code == 0 and json.loads(verified.output)["sound"]
+    again = json.loads(run(*SMALL, "--level", "expert", "--distractor", "dynamic", "--out", out, "--json").output)
+    assert again["steps"] == 0 and again["already_done"] == 1 and again["digests"] == facts["digests"]
+
+
+def test_the_same_command_with_other_options_is_refused(tmp_path):
+    assert run(*SMALL, "--out", tmp_path / "demo").exit_code == 0
+    result = run(*SMALL, "--seed", "1", "--out", tmp_path / "demo")
+    assert result.exit_code == 2 and "another recipe's release" in result.output
+
+
+def test_dry_run_shows_the_plan_and_writes_nothing(tmp_path):
+    result = run(*SMALL, "--distractor", "none", "--out", tmp_path / "x", "--dry-run")
+    assert result.exit_code == 0 and "core-hours" in result.output and not (tmp_path / "x").exists()
+    facts = json.loads(run(*SMALL, "--out", tmp_path / "x", "--dry-run", "--json").output)
+    assert facts["steps"] == 500 and facts["jobs"] == 1 and facts["bytes"] > 0
+
+
+def test_list_says_what_is_here():
+    facts = json.loads(run("list", "--json").output)
+    walker = next(task for task in facts["tasks"] if task["id"] == "walker-walk")
+    assert walker["behaviours"] == ["expert", "medium", "mixed"] and facts["renderers"]["warp"] is None
+    assert "walker-walk" in run("list").output
+
+
+def test_mixed_takes_its_policies_in_turn(tmp_path):
+    result = run(
+        "rollout",
+        "walker-walk",
+        "--level",
+        "mixed",
+        "--episodes",
+        "9",
+        "--size",
+        "8",
+        "--samples",
+        "1",
+        "--out",
+        tmp_path / "m",
+    )
+    assert result.exit_code == 0, result.output
+    subset = open_release(tmp_path / "m")["walker-walk/mixed/none"]
+    assert list(subset.read("behaviour")) == [0, 1, 2, 3, 4, 5, 6, 7, 0]
+    assert subset.returns[7] > subset.returns[0] + 100
+    assert subset.attrs["policies"] == [f"mixed_{k}" for k in range(8)]
+
+
+def broken_policy(tmp_path, kind):
+    source = bundled_policies("walker-walk", "expert")[0]
+    path = tmp_path / "policy.safetensors"
+    if kind == "truncated":
+        path.write_bytes(source.read_bytes()[:5000])
+    elif kind == "nan":
+        policy = load_policy(source)
+        weights = {name: value.clone() for name, value in policy.weights.items()}
+        weights["mean.weight"][0, 0] = torch.nan
+        save_policy(path, policy.header, weights)
+    else:
+        path.write_bytes(source.read_bytes())
+    return path
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["rollout", "walker-fly"], "walker-walk"),
+        (["rollout", "walker-walk", "--level", "master"], "expert"),
+        (["rollout", "walker-walk", "--distractor", "fog"], "dynamic"),
+        (["rollout", "walker-walk", "--size", "0"], "8 to 1024"),
+        (["rollout", "walker-walk", "--size", "5000"], "8 to 1024"),
+        (["rollout", "walker-walk", "--renderer", "povray"], "opengl"),
+        (["rollout", "walker-walk", "--device", "cuda:9"], "--device cpu"),
+        (["rollout", "walker-walk", "--distractor", "static", "--backgrounds", "EMPTY"], "holds no videos"),
+        (["rollout", "walker-walk", "--distractor", "static", "--backgrounds", "BROKEN"], "bad.mp4"),
+        (["rollout", "walker-walk", "--level", "expert", "--behaviour", "TRUNCATED"], "not a whole policy file"),
+        (["rollout", "walker-walk", "--level", "expert", "--behaviour", "NAN"], "not finite"),
+        (["rollout", "cheetah-run", "--level", "expert", "--behaviour", "WALKER"], "not for cheetah-run"),
+        (["rollout", "walker-walk", "--goal", "hidden"], "ant-maze"),
+        (["rollout", "--recipe", "no-such-recipe"], "dmcvb-mini"),
+        (["rollout"], "TASK"),
+        (["rollout", "walker-walk", "--range", "5:2"], "A < B"),
+        (["info", "EMPTY"], "holds no release"),
+        (["preview", "EMPTY"], "holds no release"),
+        (["verify", "EMPTY"], "holds no release"),
+        (["backgrounds", "--videos", "0"], "x>=1"),
+    ],
+)
+def test_bad_input_ends_with_2_one_line_and_nothing_written(tmp_path, arguments, words):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "bad.mp4").write_bytes(b"nothing like a video" * 20)
+    places = {"EMPTY": tmp_path / "empty", "BROKEN": tmp_path / "bad"}
+    for name, kind in (("TRUNCATED", "truncated"), ("NAN", "nan"), ("WALKER", "whole")):
+        if name in arguments:
+            places[name] = broken_policy(tmp_path, kind)
+    arguments = [places.get(argument, argument) for argument in arguments]
+    if arguments[0] == "rollout":
+        arguments += ["--out", tmp_path / "out"]
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert words in result.output and "Traceback" not in result.output and not (tmp_path / "out").exists()
+    if result.output.startswith("error:"):
+        assert result.output.count("\n") == 1
+
+
+def test_an_out_that_cannot_be_written_is_said(tmp_path):
+    (tmp_path / "file").write_text("x")
+    result = run(*SMALL, "--out", tmp_path / "file" / "release")
+    assert result.exit_code == 2 and "choose a writable --out" in result.output
+
+
+def test_a_missing_gl_library_names_the_cure(monkeypatch, tmp_path):
+    from dmcvb_gen.rendering import opengl
+
+    opengl.unavailable.cache_clear()
+    monkeypatch.setattr(opengl.ctypes.util, "find_library", lambda name: None)
+    result = run(*SMALL, "--renderer", "opengl", "--out", tmp_path / "x")
+    opengl.unavailable.cache_clear()
+    assert result.exit_code == 2 and "libegl1" in result.output and "--renderer warp" in result.output
