@@ -34,6 +34,7 @@ LAYOUTS = (
     "width-delta-zstd",
     "width-delta-zstd-9",
     "width-delta-blosc",
+    "channel-delta-zstd",
 )
 CHUNKS = (8, 32, 128, 501)
 

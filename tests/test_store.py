@@ -23,7 +23,16 @@ NAME = "walker-walk/random/dynamic"
 
 @pytest.mark.parametrize(
     "layout",
-    ["zstd", "zstd-9", "blosc-bitshuffle", "time-zstd", "time-delta-zstd", "width-delta-zstd", "width-delta-blosc"],
+    [
+        "zstd",
+        "zstd-9",
+        "blosc-bitshuffle",
+        "time-zstd",
+        "time-delta-zstd",
+        "width-delta-zstd",
+        "channel-delta-zstd",
+        "width-delta-blosc",
+    ],
 )
 def test_every_picture_layout_is_lossless_and_skips_rows_past_the_end(tmp_path, layout):
     assert picture_codecs(layout)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import shlex
 import shutil
 import time
 from collections.abc import Callable
@@ -69,7 +70,11 @@ def command_of(config: RunConfig) -> str:
     """The command line that trains this run again."""
     parts = [f"dmcvb-gen train-behaviour {config.task} --algo {config.algorithm} --steps {config.steps}"]
     parts.append(f"--seed {config.seed}")
-    parts += [f"--set {name}={json.dumps(value)}" for name, value in sorted(config.settings.items())]
+    parts.append(f"--evaluate-every {config.evaluate_every}")
+    if config.init_from:
+        parts.append(f"--init-from {shlex.quote(config.init_from)}")
+    pairs = (f"{name}={json.dumps(value)}" for name, value in sorted(config.settings.items()))
+    parts += [f"--set {shlex.quote(pair)}" for pair in pairs]
     return " ".join(parts)
 
 

@@ -280,7 +280,7 @@ def info(path, as_json):
         paper = subset["paper"]
         if paper:
             numbers = (f"{paper[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max"))
-            table.add_row("  DMC-VB paper", "", f"{paper['steps']:,}", "", "", *numbers, style="dim")
+            table.add_row("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers, style="dim")
     console = Console()
     console.width = max(console.width, 132)  # a cut number is worse than a wrapped line
     console.print(table)

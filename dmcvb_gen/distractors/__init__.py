@@ -57,6 +57,8 @@ class ExogenousWalk:
         if backgrounds is None:
             raise ValueError(f"distractor {setting.name!r} needs backgrounds")
         self._colors = color_walk(own, setting, frames, generators["color"])
+        unseen = np.setdiff1d(np.arange(len(own)), task.model.geom_matid)
+        self._colors[:, :, unseen] = own[unseen]  # a label of what nobody sees would only cost bytes
         offset = np.asarray(task.model.cam_poscom0[camera_ids(task)[0]])
         self._offset, roll = camera_walk(camera_range(offset, setting), setting, frames, generators["camera"])
         self._quaternion = quaternions(look_at(self._offset, roll))

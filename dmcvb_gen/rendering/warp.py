@@ -39,7 +39,7 @@ def _mjw():
 def _warp():
     import warp
 
-    warp.config.log_level = 30  # warnings alone: kernels announce themselves otherwise
+    warp.config.log_level = 40  # errors alone: kernels and a missing CUDA driver announce themselves otherwise
     return warp
 
 

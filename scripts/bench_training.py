@@ -1,0 +1,130 @@
+"""Wall-clock until 90 % of the paper's expert return on walker-walk: ours against plain SB3 SAC, in the same run.
+
+    python scripts/bench_training.py --limit 3600
+
+The peer is Stable-Baselines3's SAC with its own settings on one dm_control environment at action repeat 2. One
+thread each, one after the other. Both are evaluated on 20 fresh episodes with sampled actions every 2,000 steps; these are
+not counted, compilation is. A side that does not get there within the limit is reported as such.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+
+from dmcvb_gen.behaviours.defaults import default_run
+from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.training import RunConfig, open_run
+from dmcvb_gen.behaviours.vec_env import TaskVecEnv
+from dmcvb_gen.tasks import get_task
+
+TASK, EVERY, EPISODES = "walker-walk", 2_000, 20
+
+
+class SuiteEnv(gymnasium.Env):
+    """dm_control's own walker, one agent step two control steps."""
+
+    def __init__(self, seed: int):
+        from dm_control import suite
+
+        self.suite = suite.load(*TASK.split("-"), task_kwargs={"random": seed})
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self.suite.action_spec().shape, np.float32)
+        size = sum(int(np.prod(spec.shape)) for spec in self.suite.observation_spec().values())
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def _flat(self, step) -> np.ndarray:
+        return np.concatenate([np.ravel(part) for part in step.observation.values()]).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._flat(self.suite.reset()), {}
+
+    def step(self, action):
+        reward = 0.0
+        for _ in range(2):
+            step = self.suite.step(action)
+            reward += step.reward
+            if step.last():
+                break
+        return self._flat(step), reward, False, step.last(), {}
+
+
+class UntilReturn(BaseCallback):
+    """Evaluates every `EVERY` steps and stops at the goal or the limit; its clock stands still meanwhile."""
+
+    def __init__(self, goal: float, limit: float):
+        super().__init__()
+        self.goal, self.limit, self.spent, self.reached = goal, limit, 0.0, False
+
+    def _on_training_start(self) -> None:
+        self.started = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % EVERY:
+            return True
+        self.spent += time.perf_counter() - self.started
+        env, total = TaskVecEnv(get_task(TASK), EPISODES, seed=1_000), 0.0
+        observation = env.reset()
+        for _ in range(env.task.max_steps):
+            observation, reward, _, _ = env.step(self.model.predict(observation, deterministic=False)[0])
+            total += reward.mean()
+        print(f"  sb3   {self.num_timesteps:>8,} steps  {self.spent:7.0f} s  return {total:.0f}", flush=True)
+        self.reached = total >= self.goal
+        self.started = time.perf_counter()
+        return not self.reached and self.spent < self.limit
+
+
+class Enough(Exception):
+    """Ours got there, or ran out of time."""
+
+
+def ours(goal: float, limit: float, seed: int) -> tuple[float, bool]:
+    """Training seconds, and whether the goal was reached."""
+    last = []
+
+    def report(progress):
+        last[:] = [progress.seconds, progress.evaluation.mean >= goal]
+        print(f"  ours  {progress.step:>8,} steps  {last[0]:7.0f} s  return {progress.evaluation.mean:.0f}", flush=True)
+        if last[1] or last[0] >= limit:
+            raise Enough
+
+    with tempfile.TemporaryDirectory() as folder:
+        settings = default_run(TASK)["settings"]
+        config = RunConfig(TASK, "sac", 2_000_000, seed, settings, evaluate_every=EVERY, evaluate_sparse=EVERY)
+        try:
+            open_run(Path(folder) / "run", config, resume=False).train(report)
+        except Enough:
+            pass
+    return last[0], last[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--limit", type=float, default=3600.0, help="training seconds a side")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    goal = 0.9 * paper_returns(TASK, "expert")["mean"]
+    print(f"{TASK}: seconds of training to a return of {goal:.0f}, one thread")
+    mine, reached = ours(goal, arguments.limit, arguments.seed)
+    callback = UntilReturn(goal, arguments.limit)
+    SAC("MlpPolicy", SuiteEnv(arguments.seed), seed=arguments.seed, device="cpu").learn(2_000_000, callback=callback)
+    for name, seconds, done in (("ours", mine, reached), ("SB3 SAC", callback.spent, callback.reached)):
+        print(f"{name}: {seconds:.0f} s" + ("" if done else " (not reached)"))
+    if reached:
+        print(f"ratio: {'' if callback.reached else 'more than '}{callback.spent / mine:.1f}")
+
+
+if __name__ == "__main__":
+    main()
