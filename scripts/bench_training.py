@@ -3,8 +3,8 @@
     python scripts/bench_training.py --limit 3600
 
 The peer is Stable-Baselines3's SAC with its own settings on one dm_control environment at action repeat 2. One
-thread each, one after the other. Both are evaluated on 20 fresh episodes with sampled actions every 2,000 steps; these are
-not counted, compilation is. A side that does not get there within the limit is reported as such.
+thread each, one after the other. Both are evaluated on 20 fresh episodes with sampled actions every 2,000 steps;
+evaluations are not counted, compilation is. A side that does not get there within the limit is reported as such.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Training a behaviour policy online on states: task and settings in, a run folder of checkpoints out.
 
 A run folder holds `run.json` (what is trained, never changed), `checkpoints/<agent step>.safetensors`
-(a policy file an evaluation), `progress.csv`, TensorBoard events, and `resume/` (learner, replay buffer,
+(a policy file an evaluation), `progress.csv`, and `resume/` (learner, replay buffer,
 random states), from which a killed run goes on.
 """
 
