@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import ks_2samp, kstest
 
 from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous
 from dmcvb_gen.distractors.background import ping_pong
-from dmcvb_gen.distractors.camera import camera_range, camera_walk, cartesian, look_at, spherical
+from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.rendering.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
 from dmcvb_gen.seeding import episode_stream
@@ -97,28 +98,61 @@ def test_static_varies_between_episodes_and_never_within_one():
     assert len(np.unique(found.material_rgb[:, 0].reshape(6, -1), axis=0)) == 6
 
 
-def test_walks_have_the_standard_deviations_they_should():
+def test_roll_has_the_steps_and_limits_it_should():
     setting = DistractorSetting("dynamic", "hard")
-    rngs = [np.random.default_rng(i) for i in range(400)]
+    rngs = [np.random.default_rng(i) for i in range(3000)]
     bounds = camera_range(np.array([0.0, -4.0, 2.0]), setting)
-    _, roll = camera_walk(bounds, setting, 2, rngs)
-    # One frame is two ticks of a velocity walk: v1 + (v1 + dv2) has standard deviation sqrt(5) of a step.
-    step = np.diff(roll, axis=1)[:, 0]
-    inside = np.abs(roll[:, 0]) < 0.9 * bounds.roll
-    expected = np.sqrt(5) * np.pi / 300 * 0.3
-    assert step[inside].std() == pytest.approx(expected, rel=0.15)
+    _, roll = camera_walk(bounds, setting, 3, rngs)
     start = roll[:, 0] / bounds.roll
-    assert abs(start.mean()) < 0.1 and start.std() == pytest.approx(1 / np.sqrt(3), rel=0.1)  # uniform in [-1, 1]
+    assert kstest(start, "uniform", (-1, 2)).pvalue > 1e-3
+    step, top = np.diff(roll, axis=1), 2 * 0.3 * np.pi / 50  # two ticks a frame
+    assert np.abs(step).max() <= top + 1e-12
+    # A frame's step is v1 + v2, the next one's v3 + v4; they differ by e2 + 2 e3 + e4: sqrt(6) standard deviations.
+    free = (np.abs(start) < 0.7) & (np.abs(step[:, 0]) < top / 2)
+    assert np.diff(step, axis=1)[free, 0].std() == pytest.approx(np.sqrt(6) * 0.3 * np.pi / 300, rel=0.05)
+    first = step[np.abs(start) < 0.7, 0] / top  # starts at any speed below the top one, either way
+    assert np.abs(first).mean() == pytest.approx(0.5, abs=0.05) and abs(first.mean()) < 0.05
 
+
+def test_camera_speeds_are_those_of_a_capped_random_walk():
+    setting, count = DistractorSetting("dynamic", "medium"), 2000
+    anywhere = CameraRange(np.array([1e-3, 0.0, -np.pi]), np.array([1e3, np.pi, np.pi]), 3.0, 1.0)
+    offset, _ = camera_walk(anywhere, setting, 16, [np.random.default_rng(i) for i in range(count)])
+    steps = np.linalg.norm(np.diff(offset, axis=1), axis=-1)
+    rng, unit = np.random.default_rng(1), 0.2 * 3.0 / 4  # the walk again, with no place to walk in
+    heading = rng.normal(size=(count, 3))
+    velocity = heading / np.linalg.norm(heading, axis=1, keepdims=True) * rng.uniform(0, 0.4 * unit, (count, 1))
+    for frame in range(15):
+        moved = np.zeros((count, 3))
+        for _ in range(2):
+            velocity += rng.normal(0, 0.1 * unit, (count, 3))
+            velocity /= np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True) / (0.4 * unit), 1)
+            moved += velocity
+        if frame in (0, 5, 14):
+            assert ks_2samp(steps[:, frame], np.linalg.norm(moved, axis=1)).pvalue > 1e-3
+
+
+def test_the_camera_does_not_stick_to_the_ends_of_its_ranges():
+    setting = DistractorSetting("dynamic", "medium")
+    bounds = camera_range(np.array([0.0, -2.0, 1.2]), setting)
+    offset, roll = camera_walk(bounds, setting, 501, [np.random.default_rng(i) for i in range(40)])
+    place = spherical(offset)
+    at_end = (place < bounds.low + 1e-6) | (place > bounds.high - 1e-6)
+    assert (at_end.mean((0, 1)) < 0.12).all() and at_end.mean() > 0.01
+    assert (np.abs(roll) > bounds.roll - 1e-9).mean() < 0.12
+
+
+def test_colors_start_uniform_and_step_as_far_as_they_should():
     task = get_task("walker-walk")
     physics = np.repeat(physics_of(task, 1, 3), 60, axis=0)
     colors = labels(task, "dynamic_hard", physics).material_rgb.astype(float)
-    own, low, high = task.model.mat_rgba[:, :3], 0.1, 0.9
-    seen = np.isin(np.arange(len(own)), task.model.geom_matid)[:, None]
-    assert (colors[:, :, ~seen[:, 0]] == own[~seen[:, 0]].astype(np.float32)).all()
-    free = (own - 0.3 > low) & (own + 0.3 < high) & seen  # channels that the limits of [0, 1] do not touch
-    change = np.diff(colors, axis=1)[:, 0][:, free]
-    middle = np.abs(colors[:, 0][:, free] - own[free]) < 0.2
+    own = task.model.mat_rgba[:, :3].astype(float)
+    seen = np.isin(np.arange(len(own)), task.model.geom_matid)
+    assert (colors[:, :, ~seen] == own[~seen].astype(np.float32)).all()
+    low, high = np.clip(own - 0.3, 0, 1)[seen], np.clip(own + 0.3, 0, 1)[seen]
+    start = (colors[:, 0, seen] - low) / (high - low)  # white floors too: uniform in [0.7, 1], not half of them at 1
+    assert kstest(start.ravel(), "uniform").pvalue > 1e-3
+    change, middle = np.diff(colors, axis=1)[:, 0][:, seen], np.abs(start - 0.5) < 0.3
     assert change[middle].std() == pytest.approx(np.sqrt(2) * 0.03 * 0.3, rel=0.1)
 
 

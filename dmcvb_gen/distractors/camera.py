@@ -66,6 +66,10 @@ def camera_walk(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the camera's walk, relative to the agent.
 
+    Place and roll start uniform in their ranges, speeds uniform below their limits in a random direction. Where
+    a range ends, the camera stops pushing outwards, as in the Distracting Control Suite: it slides along the end
+    and leaves it with the next step inwards. Static cameras start like dynamic ones of the same streams.
+
     Returns:
       offset (episode, frame, 3) meters from the centre of mass, roll (episode, frame) radians. A longer
       walk begins with the shorter one.
@@ -78,19 +82,23 @@ def camera_walk(
     offsets[:], rolls[:] = cartesian(place)[:, None], roll[:, None]
     if setting.kind != "dynamic":
         return offsets, rolls
+    unit, limit = setting.scale * bounds.nominal_radius / 4, MAX_ROLL_SPEED * setting.scale
+    heading = np.stack([rng.standard_normal(3) for rng in generators])
+    share = np.stack([rng.random(2) for rng in generators])  # of the top speeds
+    velocity = heading / np.linalg.norm(heading, axis=1, keepdims=True) * share[:, :1] * MAX_SPEED * unit
+    roll_velocity = (2 * share[:, 1] - 1) * limit
     ticks = ACTION_REPEAT * (frames - 1)
     noise = np.stack([rng.standard_normal((ticks, 4)) for rng in generators], axis=1)
-    unit = setting.scale * bounds.nominal_radius / 4
-    position, velocity = cartesian(place), np.zeros((len(generators), 3))
-    roll_velocity = np.zeros(len(generators))
+    position = cartesian(place)
     for tick in range(ticks):
         velocity = velocity + VELOCITY_STD * unit * noise[tick, :, :3]
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(speed, 1e-12))
-        position = cartesian(_clip(spherical(position + velocity), bounds))
-        limit = MAX_ROLL_SPEED * setting.scale
+        reached = cartesian(_clip(spherical(position + velocity), bounds))
+        position, velocity = reached, reached - position  # a limit takes the speed towards it
         roll_velocity = np.clip(roll_velocity + ROLL_VELOCITY_STD * setting.scale * noise[tick, :, 3], -limit, limit)
-        roll = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
+        rolled = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
+        roll, roll_velocity = rolled, rolled - roll
         if (tick + 1) % ACTION_REPEAT == 0:
             frame = (tick + 1) // ACTION_REPEAT
             offsets[:, frame], rolls[:, frame] = position, roll

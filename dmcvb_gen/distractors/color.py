@@ -26,7 +26,7 @@ def color_walk(
     """
     low, high = np.clip(own - setting.scale, 0, 1), np.clip(own + setting.scale, 0, 1)
     start = np.stack([rng.random(own.shape) for rng in generators])
-    color = np.clip(own + (2 * start - 1) * setting.scale, 0, 1)
+    color = low + start * (high - low)  # uniform in what is left of the range inside [0, 1]
     out = np.empty((len(generators), frames, *own.shape))
     out[:] = color[:, None]
     if setting.kind != "dynamic":
