@@ -40,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", nargs="+", default=list(LOCOMOTION_TASKS))
     parser.add_argument("--settings", nargs="+", default=["none", "static", "dynamic"])
-    parser.add_argument("--samples", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--samples", nargs="+", type=int, default=[1, 2, 4])
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--frames", type=int, default=512, help="of warp; OpenGL paints an eighth of them")
     parser.add_argument("--out", help="side-by-side PNG: OpenGL, then warp at each number of samples")

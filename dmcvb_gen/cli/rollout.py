@@ -35,7 +35,9 @@ def _out_default(name: str) -> Path:
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
 @click.option("--renderer", default="warp", show_default=True, help="warp or opengl.")
-@click.option("--samples", type=click.IntRange(1, 8), help="Samples a pixel and axis (warp).")
+@click.option(
+    "--samples", type=click.IntRange(1, 8), help="Samples a pixel: 1, 2, 4 or 8.  [default: warp 2, opengl 4]"
+)
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
 @click.option("--backgrounds", default="builtin", show_default=True, help="builtin, or a folder of videos.")
 @click.option("--split", type=click.Choice(["train", "val"]), default="train", help="Videos and styles: train or val.")

@@ -2,13 +2,16 @@
 
 Folders that are understood: DMC-VB's own (`train/` and `validation/`, each with videos), a DAVIS-like one
 (a sub-folder of frames a video), loose videos and pictures. Without a split in the folder, every second
-video in the order of names is for evaluation (the only video of a folder of one serves both).
+video in the order of names is for evaluation (the only video of a folder of one serves both). Names are
+ordered as people count, `2.png` before `10.png`; hidden files are passed over.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import re
+import subprocess
 from collections import OrderedDict
 from importlib import resources
 from pathlib import Path
@@ -20,10 +23,13 @@ from dmcvb_gen.errors import BackgroundError
 
 FRAME_SIZE = 256
 """Frames are cut to their central square and resized to this many pixels a side (Kubric MOVi-D's size)."""
+MAX_FRAMES = 1000
+"""A longer video counts with its first frames; a walk of 500 agent steps sees 101 of them."""
+CACHE_BYTES = 256 * 2**20
+"""Decoded frames that an open source keeps (and always the video asked for last)."""
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif", ".webp"}
 _SPLITS = {"train": ("train", "training"), "val": ("val", "validation", "test")}
-_CACHED = 16  # decoded videos kept, 5 MB each at 24 frames
 
 
 def builtin_folder() -> Path:
@@ -34,10 +40,17 @@ def builtin_folder() -> Path:
 class Backgrounds:
     """The videos of one split of a source; frames are decoded when they are asked for.
 
+    Making one decodes every video once, so that a bad file is found before any work; a pickled one opens at once.
+
     Attributes:
       source: "builtin" or the folder.
       split: "train" or "val".
-      names: of the videos, sorted.
+      names: of the videos, in order.
+      lengths: frames of each video.
+      digest: SHA-256 over the decoded frames of all videos.
+
+    Raises:
+      BackgroundError: a file cannot be read.
     """
 
     def __init__(self, source: str, split: str, videos: list[tuple[str, tuple[Path, ...]]]):
@@ -45,6 +58,12 @@ class Backgrounds:
         self.names = tuple(name for name, _ in videos)
         self._files = tuple(files for _, files in videos)
         self._decoded: OrderedDict[int, np.ndarray] = OrderedDict()
+        lengths, digest = [], hashlib.sha256()
+        for video in range(len(self)):
+            frames = self.frames(video)
+            lengths.append(len(frames))
+            digest.update(frames)
+        self.lengths, self.digest = tuple(lengths), digest.hexdigest()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -53,74 +72,89 @@ class Backgrounds:
         return self.__dict__ | {"_decoded": OrderedDict()}
 
     def frames(self, video: int) -> np.ndarray:
-        """(frame, 256, 256, 3) uint8, RGB.
+        """(frame, 256, 256, 3) uint8, RGB, read-only.
 
         Raises:
           BackgroundError: a file cannot be read.
         """
         if video not in self._decoded:
-            while len(self._decoded) >= _CACHED:
-                self._decoded.popitem(last=False)
             self._decoded[video] = _decode(self._files[video])
+            held = sum(frames.nbytes for frames in self._decoded.values())
+            while held > CACHE_BYTES and len(self._decoded) > 1:
+                held -= self._decoded.popitem(last=False)[1].nbytes
         self._decoded.move_to_end(video)
         return self._decoded[video]
 
-    @functools.cached_property
-    def lengths(self) -> tuple[int, ...]:
-        """Frames of each video."""
-        return tuple(len(self.frames(video)) for video in range(len(self)))
 
-    @functools.cached_property
-    def digest(self) -> str:
-        """SHA-256 over the decoded frames of all videos."""
-        digest = hashlib.sha256()
-        for video in range(len(self)):
-            digest.update(self.frames(video).tobytes())
-        return digest.hexdigest()
-
-
-def load_backgrounds(source: str | Path = "builtin", split: str = "train") -> Backgrounds:
-    """The background videos of a source.
+def load_backgrounds(source: str | Path = "builtin", split: str = "train", videos: int | None = None) -> Backgrounds:
+    """The background videos of a source. Opened again with its files unchanged, a source costs nothing.
 
     Args:
       source: "builtin" or a folder.
       split: "train" or "val".
+      videos: take only the first so many (what `DistractorSetting.videos` has in play); None: all.
 
     Raises:
-      BackgroundError: no such folder, nothing in it, or a video that cannot be read (named).
+      BackgroundError: no such folder, nothing in it, or a video that cannot be read or is cut short (named).
     """
     if split not in _SPLITS:
         raise BackgroundError(f"unknown split {split!r} of backgrounds; known: train, val")
     root = builtin_folder() if source == "builtin" else Path(source)
+    if root.is_file():
+        raise BackgroundError(f"background source {str(source)!r} is a file; give the folder that holds it")
     if not root.is_dir():
         raise BackgroundError(f"background folder {str(source)!r} does not exist; give a folder of videos or 'builtin'")
+    try:
+        found = _find_split(root, split)[:videos]
+        stamps = tuple((p.stat().st_mtime_ns, p.stat().st_size) for _, files in found for p in files)
+    except OSError as error:
+        raise BackgroundError(f"cannot read background folder {root} ({error.strerror or error})") from None
+    if not found:
+        kinds = " ".join(sorted(VIDEOS | PICTURES))
+        raise BackgroundError(
+            f"background folder {root} holds no videos; put in files of {kinds}, or a folder of pictures for each video"
+        )
+    return _open(str(source), split, tuple(found), stamps)
+
+
+@functools.lru_cache(maxsize=4)
+def _open(source: str, split: str, videos: tuple, stamps: tuple) -> Backgrounds:
+    """Plans, workers and verification open the same source again and again; `stamps` notices changed files."""
+    return Backgrounds(source, split, list(videos))
+
+
+def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:
     for name in _SPLITS[split]:
         if (root / name).is_dir():
-            videos = _find_videos(root / name)
-            break
-    else:
-        if any((root / name).is_dir() for names in _SPLITS.values() for name in names):
-            raise BackgroundError(f"{root} has no {' or '.join(_SPLITS[split])} folder beside its other split")
-        videos = _find_videos(root)
-        if len(videos) > 1:
-            videos = videos[1::2] if split == "val" else videos[::2]
-    if not videos:
-        kinds = " ".join(sorted(VIDEOS | PICTURES))
-        raise BackgroundError(f"background folder {root} holds no videos; put in files of {kinds}")
-    backgrounds = Backgrounds(str(source), split, videos)
-    backgrounds.lengths  # every video is opened once, so that a bad one is found before any work  # noqa: B018
-    return backgrounds
+            return _find_videos(root / name)
+    if any((root / name).is_dir() for names in _SPLITS.values() for name in names):
+        raise BackgroundError(f"{root} has no {' or '.join(_SPLITS[split])} folder beside its other split")
+    videos = _find_videos(root)
+    if len(videos) == 1:
+        return videos
+    return videos[1::2] if split == "val" else videos[::2]
+
+
+def _listed(folder: Path) -> list[Path]:
+    """What is in a folder, hidden files apart, with numbers in names ordered by value."""
+
+    def key(path: Path):
+        return [
+            (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)
+        ], path.name
+
+    return sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=key)
 
 
 def _find_videos(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
     """(name, files) of each video: a file, or a folder of pictures; a loose picture is a video of one frame."""
     videos = []
-    for path in sorted(folder.iterdir()):
+    for path in _listed(folder):
         if path.is_dir():
-            frames = tuple(sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES))
-            inside = tuple(sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEOS))
+            frames = tuple(p for p in _listed(path) if p.suffix.lower() in PICTURES)
+            inside = tuple(p for p in _listed(path) if p.suffix.lower() in VIDEOS)
             if frames:
-                videos.append((path.name, frames))
+                videos.append((path.name, frames[:MAX_FRAMES]))
             else:
                 videos += [(f"{path.name}/{file.stem}", (file,)) for file in inside]
         elif path.suffix.lower() in VIDEOS | PICTURES:
@@ -129,29 +163,53 @@ def _find_videos(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
 
 
 def _decode(files: tuple[Path, ...]) -> np.ndarray:
-    frames = []
+    parts, count = [], 0
     for path in files:
         try:
-            frames += _read(path)
+            if path.suffix.lower() in PICTURES | {".gif", ".webp"}:
+                parts.append(_read_pictures(path))
+            else:
+                parts.append(_read_video(path))
         except Exception as error:  # decoders raise many kinds; all mean the same to the user
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise BackgroundError(f"cannot read background {path} ({reason}); remove or replace the file") from None
-    if not frames:
-        raise BackgroundError(f"background {files[0]} has no frames; remove or replace the file")
+        count += len(parts[-1])
+        if count >= MAX_FRAMES:
+            break
+    frames = np.concatenate(parts)[:MAX_FRAMES] if len(parts) > 1 else parts[0]
+    frames.flags.writeable = False  # the cache is shared
+    return frames
+
+
+def _read_pictures(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        frames = []
+        for index in range(min(getattr(picture, "n_frames", 1), MAX_FRAMES)):
+            picture.seek(index)
+            frames.append(square(picture.convert("RGB")))
     return np.stack(frames)
 
 
-def _read(path: Path) -> list[np.ndarray]:
-    if path.suffix.lower() in PICTURES | {".gif", ".webp"}:
-        with Image.open(path) as picture:
-            frames = []
-            for index in range(getattr(picture, "n_frames", 1)):
-                picture.seek(index)
-                frames.append(square(picture.convert("RGB")))
-            return frames
-    import imageio.v3 as iio
+def _read_video(path: Path) -> np.ndarray:
+    """Decode with the ffmpeg that imageio-ffmpeg brings.
 
-    return [square(Image.fromarray(frame[..., :3])) for frame in iio.imiter(path, plugin="FFMPEG")]
+    Any complaint of the decoder counts as an error: a cut file otherwise just gives fewer frames. Scaling is
+    the variant without processor-specific shortcuts, and only local files are opened, whatever a playlist says.
+    """
+    import imageio_ffmpeg
+
+    middle = "crop='min(iw,ih)':'min(iw,ih)'"
+    resize = f"scale={FRAME_SIZE}:{FRAME_SIZE}:flags=lanczos+accurate_rnd+full_chroma_int+bitexact"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-protocol_whitelist", "file,pipe"]
+    command += ["-i", f"file:{path}", "-map", "0:v:0", "-frames:v", str(MAX_FRAMES), "-fps_mode", "passthrough"]
+    command += ["-vf", f"{middle},{resize},format=rgb24", "-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
+    run = subprocess.run(command, capture_output=True, check=False)
+    complaint = re.sub(r"\[[^]]*\]\s*", "", run.stderr.decode(errors="replace")).strip()
+    if complaint or run.returncode:
+        raise ValueError(complaint or f"ffmpeg ended with code {run.returncode}")
+    if not run.stdout:
+        raise ValueError("no frames in it")
+    return np.frombuffer(run.stdout, np.uint8).reshape(-1, FRAME_SIZE, FRAME_SIZE, 3)
 
 
 def square(picture: Image.Image) -> np.ndarray:

@@ -29,7 +29,7 @@ def make_renderer(
       backgrounds: the videos that labels may name (`load_backgrounds`).
       floor_alpha: opacity of the ground plane (`floor_alpha_for`).
       device: "cpu" or "cuda" (warp).
-      samples: samples a pixel and axis (warp), multisampling (opengl); None: the default.
+      samples: samples a pixel; None: the default.
 
     Raises:
       UnknownNameError, RenderingError: no such renderer, or it cannot start here.
