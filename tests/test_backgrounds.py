@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dmcvb_gen.distractors import backgrounds as backgrounds_module
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.errors import BackgroundError
 
@@ -99,9 +100,93 @@ def test_an_unreadable_file_is_named(tmp_path, name):
         load_backgrounds(tmp_path)
 
 
-def test_a_truncated_video_is_named(tmp_path):
-    write_video(tmp_path / "a.webp", clip(6, 200, 200))
-    data = (tmp_path / "a.webp").read_bytes()
-    (tmp_path / "a.webp").write_bytes(data[: len(data) // 2])
-    with pytest.raises(BackgroundError, match="a.webp"):
+@pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv", ".gif", ".webp", ".png", ".jpg"])
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_truncated_file_is_named_instead_of_giving_fewer_frames(tmp_path, suffix, share):
+    path = tmp_path / f"a{suffix}"
+    frames = clip(12, 128, 128)
+    if suffix in (".png", ".jpg"):
+        Image.fromarray(frames[0]).save(path)
+    elif suffix in (".gif", ".webp"):
+        write_video(path, frames)
+    else:  # with its index in front, where a format can have it, so that the beginning still opens
+        options = ["-movflags", "faststart"] if suffix == ".mp4" else []
+        iio.imwrite(path, frames, plugin="FFMPEG", fps=12, macro_block_size=2, output_params=options)
+    assert load_backgrounds(tmp_path).lengths == (1 if suffix in (".png", ".jpg") else 12,)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(BackgroundError, match=path.name):
         load_backgrounds(tmp_path)
+
+
+def test_a_video_keeps_its_colors_order_and_central_square(tmp_path):
+    frames = np.zeros((5, 64, 128, 3), np.uint8)
+    frames[:, :, 32:96] = [[[[40 * k, 200 - 40 * k, 90]]] for k in range(5)]
+    iio.imwrite(tmp_path / "a.mp4", frames, plugin="FFMPEG", fps=12, macro_block_size=2, quality=10)
+    found = load_backgrounds(tmp_path).frames(0)
+    assert found.shape == (5, 256, 256, 3)
+    for index in range(5):
+        np.testing.assert_allclose(found[index].mean((0, 1)), [40 * index, 200 - 40 * index, 90], atol=6)
+
+
+def test_numbers_in_names_are_ordered_by_value_and_hidden_files_passed_over(tmp_path):
+    (tmp_path / "walk").mkdir()
+    for index in range(12):
+        Image.fromarray(np.full((20, 20, 3), 20 * index, np.uint8)).save(tmp_path / "walk" / f"{index}.png")
+    (tmp_path / "walk" / "._0.png").write_bytes(b"left by another system")
+    (tmp_path / ".cache").mkdir()
+    found = load_backgrounds(tmp_path)
+    assert found.names == ("walk",)
+    np.testing.assert_array_equal(found.frames(0)[:, 0, 0, 0], 20 * np.arange(12))
+
+
+def test_a_changed_file_is_noticed_and_an_unchanged_one_not_read_again(tmp_path):
+    write_video(tmp_path / "a.webp", clip(3))
+    first = load_backgrounds(tmp_path)
+    assert load_backgrounds(tmp_path) is first
+    write_video(tmp_path / "a.webp", clip(4, seed=1))
+    assert load_backgrounds(tmp_path).lengths == (4,) and load_backgrounds(tmp_path).digest != first.digest
+
+
+def test_only_the_videos_in_play_are_opened_when_asked_for(tmp_path):
+    for index in range(3):
+        write_video(tmp_path / "train" / f"{index}.webp", clip(3, seed=index))
+    (tmp_path / "train" / "9.webp").write_bytes(b"broken")
+    assert load_backgrounds(tmp_path, videos=3).names == ("0", "1", "2")
+    with pytest.raises(BackgroundError, match="9.webp"):
+        load_backgrounds(tmp_path)
+
+
+def test_long_videos_count_with_their_first_frames_and_memory_is_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(backgrounds_module, "MAX_FRAMES", 6)
+    monkeypatch.setattr(backgrounds_module, "CACHE_BYTES", 10 * 256 * 256 * 3)
+    write_video(tmp_path / "train" / "a.mp4", clip(9))
+    write_video(tmp_path / "train" / "b.gif", clip(9))
+    (tmp_path / "train" / "c").mkdir()
+    for index, frame in enumerate(clip(9)):
+        Image.fromarray(frame).save(tmp_path / "train" / "c" / f"{index}.jpg")
+    found = load_backgrounds(tmp_path)
+    assert found.lengths == (6, 6, 6)
+    for video in (0, 1, 2, 0):
+        assert len(found.frames(video)) == 6
+        assert sum(frames.nbytes for frames in found._decoded.values()) <= 10 * 256 * 256 * 3
+
+
+def test_decoded_frames_and_their_digest_are_the_same_each_time():
+    first = load_backgrounds("builtin", "val")
+    again = backgrounds_module.Backgrounds("builtin", "val", list(zip(first.names, first._files, strict=True)))
+    assert again.digest == first.digest and again is not first
+    assert not first.frames(0).flags.writeable  # nobody changes what others see
+
+
+@pytest.mark.parametrize("split, message", [("val", "no val or validation"), ("test", "unknown split")])
+def test_a_split_that_is_not_there_is_named(tmp_path, split, message):
+    write_video(tmp_path / "train" / "a.webp", clip())
+    with pytest.raises(BackgroundError, match=message):
+        load_backgrounds(tmp_path, split)
+
+
+def test_a_file_in_place_of_a_folder_is_named(tmp_path):
+    write_video(tmp_path / "a.webp", clip())
+    with pytest.raises(BackgroundError, match="is a file; give the folder"):
+        load_backgrounds(tmp_path / "a.webp")

@@ -117,7 +117,7 @@ def load_backgrounds(source: str | Path = "builtin", split: str = "train", video
     return _open(str(source), split, tuple(found), stamps)
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=2)
 def _open(source: str, split: str, videos: tuple, stamps: tuple) -> Backgrounds:
     """Plans, workers and verification open the same source again and again; `stamps` notices changed files."""
     return Backgrounds(source, split, list(videos))
