@@ -1,12 +1,13 @@
 """Clips of objects that fall and collide: a seed in, short videos like Kubric's MOVi-D out.
 
-Each clip is a MuJoCo simulation of its own: 10 to 23 objects of many shapes with procedural textures,
-some at rest, some dropped among them, filmed by a fixed camera for 24 frames of 256 x 256.
+Each clip is a MuJoCo simulation of its own: 13 to 23 objects of many shapes with procedural textures, some
+lying in a heap, some thrown into it one after the other, filmed by a fixed camera for 24 frames of 256 x 256.
 """
 
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,10 +16,14 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.distractors.backgrounds import FRAME_SIZE
-from dmcvb_gen.distractors.textures import surroundings, texture
+from dmcvb_gen.distractors.textures import FLOORS, surroundings, texture
 from dmcvb_gen.errors import BackgroundError
 
+GENERATOR = 2
+"""Version of what a seed means; clips of another version or seed are not mixed."""
 FRAMES, FRAMES_PER_SECOND = 24, 12
+SETTLING = 0.8
+"""Seconds that the heap has to come to rest before the film begins."""
 QUALITY = 72
 """WebP quality of the files."""
 
@@ -131,10 +136,20 @@ def _light(rng: np.random.Generator, sun: bool) -> str:
     )
 
 
-def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes]]:
-    """The XML of a clip and its texture files."""
-    count = int(rng.integers(10, 24))
-    assets = {"floor.png": _png(texture(rng, 512)), "sky.png": _png(surroundings(rng))}
+def _throw(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Where a thrown object starts, and the velocity that takes it into the heap within the film."""
+    flight = rng.uniform(0.15, 0.85) * FRAMES / FRAMES_PER_SECOND
+    side, far = rng.uniform(0, 2 * np.pi), rng.uniform(1.8, 3.5)
+    start = np.array([far * np.cos(side), far * np.sin(side), rng.uniform(0.8, 3.5)])
+    goal = np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(0.5, 1.0)])
+    return start, (goal - start) / flight + np.array([0, 0, 9.81 / 2 * flight])
+
+
+def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes], np.ndarray]:
+    """The XML of a clip, its texture files, and the velocity of each object (NaN: it lies in the heap)."""
+    count = int(rng.integers(13, 24))
+    velocities = np.full((count, 3), np.nan)
+    assets = {"floor.png": _png(texture(rng, 512, FLOORS)), "sky.png": _png(surroundings(rng))}
     textures, materials, meshes, bodies = [], [], [], []
     for index in range(count):
         assets[f"t{index}.png"] = _png(texture(rng))
@@ -145,15 +160,16 @@ def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes]]:
         )
         geoms, mesh = _object(rng, index, f"o{index}")
         meshes.append(mesh)
-        lifted = rng.random() < 0.65
-        place = [
-            rng.uniform(-1.7, 1.7),
-            rng.uniform(-1.7, 1.7),
-            rng.uniform(1.2, 4.5) if lifted else rng.uniform(0.4, 0.8),
-        ]
-        bodies.append(f'<body pos="{_numbers(place)}" quat="{_numbers(rng.normal(size=4))}"><freejoint/>{geoms}</body>')
-    angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(3.8, 5.2)
-    eye = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(0.9, 3.2)])
+        if rng.random() < 0.45:
+            place, velocities[index] = _throw(rng)
+        else:
+            place = np.array([*rng.normal(0, 0.9, 2).clip(-1.7, 1.7), rng.uniform(0.3, 1.6)])
+        floating = 'gravcomp="1"' if np.isfinite(velocities[index, 0]) else ""
+        bodies.append(
+            f'<body pos="{_numbers(place)}" quat="{_numbers(rng.normal(size=4))}" {floating}><freejoint/>{geoms}</body>'
+        )
+    angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(3.4, 4.6)
+    eye = np.array([far * np.cos(angle), far * np.sin(angle), rng.uniform(0.9, 2.8)])
     target = np.array([*rng.normal(0, 0.3, 2), rng.uniform(0.5, 1.1)])
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0, 0, 1.0], back)
@@ -168,11 +184,11 @@ def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes]]:
     <asset><texture name="sky" type="skybox" file="sky.png"/><texture name="floor" type="2d" file="floor.png"/>
     <material name="floor" texture="floor" texrepeat="{_numbers(repeat)}" texuniform="true"
      reflectance="{rng.uniform(0, 0.15):.2f}"/>{"".join(textures)}{"".join(materials)}{"".join(meshes)}</asset>
-    <default><geom density="400" friction="0.8 0.02 0.002"/></default>
+    <default><geom density="400" friction="0.9 0.02 0.006" condim="6"/></default>
     <worldbody><geom type="plane" size="30 30 1" material="floor"/>{lights}
     <camera name="film" pos="{_numbers(eye)}" xyaxes="{_numbers(right)} {_numbers(up)}" fovy="{fovy:.1f}"/>
     {"".join(bodies)}</worldbody></mujoco>"""
-    return xml, assets
+    return xml, assets, velocities
 
 
 def make_clip(seed: int, split: str, index: int) -> np.ndarray:
@@ -187,33 +203,37 @@ def make_clip(seed: int, split: str, index: int) -> np.ndarray:
     if reason:
         raise BackgroundError(f"clips are rendered with OpenGL: {reason.replace(' or use --renderer warp', '')}")
     rng = np.random.default_rng([seed, {"train": 0, "val": 1}[split], index])
-    while True:
-        xml, assets = _scene(rng)
+    for last in (False,) * 19 + (True,):
+        xml, assets, velocities = _scene(rng)
         try:
             model = mujoco.MjModel.from_xml_string(xml, assets)
             break
-        except ValueError:
-            continue  # a degenerate random mesh: draw another scene from the same stream
-    data = mujoco.MjData(model)
-    for joint in range(model.njnt):
-        data.qvel[joint * 6 : joint * 6 + 3] = rng.normal(0, 0.7, 3)
-        data.qvel[joint * 6 + 3 : joint * 6 + 6] = rng.normal(0, 3, 3)
-    mujoco.mj_step(model, data, nstep=int(rng.uniform(0.1, 0.5) / model.opt.timestep))
+        except ValueError:  # a degenerate random mesh: draw another scene from the same stream
+            if last:
+                raise
+    data, step = mujoco.MjData(model), model.opt.timestep
+    mujoco.mj_step(model, data, nstep=round(SETTLING / step))
+    speed = data.qvel.reshape(-1, 6)
+    for index in np.flatnonzero(np.isfinite(velocities[:, 0])):
+        model.body_gravcomp[index + 1] = 0
+        speed[index] = [*velocities[index], *rng.normal(0, 3, 3)]
     frames = np.empty((FRAMES, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
     with offscreen(model, FRAME_SIZE) as shoot:
         for frame in range(FRAMES):
             frames[frame] = shoot(data, "film")
-            mujoco.mj_step(model, data, nstep=round(1 / FRAMES_PER_SECOND / model.opt.timestep))
+            mujoco.mj_step(model, data, nstep=round(1 / FRAMES_PER_SECOND / step))
     return frames
 
 
 def save_clip(path: Path, frames: np.ndarray) -> None:
-    """Write frames (n, h, w, 3) uint8 as an animated WebP."""
+    """Write frames (n, h, w, 3) uint8 as an animated WebP, whole or not at all."""
     pictures = [Image.fromarray(frame) for frame in frames]
+    part = path.with_name(f".{path.name}.part")  # hidden: nobody takes it for a video
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         pictures[0].save(
-            path,
+            part,
+            "WEBP",
             save_all=True,
             append_images=pictures[1:],
             duration=round(1000 / FRAMES_PER_SECOND),
@@ -221,8 +241,26 @@ def save_clip(path: Path, frames: np.ndarray) -> None:
             quality=QUALITY,
             method=6,
         )
+        part.replace(path)
     except OSError as error:
         raise BackgroundError(f"cannot write {path}: {error.strerror or error}; give another --out") from None
+
+
+def _claim(out: Path, seed: int) -> None:
+    """Note in the folder what its clips are made from; refuse one with other clips."""
+    note, facts = out / "clips.json", {"seed": seed, "generator": GENERATOR}
+    try:
+        if note.is_file():
+            found = json.loads(note.read_text())
+            if found != facts:
+                raise BackgroundError(f"{out} holds clips of {found}, asked for are {facts}; give another --out")
+        elif any((out / split).is_dir() and any((out / split).iterdir()) for split in ("train", "val")):
+            raise BackgroundError(f"{out} holds videos of another origin; give another --out")
+        else:
+            out.mkdir(parents=True, exist_ok=True)
+            note.write_text(json.dumps(facts))
+    except (OSError, ValueError) as error:
+        raise BackgroundError(f"cannot use {out} ({error}); give another --out") from None
 
 
 def make_clips(
@@ -230,8 +268,12 @@ def make_clips(
 ) -> dict[str, list[Path]]:
     """Make `videos` clips for training and as many for evaluation, in train/ and val/ of a folder.
 
-    Clips that are there already are kept, so that an interrupted call goes on.
+    Clips of the same seed that are there already are kept, so that an interrupted call goes on.
+
+    Raises:
+      BackgroundError: OpenGL cannot start, the folder cannot be written or holds other videos.
     """
+    _claim(Path(out), seed)
     made: dict[str, list[Path]] = {"train": [], "val": []}
     for split, paths in made.items():
         for index in range(videos):

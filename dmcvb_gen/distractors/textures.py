@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from PIL import Image, ImageFilter
@@ -23,14 +24,24 @@ def fractal_noise(rng: np.random.Generator, size: int, octaves: int = 6, first: 
     return (total - low) / (high - low + 1e-9)
 
 
+_HUES = ((0.08, 0.035, 0.5), (0.6, 0.05, 0.17), (0.27, 0.06, 0.13), (0.0, 0.02, 0.08))
+"""Mean, spread and share of the hues of nature and rooms: earth and wood, sky and slate, leaves, brick; else any."""
+
+
 def palette(rng: np.random.Generator, count: int = 4, vivid: float | None = None) -> np.ndarray:
-    """(count, 3) in [0, 1]: colors that go together: neighboring hues and one of the other side."""
-    hue, vivid = rng.random(), rng.uniform(0.15, 0.9) if vivid is None else vivid
+    """(count, 3) in [0, 1]: colors that go together: neighboring hues and sometimes one of the other side."""
+    draw, hue = rng.random(), rng.random()
+    for mean, spread, share in _HUES:
+        if draw < share:
+            hue = rng.normal(mean, spread)
+            break
+        draw -= share
+    vivid = rng.uniform(0.1, 0.75) if vivid is None else vivid
     colors = []
     for index in range(count):
-        shift = rng.normal(0, 0.05) + (0.5 if index == count - 1 and rng.random() < 0.5 else 0)
+        shift = rng.normal(0, 0.04) + (0.5 if index == count - 1 and rng.random() < 0.3 else 0)
         colors.append(
-            colorsys.hsv_to_rgb((hue + shift) % 1, np.clip(vivid + rng.normal(0, 0.15), 0, 1), rng.uniform(0.25, 1))
+            colorsys.hsv_to_rgb((hue + shift) % 1, np.clip(vivid + rng.normal(0, 0.12), 0, 1), rng.uniform(0.25, 1))
         )
     return np.array(colors)
 
@@ -54,7 +65,8 @@ def _marble(rng, size, grid):
 def _wood(rng, size, grid):
     x, y = grid
     warp = fractal_noise(rng, size, 4) * rng.uniform(0.05, 0.3)
-    rings = ((np.hypot(x - rng.random(), (y - 0.5) * rng.uniform(0.05, 0.4)) + warp) * rng.uniform(6, 20)) % 1
+    rings = (np.hypot(x - rng.random(), (y - 0.5) * rng.uniform(0.05, 0.4)) + warp) * rng.uniform(6, 20)
+    rings = 0.5 + 0.35 * np.sin(2 * np.pi * rings) + 0.15 * np.sin(6 * np.pi * rings)
     brown = np.array([[0.25, 0.13, 0.05], [0.55, 0.33, 0.15], [0.75, 0.52, 0.3]]) * rng.uniform(0.6, 1.3)
     grain = fractal_noise(rng, size, 7, 16)[:, :, None]
     return np.clip(shade(rings, brown) * (0.75 + 0.4 * grain), 0, 1)
@@ -134,23 +146,37 @@ def _bricks(rng, size, grid):
 
 
 MATERIALS = (_marble, _wood, _rust, _fabric, _stones, _package, _foliage, _bricks)
+FLOORS = (_marble, _wood, _fabric, _stones, _foliage, _bricks)
 
 
-def texture(rng: np.random.Generator, size: int = 256) -> np.ndarray:
-    """(size, size, 3) uint8: marble, wood, rust, cloth, stones, print, leaves or bricks."""
+def texture(rng: np.random.Generator, size: int = 256, materials: Sequence[Callable] = MATERIALS) -> np.ndarray:
+    """(size, size, 3) uint8: marble, wood, rust, cloth, stones, print, leaves or bricks (or one of `materials`)."""
     y, x = np.mgrid[:size, :size] / size
-    kind = MATERIALS[rng.integers(len(MATERIALS))]
+    kind = materials[rng.integers(len(materials))]
     return (np.clip(kind(rng, size, (x, y)), 0, 1) * 255).astype(np.uint8)
+
+
+_SKIES = np.array(
+    [
+        [[0.25, 0.45, 0.8], [0.8, 0.88, 0.95]],  # clear
+        [[0.55, 0.6, 0.66], [0.85, 0.85, 0.85]],  # overcast
+        [[0.2, 0.25, 0.5], [0.98, 0.62, 0.35]],  # sunset
+        [[0.75, 0.7, 0.62], [0.95, 0.92, 0.85]],  # a lit room
+        [[0.1, 0.12, 0.22], [0.4, 0.42, 0.55]],  # dusk
+    ]
+)
+"""Colors at the zenith and at the horizon."""
 
 
 def surroundings(rng: np.random.Generator, size: int = 512) -> np.ndarray:
     """(size, size, 3) uint8: a side of the world around: sky or ceiling, a skyline or shelves, ground; out of focus."""
     y, x = np.mgrid[:size, :size] / size
-    sky = shade(np.clip(y * 1.6, 0, 1), palette(rng, 3, rng.uniform(0.1, 0.6))[::-1])
+    zenith, horizon = _SKIES[rng.integers(len(_SKIES))] * rng.normal(1, 0.06, (2, 3))
+    sky = shade(np.clip(y * 1.8, 0, 1), np.clip([zenith, (zenith + horizon) / 2, horizon], 0, 1))
     clouds = np.clip(fractal_noise(rng, size, 7) - 0.45, 0, 1)[..., None] * 1.2
     picture = sky * (1 - clouds) + clouds
     for layer in range(3):
-        color = palette(rng, 3, rng.uniform(0.05, 0.6)) * (0.75 - 0.15 * layer)
+        color = palette(rng, 3, rng.uniform(0.05, 0.4)) * (0.8 - 0.15 * layer)
         edges = np.cumsum(rng.integers(size // 40, size // 8, 80))
         heights = rng.uniform(0.32 + 0.08 * layer, 0.52 + 0.06 * layer, 81)
         column = np.searchsorted(edges, np.arange(size))
