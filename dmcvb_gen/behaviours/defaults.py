@@ -11,11 +11,9 @@ from typing import Any
 
 import yaml
 
-from dmcvb_gen.behaviours.sac import SacSettings
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
-
-ALGORITHMS = ("sac",)
-"""What `train-behaviour --algo` takes."""
+from dmcvb_gen.behaviours.runs import RunConfig
+from dmcvb_gen.behaviours.settings import check_settings
+from dmcvb_gen.errors import DmcvbError
 
 
 @functools.cache
@@ -23,25 +21,36 @@ def _all() -> dict[str, Any]:
     return yaml.safe_load((resources.files("dmcvb_gen.behaviours") / "data" / "defaults.yaml").read_text())
 
 
-def default_run(task_id: str) -> dict[str, Any]:
-    """{"steps", "evaluate_every", "evaluate_sparse", "settings"} of a task's SAC run."""
+def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
+    """{"steps", "evaluate_every", "evaluate_sparse", "settings"} of a task's run.
+
+    `settings` of the file are sac's; another algorithm's are under `algorithms: {<name>: {...}}` of "all" and of
+    the task, on top of that algorithm's own defaults.
+    """
     family = "ant-maze" if task_id.startswith("ant-maze") else task_id
-    values = _all()["all"] | _all().get(family, {})
-    return values | {"settings": dict(values.get("settings") or {})}
+    general, own = _all()["all"], _all().get(family, {})
+    values = {name: value for name, value in (general | own).items() if name != "algorithms"}
+    if algorithm == "sac":
+        return values | {"settings": dict(values.get("settings") or {})}
+    parts = ((part.get("algorithms") or {}).get(algorithm) or {} for part in (general, own))
+    return values | {"settings": {name: value for part in parts for name, value in part.items()}}
 
 
 def parse_settings(pairs: tuple[str, ...], config: str | Path | None, algorithm: str) -> dict[str, Any]:
-    """Settings from --set key=value pairs and a YAML file, checked against the algorithm's known ones.
+    """Settings from a YAML file and --set key=value pairs (which win), as plain JSON values.
 
     Raises:
-      DmcvbError: not key=value, an unreadable file, or an unknown setting (lists the known ones).
+      DmcvbError: not key=value, an unreadable file, an unknown setting (lists the known ones) or a wrong value.
     """
     settings: dict[str, Any] = {}
     if config:
         try:
-            settings |= yaml.safe_load(Path(config).read_text()) or {}
-        except (OSError, yaml.YAMLError, TypeError) as error:
+            read = yaml.safe_load(Path(config).read_text())
+        except (OSError, ValueError, yaml.YAMLError) as error:
             raise DmcvbError(f"cannot read settings from {config}: {' '.join(str(error).split())}") from None
+        if not isinstance(read or {}, dict):
+            raise DmcvbError(f"{config} holds no settings; write lines like `learning_rate: 0.0003`")
+        settings |= {str(name): value for name, value in (read or {}).items()}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:
@@ -50,9 +59,25 @@ def parse_settings(pairs: tuple[str, ...], config: str | Path | None, algorithm:
             settings[name] = json.loads(value)
         except ValueError:
             settings[name] = value
-    if algorithm == "sac":
-        known = [field.name for field in dataclasses.fields(SacSettings)]
-        for name in settings:
-            if name not in known:
-                raise UnknownNameError("setting of sac", name, known)
-    return settings
+    checked = dataclasses.asdict(check_settings(algorithm, settings))
+    return {name: json.loads(json.dumps(checked[name])) for name in settings}
+
+
+def run_config(
+    task_id: str, algorithm: str, settings: dict[str, Any], found: RunConfig | None = None, **given: Any
+) -> RunConfig:
+    """What a run trains: what is given, else what the run to go on with has, else the task's defaults.
+
+    Args:
+      settings: given settings, checked.
+      found: the configuration of the run to go on with. Where `given` differs from it the result does too, and
+        `open_run` refuses it.
+      given: steps, seed, evaluate_every, init_from; None where not given.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if found and found.algorithm == algorithm:
+        return dataclasses.replace(found, task=task_id, settings=found.settings | settings, **given)
+    defaults = default_run(task_id, algorithm)
+    fields = {name: defaults[name] for name in ("steps", "evaluate_every", "evaluate_sparse")} | {"seed": 0} | given
+    fields["evaluate_sparse"] = max(given.get("evaluate_every", 0), fields["evaluate_sparse"])
+    return RunConfig(task=task_id, algorithm=algorithm, settings=defaults["settings"] | settings, **fields)

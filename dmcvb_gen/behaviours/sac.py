@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import nn
 
 from dmcvb_gen.behaviours.policy_file import LOG_STD_RANGE, Actor, PolicyHeader
+from dmcvb_gen.behaviours.row_files import map_rows, rows_in
+from dmcvb_gen.behaviours.settings import Count, Decay, Natural, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -32,33 +35,40 @@ class SacSettings:
       standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
         instead of the task's initial states; evaluations always start as the task does.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
+      critics: how many critics.
+      clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
+        tasks want).
+      weight_decay: of AdamW, on actor and critics.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
       compile: compile the updates (needs a C++ compiler on the CPU).
     """
 
-    simulations: int = 8
-    batch_size: int = 256
-    actor_hidden: tuple[int, ...] = (256, 256)
-    critic_hidden: tuple[int, ...] = (256, 256)
-    learning_rate: float = 1e-3
-    discount: float = 0.99
-    target_decay: float = 0.995
-    updates_per_step: float = 1.0
-    warmup_steps: int = 5000
-    actor_every: int = 2
+    simulations: Count = 8
+    batch_size: Count = 256
+    actor_hidden: tuple[Count, ...] = (256, 256)
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    learning_rate: Positive = 1e-3
+    discount: Decay = 0.99
+    target_decay: Decay = 0.995
+    updates_per_step: Positive = 1.0
+    warmup_steps: Natural = 5000
+    actor_every: Count = 2
     target_entropy_scale: float = 0.5
-    initial_temperature: float = 0.1
-    reward_scale: float = 0.5
-    shaping: float = 0.0
-    standing_starts: float = 0.0
-    train_episode_steps: int = 0
-    buffer_size: int = 1_000_000
+    initial_temperature: Positive = 0.1
+    reward_scale: Positive = 0.5
+    shaping: NonNegative = 0.0
+    standing_starts: Share = 0.0
+    train_episode_steps: Natural = 0
+    buffer_size: Count = 1_000_000
+    critics: Count = 2
+    clipped: bool = True
+    weight_decay: NonNegative = 0.0
     bfloat16: bool = True
     compile: bool = True
 
 
 class CriticEnsemble(nn.Module):
-    """Two critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer."""
+    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer."""
 
     def __init__(
         self, observation_size: int, action_size: int, hidden: tuple[int, ...], bfloat16: bool, critics: int = 2
@@ -101,24 +111,37 @@ class ReplayBuffer:
       folder: where the files are; None keeps them in memory.
     """
 
-    def __init__(self, size: int, observation_size: int, action_size: int, folder=None):
-        self.size, self.position, self.full = size, 0, False
+    def __init__(self, size: int, observation_size: int, action_size: int, folder: Path | None = None):
         shapes = {
-            "observation": (size, observation_size),
-            "next_observation": (size, observation_size),
-            "action": (size, action_size),
-            "reward": (size,),
-            "terminated": (size,),
+            "observation": (observation_size,),
+            "next_observation": (observation_size,),
+            "action": (action_size,),
+            "reward": (),
+            "terminated": (),
         }
-        self.arrays = {}
-        for name, shape in shapes.items():
-            if folder is None:
-                self.arrays[name] = np.zeros(shape, np.float32)
-                continue
-            path = folder / f"{name}.f32"
-            expected = int(np.prod(shape)) * 4
-            mode = "r+" if path.exists() and path.stat().st_size == expected else "w+"
-            self.arrays[name] = np.memmap(path, np.float32, mode, shape=shape)
+        self.position, self.full = 0, False
+        self.found = 0
+        """Rows that the files held before they were opened."""
+        if folder is None:
+            self.arrays = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
+        else:
+            paths = {name: folder / f"{name}.f32" for name in shapes}
+            self.found = min(rows_in(paths[name], shape) for name, shape in shapes.items())
+            size = max(size, self.found)
+            self.arrays = {name: map_rows(paths[name], size, shape)[:size] for name, shape in shapes.items()}
+        self.size = size
+
+    def restore(self, position: int, full: bool, rows: int | None = None) -> None:
+        """Go on where a run was saved, whose buffer had `rows` rows (as many as the files held, if not known)."""
+        rows = rows or self.found
+        # A full buffer that has grown since is not full any more: what is new lies behind the old rows.
+        self.position, self.full = (rows, False) if full and self.size > rows else (position, full)
+
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        for array in self.arrays.values():
+            if isinstance(array, np.memmap):
+                array.flush()
 
     def __len__(self) -> int:
         return self.size if self.full else self.position
@@ -164,18 +187,20 @@ class Sac:
         self.settings = settings
         observation, action = header.observation_size, header.action_size
         self.actor = Actor(header)
-        self.critic = CriticEnsemble(observation, action, settings.critic_hidden, settings.bfloat16)
-        self.target = CriticEnsemble(observation, action, settings.critic_hidden, settings.bfloat16)
+        sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics)
+        self.critic, self.target = CriticEnsemble(*sizes), CriticEnsemble(*sizes)
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
         self.target_entropy = -settings.target_entropy_scale * action
         rate = settings.learning_rate
-        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=rate, fused=True)
-        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=rate, fused=True)
+        decay = {"weight_decay": settings.weight_decay, "fused": True}
+        self.actor_optimizer = torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay)
+        self.critic_optimizer = torch.optim.AdamW(self.critic.parameters(), lr=rate, **decay)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
         self.norm = RunningNorm(observation)
         self.updates = 0
+        self._losses: dict[str, torch.Tensor] = {}
         self._critic_loss, self._actor_loss = self.critic_loss, self.actor_loss
         if settings.compile:
             self._critic_loss = torch.compile(self.critic_loss)
@@ -202,12 +227,16 @@ class Sac:
         log_prob = log_prob - 2 * (math.log(2) - before - nn.functional.softplus(-2 * before))
         return action, log_prob.sum(dim=1)
 
+    def reduce(self, values: torch.Tensor) -> torch.Tensor:
+        """(critic, n) -> (n,): the value that targets and the actor believe."""
+        return values.min(dim=0).values if self.settings.clipped else values.mean(dim=0)
+
     def critic_loss(self, observation, action, reward, terminated, next_observation):
-        """Mean squared Bellman error of both critics, (1)."""
+        """Mean squared Bellman error of the critics, (1)."""
         with torch.no_grad():
             next_observation = self.actor.normalize(next_observation)
             next_action, log_prob = self.sample_action(next_observation)
-            next_value = self.target(next_observation, next_action).min(dim=0).values
+            next_value = self.reduce(self.target(next_observation, next_action))
             next_value = next_value - self.log_alpha.exp() * log_prob
             target = reward + (1 - terminated) * self.settings.discount * next_value
         values = self.critic(self.actor.normalize(observation), action)
@@ -217,7 +246,7 @@ class Sac:
         """E[alpha log pi - min Q] and the mean log probability."""
         observation = self.actor.normalize(observation)
         action, log_prob = self.sample_action(observation)
-        value = self.critic(observation, action).min(dim=0).values
+        value = self.reduce(self.critic(observation, action))
         return (self.log_alpha.exp().detach() * log_prob - value).mean(), log_prob.mean()
 
     def update(self, batch: dict[str, torch.Tensor]) -> None:
@@ -233,6 +262,7 @@ class Sac:
         self.critic_optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.critic_optimizer.step()
+        self._losses["critic_loss"] = loss.detach()
         self.updates += 1
         if self.updates % settings.actor_every == 0:
             self.critic.requires_grad_(False)
@@ -241,6 +271,7 @@ class Sac:
             loss.backward()
             self.actor_optimizer.step()
             self.critic.requires_grad_(True)
+            self._losses |= {"actor_loss": loss.detach(), "entropy": -log_prob.detach()}
             self.alpha_optimizer.zero_grad(set_to_none=True)
             (-self.log_alpha.exp() * (log_prob.detach() + self.target_entropy)).backward()
             self.alpha_optimizer.step()
@@ -251,6 +282,12 @@ class Sac:
         with torch.no_grad():
             mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
             return torch.tanh(mean + std * torch.randn_like(mean)).numpy()
+
+    def metrics(self) -> dict[str, float]:
+        """Losses, policy entropy (nats) and temperature of the last update."""
+        return {name: float(value) for name, value in self._losses.items()} | {
+            "temperature": float(self.log_alpha.detach().exp())
+        }
 
     def state(self) -> dict:
         """Everything that learning continues from (tensors and plain numbers)."""
@@ -273,11 +310,21 @@ class Sac:
 
     def load_state(self, state: dict) -> None:
         """Continue from `state()`."""
-        for name in ("actor", "critic", "target", "actor_optimizer", "critic_optimizer", "alpha_optimizer"):
+        self.load_networks(state)
+        for name in ("actor_optimizer", "critic_optimizer", "alpha_optimizer"):
+            getattr(self, name).load_state_dict(state[name])
+        self.updates = int(state["updates"])
+        torch.set_rng_state(state["torch_rng"])
+
+    def load_networks(self, state: dict) -> None:
+        """Take networks, temperature and normalization of `state()`, but no optimizer or random state.
+
+        Raises:
+          RuntimeError: they have other shapes.
+        """
+        for name in ("actor", "critic", "target"):
             getattr(self, name).load_state_dict(state[name])
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
         self.norm.count = float(state["norm"]["count"])
         self.norm.mean, self.norm.m2 = state["norm"]["mean"].numpy().copy(), state["norm"]["m2"].numpy().copy()
-        self.updates = int(state["updates"])
-        torch.set_rng_state(state["torch_rng"])

@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -87,6 +88,17 @@ class TaskVecEnv(VecEnv):
             observation[ended] = self._observe(self._start(ended))[ended]
         return observation, result.reward.astype(np.float32), done, infos
 
+    def saved(self) -> dict[str, Any]:
+        """All that decides how the episodes go on: tensors and numbers."""
+        parts = {"physics": self.batch.physics(), "length": self._length, "return": self._return}
+        return {name: torch.from_numpy(part.copy()) for name, part in parts.items()} | {"started": self._started}
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go on from `saved()`, bit for bit."""
+        self.batch.set_physics(saved["physics"].numpy())
+        self._length, self._return = saved["length"].numpy().copy(), saved["return"].numpy().copy()
+        self._started = saved["started"]
+
     def close(self) -> None:
         """Nothing to free: the simulations live in memory."""
 
@@ -96,10 +108,10 @@ class TaskVecEnv(VecEnv):
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
-        raise NotImplementedError("simulations of a batch share their attributes")
+        raise AttributeError(f"{attr_name} cannot be set: simulations of a batch share their attributes")
 
     def env_method(self, method_name: str, *args, indices=None, **kwargs) -> list[Any]:
-        raise NotImplementedError("simulations of a batch have no methods of their own")
+        raise AttributeError(f"{method_name} cannot be called: simulations of a batch have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -16,13 +16,13 @@ from dmcvb_gen.cli.common import json_option, print_json
 @click.argument("task")
 @click.option("--out", type=click.Path(path_type=Path), help="The run's folder.  [default: runs/TASK]")
 @click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--algo", default="sac", show_default=True, help="sac.")
+@click.option("--seed", type=click.IntRange(0), help="[default: 0]")
+@click.option("--algo", help="sac (the package's own), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac]")
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="Override a setting. Repeatable.")
 @click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
 @click.option("--init-from", metavar="RUN|FILE", help="Start from another run's networks (or a policy file).")
 @click.option("--evaluate-every", type=click.IntRange(1), help="Agent steps between evaluations while returns are low.")
-@click.option("--resume", is_flag=True, help="Go on with the run in --out.")
+@click.option("--resume", is_flag=True, help="Go on with the run in --out; what is not given is as it was.")
 @json_option
 def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, resume, as_json):
     """Train a behaviour policy online on states.
@@ -30,41 +30,35 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     \b
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
+    dmcvb-gen train-behaviour cheetah-run --algo tqc --set gradient_steps=8 --out runs/cheetah-tqc
     dmcvb-gen select-checkpoints runs/walker-walk
     """
     import torch
 
-    from dmcvb_gen.behaviours.defaults import ALGORITHMS, default_run, parse_settings
-    from dmcvb_gen.behaviours.training import RunConfig, open_run
-    from dmcvb_gen.errors import UnknownNameError
+    from dmcvb_gen.behaviours.defaults import parse_settings, run_config
+    from dmcvb_gen.behaviours.paper import paper_returns
+    from dmcvb_gen.behaviours.runs import read_config
+    from dmcvb_gen.behaviours.training import open_run
     from dmcvb_gen.tasks import get_task
 
     get_task(task)
-    if algo not in ALGORITHMS:
-        raise UnknownNameError("algorithm", algo, ALGORITHMS)
-    defaults = default_run(task)
-    given = parse_settings(pairs, config, algo)
-    settings = (defaults["settings"] if algo == "sac" else {}) | given
-    total = steps or defaults["steps"]
     folder = out or Path("runs") / task
-    configuration = RunConfig(
-        task=task,
-        algorithm=algo,
-        steps=total,
-        seed=seed,
-        settings=settings,
-        evaluate_every=evaluate_every or defaults["evaluate_every"],
-        evaluate_sparse=max(evaluate_every or 0, defaults["evaluate_sparse"]),
-        init_from=init_from,
-    )
-    torch.set_num_threads(1)
+    found = read_config(folder) if resume else None
+    algorithm = algo or (found.algorithm if found else "sac")
+    given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
+    configuration = run_config(task, algorithm, parse_settings(pairs, config, algorithm), found, **given)
     run = open_run(folder, configuration, resume)
-    with tqdm(total=total, unit=" steps", unit_scale=True, desc=task, disable=as_json or None) as bar:
-
-        def report(progress):
-            bar.set_postfix_str(f"return {progress.evaluation.mean:.1f}", refresh=False)
-
-        run.train(report, bar.update)
+    torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
+    done = (run.saved() or {"step": 0})["step"]
+    expert = paper_returns(task, "expert")
+    goal = f" of the paper's {expert['mean']:.0f}" if expert else ""
+    with tqdm(
+        total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task, disable=as_json or None
+    ) as bar:
+        run.train(
+            lambda progress: bar.set_postfix_str(f"return {progress.evaluation.mean:.1f}{goal}", refresh=False),
+            bar.update,
+        )
     if as_json:
         return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1)))
     click.echo(f"{folder}: trained to {run.step:,} agent steps. Next: dmcvb-gen select-checkpoints {folder}")

@@ -1,0 +1,323 @@
+"""Run folders: what every training run has, whatever trains it.
+
+A run folder holds
+
+    run.json                              what is trained, never changed
+    checkpoints/<agent step>.safetensors  a policy file an evaluation, thinned where there are many
+    progress.csv, tensorboard/            a row, a point an evaluation
+    resume/                               learner, replay buffer, simulations, random states: a killed run goes on
+    selected/, selection.json, curve.png  written by the selection
+
+The saved state is written aside and renamed, so that a process that dies, or a disk that fills up, leaves the
+previous one. All that was logged after the saved state is dropped when a run goes on from it, and made again: with
+the same versions of torch and numpy, the same processor and one thread, a run that was killed and resumed gives the
+same bits as one that never was, as long as its replay buffer did not wrap around between save and kill (the rows
+written over by then are newer ones of the same run).
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import dataclasses
+import fcntl
+import functools
+import io
+import json
+import os
+import shlex
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dmcvb_gen.behaviours.evaluation import evaluate
+from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.policy_file import (
+    Actor,
+    Evaluation,
+    Policy,
+    PolicyHeader,
+    random_policy,
+    save_policy,
+)
+from dmcvb_gen.behaviours.run_log import RunLog
+from dmcvb_gen.behaviours.settings import check_settings
+from dmcvb_gen.behaviours.thinning import superfluous
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.store.manifest import environment
+from dmcvb_gen.tasks import get_task
+
+EVALUATION_EPISODES = 20
+"""Episodes of the evaluations along the way; selection evaluates its picks again on 100."""
+DENSE_SHARE = 0.6
+"""Share of the paper's expert return below which evaluations are dense: medium and mixed are picked from there."""
+SAVE_SECONDS = 240
+"""Seconds after which the next evaluation also saves the state to resume from."""
+
+Report = Callable[["Progress"], None]
+Tick = Callable[[int], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """What a run trains; written once to run.json, a resumed run must have the same.
+
+    Attributes:
+      steps: agent steps (at action repeat 2) to train; a resumed run may have more.
+      evaluate_every: agent steps between evaluations (and policy files) while the return is low, where medium and
+        mixed checkpoints are picked from.
+      evaluate_sparse: the same once 60 % of the paper's expert return is reached.
+      init_from: policy file or run whose actor, critics and normalization it starts from.
+    """
+
+    task: str
+    algorithm: str
+    steps: int
+    seed: int
+    settings: dict[str, Any]
+    evaluate_every: int = 2_000
+    evaluate_sparse: int = 10_000
+    init_from: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """One evaluation along the way; seconds are of training, evaluations left out."""
+
+    step: int
+    evaluation: Evaluation
+    seconds: float
+    steps_per_second: float
+
+
+def command_of(config: RunConfig) -> str:
+    """The command line that trains this run again."""
+    parts = [f"dmcvb-gen train-behaviour {config.task} --algo {config.algorithm} --steps {config.steps}"]
+    parts.append(f"--seed {config.seed}")
+    parts.append(f"--evaluate-every {config.evaluate_every}")
+    if config.init_from:
+        parts.append(f"--init-from {shlex.quote(config.init_from)}")
+    pairs = (f"{name}={json.dumps(value)}" for name, value in sorted(config.settings.items()))
+    parts += [f"--set {shlex.quote(pair)}" for pair in pairs]
+    return " ".join(parts)
+
+
+def read_config(folder: str | Path) -> RunConfig | None:
+    """What the run in a folder trains; None where there is no run.
+
+    Raises:
+      DmcvbError: run.json is damaged.
+    """
+    path = Path(folder) / "run.json"
+    if not path.exists():
+        return None
+    try:
+        return RunConfig(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise DmcvbError(f"{path} is not a run's configuration ({error}); choose another --out") from None
+
+
+def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:
+    """Refuse to mix two configurations in one folder; only `steps` may differ.
+
+    Settings are compared with their defaults filled in, so that naming a default is no difference.
+    """
+    was, now = (
+        {name: value for name, value in vars(config).items() if name not in ("steps", "settings")}
+        | dataclasses.asdict(check_settings(config.algorithm, config.settings))
+        for config in (found, asked)
+    )
+    for name in was | now:
+        if was.get(name) != now.get(name):
+            raise DmcvbError(
+                f"{folder} holds a run with {name} {was.get(name)!r}, asked for {now.get(name)!r}; "
+                "choose another --out, or repeat its settings"
+            )
+
+
+class Run(abc.ABC):
+    """A run in a folder; `train` starts it or goes on.
+
+    Attributes:
+      settings: the algorithm's checked settings.
+      header: of its policy files, without evaluation and agent step.
+      step: agent steps so far.
+      seconds: of training so far, evaluations left out.
+    """
+
+    def __init__(self, folder: Path, config: RunConfig):
+        self.folder, self.config = Path(folder), config
+        self.task = get_task(config.task)
+        self.settings = check_settings(config.algorithm, config.settings)
+        self.header = PolicyHeader(
+            task=self.task.id,
+            observation_size=self.task.behaviour_size,
+            action_size=self.task.action_size,
+            algorithm=config.algorithm,
+            agent_step=0,
+            training={
+                "settings": dataclasses.asdict(self.settings),
+                "seed": config.seed,
+                "init_from": config.init_from,
+                "environment": environment(),
+            },
+            command=command_of(config),
+            **self.network(),
+        )
+        self.step, self.seconds = 0, 0.0
+        self._started = time.time()
+
+    # -- what an algorithm must say ---------------------------------------------------------
+
+    @abc.abstractmethod
+    def network(self) -> dict[str, Any]:
+        """The header's fields that say how the actor is built."""
+
+    @abc.abstractmethod
+    def warmup(self) -> int:
+        """Agent steps before anything is learned."""
+
+    @abc.abstractmethod
+    def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
+        """Train until `config.steps`, from a saved state where there is one."""
+
+    # -- what callers use -------------------------------------------------------------------
+
+    def train(self, report: Report = lambda progress: None, tick: Tick = lambda steps: None) -> None:
+        """Train until `config.steps` agent steps; told of every evaluation and of every few steps.
+
+        Raises:
+          DmcvbError: another process trains in the folder, or its disk is full (the last saved state is whole).
+        """
+        with self._writing():
+            for name in ("checkpoints", "resume"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+            with self._alone():
+                saved = self.saved()
+                self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
+                self._drop_later_checkpoints()
+                self._log = RunLog(self.folder, self.step)
+                self._started = time.time()
+                try:
+                    self._train(saved, report, tick)
+                finally:
+                    self._log.close()
+
+    def saved(self) -> dict[str, Any] | None:
+        """The state to resume from (tensors, numbers and texts only), None where nothing is saved yet."""
+        path = self.folder / "resume" / "state.pt"
+        if not path.exists():
+            return None
+        try:
+            return torch.load(path, weights_only=True)
+        except Exception as error:  # torch raises many kinds for a file that is not its own
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise DmcvbError(f"{path} cannot be read ({reason}); start again with another --out") from None
+
+    # -- what algorithms use ----------------------------------------------------------------
+
+    def record(
+        self, weights: Mapping[str, torch.Tensor], updates: int, metrics: Mapping[str, float], report: Report
+    ) -> Progress:
+        """Evaluate the actor's `weights`, export them as a policy file, log; evaluations are not training time."""
+        self.seconds += time.time() - self._started
+        header = self.header.model_copy(update={"agent_step": self.step})
+        weights = {name: value.detach().clone() for name, value in weights.items()}
+        actor = Actor(header)
+        actor.load_state_dict(weights)
+        evaluation, _ = evaluate(Policy(header, actor, ""), self.task, EVALUATION_EPISODES, seed=self.step)
+        trained = header.training | {"seconds": round(self.seconds, 1)}
+        header = header.model_copy(update={"evaluation": evaluation, "training": trained})
+        save_policy(self._checkpoint(self.step), header, weights)
+        self._log.add(self.step, evaluation, self.seconds, updates, metrics)
+        self._thin()
+        progress = Progress(self.step, evaluation, self.seconds, self.step / max(self.seconds, 1e-9))
+        report(progress)
+        self._started = time.time()
+        return progress
+
+    def next_evaluation(self, evaluation: Evaluation) -> int:
+        """The agent step of the evaluation after this one."""
+        config, expert = self.config, paper_returns(self.task.id, "expert")
+        dense = expert is None or evaluation.mean < self._base + DENSE_SHARE * (expert["mean"] - self._base)
+        return self.step + (config.evaluate_every if dense else config.evaluate_sparse)
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Put the state to resume from in place of the previous one, whole or not at all."""
+        data = io.BytesIO()  # torch's own writer would abort the process where the disk is full
+        torch.save(state | {"step": self.step, "seconds": self.seconds}, data)
+        path = self.folder / "resume" / "state.pt"
+        temporary = path.with_suffix(".partial")
+        try:
+            with temporary.open("wb") as file:
+                file.write(data.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    # -- the folder -------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _base(self) -> float:
+        """Return at 0 % of the way: the random policy's where returns are negative, as in the selection."""
+        if self.task.return_range[1] > 0:
+            return 0.0
+        return evaluate(random_policy(self.task), self.task, EVALUATION_EPISODES, seed=0)[0].mean
+
+    def _checkpoint(self, step: int) -> Path:
+        return self.folder / "checkpoints" / f"{step:010d}.safetensors"
+
+    def _checkpoints(self) -> dict[int, Path]:
+        files = (self.folder / "checkpoints").glob("[0-9]*.safetensors")
+        return {int(path.stem): path for path in files if path.stem.isdigit()}
+
+    def _drop_later_checkpoints(self) -> None:
+        for step, path in self._checkpoints().items():
+            if step > self.step:
+                path.unlink()
+        for folder in ("checkpoints", "resume"):
+            for path in (self.folder / folder).glob("*.partial"):
+                path.unlink()
+
+    def _thin(self) -> None:
+        files = self._checkpoints()
+        curve = {step: self._log.curve[step] for step in files if step in self._log.curve}
+        picked = self._picked()
+        for step in superfluous(curve, self.task.return_range):
+            if files[step].name not in picked:
+                files[step].unlink()
+
+    def _picked(self) -> set[str]:
+        """Names of the checkpoints that the last selection picked."""
+        try:
+            levels = json.loads((self.folder / "selection.json").read_text())["levels"]
+            return {Path(pick["path"]).name for level in levels.values() for pick in level["picks"]}
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            return set()
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """One process a folder; the lock ends with the process, however that ends."""
+        with (self.folder / "resume" / "lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise DmcvbError(
+                    f"another process trains in {self.folder}; wait for it, or choose another --out"
+                ) from None
+            yield
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DmcvbError(
+                f"cannot write the run in {self.folder}: {error.strerror or error}; the previous saved state is whole, "
+                "make room and go on with --resume"
+            ) from None
