@@ -1,0 +1,145 @@
+"""Agents by name: "id+bc" in, what pre-trains its encoder and what learns its policy out.
+
+    [PRETRAIN+]POLICY[:frames=N,k=N,sample]
+
+PRETRAIN is one of id, lfd, ae, state, dino, bc (its encoder is then frozen) or null (none: the policy trains its
+encoder); POLICY is bc or td3-bc. state-bc and state-td3-bc see states instead of pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import nn
+
+from dmcvb_gen.agents.data import FRAMES, TrainingData
+from dmcvb_gen.agents.dino import load_dino
+from dmcvb_gen.agents.learners import (
+    TD3BC,
+    Autoencoder,
+    BehaviorCloning,
+    InverseDynamics,
+    LatentForwardDynamics,
+    Learner,
+    Policy,
+    StatePrediction,
+)
+from dmcvb_gen.agents.networks import Convolutions, Encoder, observation_encoder, state_encoder
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+
+PRETRAIN = ("id", "lfd", "ae", "state", "dino", "bc")
+POLICIES = ("bc", "td3-bc")
+AGENTS = (
+    *POLICIES,
+    *(f"state-{policy}" for policy in POLICIES),
+    *(f"{pretrain}+{policy}" for policy in POLICIES for pretrain in PRETRAIN),
+)
+"""The names that `parse_agent` takes, options left out."""
+
+
+@dataclass(frozen=True)
+class Agent:
+    """An agent.
+
+    Attributes:
+      policy: "bc" or "td3-bc".
+      pretrain: what makes the frozen encoder; None: trained with the policy.
+      sees_state: states instead of pictures.
+      stack: frames an observation.
+      k, sample_k: of inverse dynamics.
+    """
+
+    policy: str
+    pretrain: str | None = None
+    sees_state: bool = False
+    stack: int = FRAMES
+    k: int = 1
+    sample_k: bool = False
+
+    @property
+    def base(self) -> str:
+        """The name without options."""
+        if self.sees_state:
+            return f"state-{self.policy}"
+        return f"{self.pretrain}+{self.policy}" if self.pretrain else self.policy
+
+    @property
+    def name(self) -> str:
+        options = [f"frames={self.stack}"] if self.stack != FRAMES and not self.sees_state else []
+        options += [f"k={self.k}"] if self.k != 1 else []
+        options += ["sample"] if self.sample_k else []
+        return self.base + (":" + ",".join(options) if options else "")
+
+    @property
+    def paper_name(self) -> str | None:
+        """The column of the paper's table; None where it has none."""
+        if ":" in self.name or (self.sees_state and self.policy != "bc"):
+            return None
+        if self.sees_state:
+            return "bc(state)"
+        return f"{self.pretrain or 'null'}+{self.policy}"
+
+
+def parse_agent(name: str) -> Agent:
+    """The agent of a name.
+
+    Raises:
+      UnknownNameError, DmcvbError: no such agent or option.
+    """
+    base, _, options = name.strip().lower().partition(":")
+    base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
+    if base not in AGENTS:
+        raise UnknownNameError("agent", name, AGENTS)
+    values = {"stack": FRAMES, "k": 1, "sample_k": False}
+    for option in filter(None, options.split(",")):
+        key, _, value = option.partition("=")
+        if key == "sample" and not value:
+            values["sample_k"] = True
+        elif key in ("frames", "k") and value.isdigit() and 1 <= int(value) <= 64:
+            values["stack" if key == "frames" else "k"] = int(value)
+        else:
+            raise DmcvbError(f"agent {name!r}: {option!r} is not an option; known: frames=1..64, k=1..64, sample")
+    pretrain, plus, policy = base.rpartition("+")
+    if base.startswith("state-"):
+        return Agent(base.removeprefix("state-"), sees_state=True, **values)
+    return Agent(policy, pretrain if plus else None, **values)
+
+
+def make_encoder(agent: Agent, data: TrainingData, dino_weights: str | Path | None = None) -> nn.Module:
+    """phi of an agent, untrained (or DINO's).
+
+    Raises:
+      DmcvbError: DINO's weights are asked for and not at hand.
+    """
+    if agent.sees_state:
+        return state_encoder(data.state.shape[1])
+    if agent.pretrain == "dino":
+        return load_dino(dino_weights, data.channels)
+    return observation_encoder(data.channels, data.frames.size)
+
+
+def make_pretrainer(agent: Agent, encoder: Encoder, data: TrainingData) -> Learner:
+    """What pre-trains phi."""
+    actions, states = data.action.shape[1], data.state.shape[1]
+    makers = {
+        "id": lambda: InverseDynamics(encoder, actions, agent.k, agent.sample_k),
+        "lfd": lambda: LatentForwardDynamics(encoder, actions),
+        "ae": lambda: Autoencoder(encoder, data.channels, data.frames.size),
+        "state": lambda: StatePrediction(encoder, states),
+        "bc": lambda: BehaviorCloning(encoder, actions),
+    }
+    return makers[agent.pretrain]()
+
+
+def make_policy(agent: Agent, encoder: nn.Module, data: TrainingData) -> Policy:
+    """What learns the policy, on the pre-trained encoder (frozen) or with one of its own."""
+    actions, frozen = data.action.shape[1], agent.pretrain is not None
+    if agent.policy == "bc":
+        return BehaviorCloning(encoder, actions, frozen=frozen)
+    if frozen:
+        return TD3BC(encoder, encoder.features, actions, frozen=True)
+    if agent.sees_state:
+        return TD3BC(nn.Identity(), data.state.shape[1], actions)
+    body = Convolutions(data.channels, data.frames.size)
+    return TD3BC(body, body.features, actions)

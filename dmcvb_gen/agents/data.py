@@ -1,0 +1,399 @@
+"""Training data of the agents: subsets of a release in, batches of frame stacks, states and transitions out.
+
+Episodes lie one after the other in one table of rows, L + 1 rows an episode (row t: observation t, the action
+taken there, its reward); a batch is a gather from that table, never a loop over samples::
+
+    row        0    1   ...  L_0 | L_0 + 1 ...          start[e] + t
+    frames     o_0  o_1 ...  o_L | o_0 of episode 1 ...  (channel, height, width) uint8
+
+Pictures stay uint8 until they are in a batch. They are held in memory (or on the accelerator) where they fit, else
+read from the shards as they are asked for (`StoredFrames`).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from dmcvb_gen.agents.learners import Batch
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.store import Subset
+
+FRAMES = 3
+"""Frames an observation; the first one of an episode is repeated (paper, appendix "Encoders")."""
+PAD = 4
+"""Pixels that a random shift may move a stack, either way (section 5, "Preprocessing details")."""
+HOLD_OUT = 0.05
+"""Share of the episodes that no agent learns from."""
+STD_FLOOR = 1e-3
+READ_EPISODES = 10
+"""Episodes decoded at a time while a subset is loaded."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A part of a subset: `share` of its episodes, drawn once by `seed`."""
+
+    subset: Subset
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """Centers and scales states: (s - mean) / std; both (state,) float32."""
+
+    mean: torch.Tensor
+    std: torch.Tensor
+
+    def __call__(self, state: torch.Tensor) -> torch.Tensor:
+        return (state - self.mean.to(state.device)) / self.std.to(state.device)
+
+    @classmethod
+    def of(cls, state: torch.Tensor) -> Normalization:
+        """Statistics of (row, state) values, std floored at 1e-3."""
+        values = state.double()
+        std = values.std(dim=0, correction=0).clamp(min=STD_FLOOR)
+        return cls(values.mean(dim=0).float(), std.float())
+
+
+class Frames(Protocol):
+    """A table of pictures."""
+
+    channels: int
+    size: int
+
+    def shifted(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        """(batch, frames) rows, (batch,) offsets in 0..2 PAD -> (batch, frames x channels, size, size) uint8."""
+        ...
+
+
+def mirror(size: int) -> torch.Tensor:
+    """(size + 2 PAD,) long: which pixel stands where after padding that repeats the border in reverse."""
+    index = torch.arange(size + 2 * PAD) - PAD
+    index = torch.where(index < 0, -index - 1, index)
+    return torch.where(index >= size, 2 * size - 1 - index, index)
+
+
+def shift_columns(pictures: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """(batch, channel, size, size) moved sideways, an offset a stack."""
+    size = pictures.shape[-1]
+    columns = mirror(size).to(right.device)[right[:, None] + torch.arange(size, device=right.device)]
+    return torch.gather(pictures, 3, columns[:, None, None].expand(pictures.shape))
+
+
+class HeldFrames:
+    """Pictures in memory.
+
+    Args:
+      pictures: (row, channel, size, size) uint8, contiguous, on any device.
+    """
+
+    def __init__(self, pictures: torch.Tensor):
+        self.pictures = pictures
+        self.channels, self.size = pictures.shape[1], pictures.shape[2]
+
+    def shifted(self, rows, down, right):
+        # Lines of pixels are what is gathered, so that picking the frames and moving them up or down is one copy.
+        batch, frames = rows.shape
+        device, size = rows.device, self.size
+        line = mirror(size).to(device)[down[:, None] + torch.arange(size, device=device)]  # (batch, size)
+        plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=device)
+        index = plane.reshape(batch, -1, 1) * size + line[:, None]
+        lines = self.pictures.view(-1, size).index_select(0, index.reshape(-1))
+        return shift_columns(lines.view(batch, frames * self.channels, size, size), right)
+
+
+class StoredFrames:
+    """Pictures read from the shards when they are asked for: for data larger than memory.
+
+    Args:
+      subsets: the subsets, their picture arrays, and for every row of the table (subset, episode, step).
+    """
+
+    def __init__(self, subsets: Sequence[Subset], arrays: Sequence[tuple[str, ...]], where: np.ndarray, size: int):
+        self._arrays = [[subset.group[name] for name in names] for subset, names in zip(subsets, arrays, strict=True)]
+        self._where = where
+        self.channels, self.size = 3 * len(arrays[0]), size
+
+    def shifted(self, rows, down, right):
+        out = np.empty((*rows.shape, self.channels, self.size, self.size), np.uint8)
+        for sample, row in enumerate(rows.cpu().numpy()):
+            source, episode, first = self._where[row[0]]
+            last = self._where[row[-1]][2]
+            steps = self._where[row][:, 2] - first
+            views = [array[int(episode), int(first) : int(last) + 1][steps] for array in self._arrays[source]]
+            out[sample] = np.concatenate(views, axis=-1).transpose(0, 3, 1, 2)
+        stacks = torch.from_numpy(out).flatten(1, 2).to(rows.device)
+        held = HeldFrames(stacks.contiguous())  # each sample a "frame" of its own: only the shift is left to do
+        return held.shifted(torch.arange(len(stacks), device=rows.device)[:, None], down, right)
+
+
+def normalize_pixels(pictures: torch.Tensor) -> torch.Tensor:
+    """uint8 -> float32 in [-0.5, 0.5]."""
+    return pictures.to(torch.float32).mul_(1 / 255).sub_(0.5)
+
+
+def stack_rows(row: torch.Tensor, start: torch.Tensor, frames: int) -> torch.Tensor:
+    """(batch,) rows and the first rows of their episodes -> (batch, frames) rows, oldest first."""
+    back = torch.arange(frames - 1, -1, -1, device=row.device)
+    return torch.maximum(row[:, None] - back, start[:, None])
+
+
+def training_views(subset: Subset) -> tuple[str, ...]:
+    """The picture arrays that agents see: the goal hidden where the setting hides it, never the overhead view."""
+    hidden = subset.task.startswith("ant-maze") and subset.setting != "visible"
+    root = "pixels_hidden_goal" if hidden else "pixels"
+    names = subset.pixel_arrays
+    if names == ("pixels",):
+        return names
+    order = ("top", "egocentric", "follow")
+    return tuple(f"{root}/{view}" for view in order if f"{root}/{view}" in names)
+
+
+class TrainingData(Dataset):
+    """Episodes of one or several subsets, ready to be drawn from.
+
+    As a torch data set it has an item a training transition: (observation, action); `__getitems__` gives many at
+    once, which a DataLoader uses. Training calls `batch`.
+
+    Attributes:
+      state: (row, state) float32, normalized.
+      action: (row, action) float32. reward, discount: (row,) float32.
+      start, end: (row,) long, first and last row of the row's episode.
+      normalization: of the states, from the training episodes.
+      train_rows, hold_out_rows: (n,) long, rows that hold a transition.
+      returns: (episode,) float64, of all episodes in it.
+    """
+
+    def __init__(
+        self,
+        state: torch.Tensor,
+        action: torch.Tensor,
+        reward: torch.Tensor,
+        discount: torch.Tensor,
+        lengths: np.ndarray,
+        held_out: np.ndarray,
+        frames: Frames | None = None,
+        stack: int = FRAMES,
+        returns: np.ndarray | None = None,
+    ):
+        device = state.device
+        first = np.cumsum(lengths + 1) - (lengths + 1)
+        self.start = torch.as_tensor(np.repeat(first, lengths + 1), device=device)
+        self.end = torch.as_tensor(np.repeat(first + lengths, lengths + 1), device=device)
+        rows = torch.arange(len(state), device=device)
+        out = torch.as_tensor(np.repeat(held_out, lengths + 1), device=device)
+        self.train_rows = rows[(rows < self.end) & ~out]
+        self.hold_out_rows = rows[(rows < self.end) & out]
+        self.normalization = Normalization.of(state[~out])
+        self.state = self.normalization(state)
+        self.action, self.reward, self.discount = action, reward, discount
+        self.frames, self.stack = frames, stack
+        self.lengths, self.held_out, self.returns = lengths, held_out, returns
+
+    @property
+    def channels(self) -> int:
+        """Channels of an observation: 3 x views x frames of the stack."""
+        return self.frames.channels * self.stack
+
+    @property
+    def device(self) -> torch.device:
+        return self.state.device
+
+    def __len__(self) -> int:
+        return len(self.train_rows)
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        rows = self.train_rows[torch.as_tensor(indices, device=self.device)]
+        observations = self.observe(rows, *self._no_shift(len(rows)))
+        return list(zip(observations, self.action[rows], strict=True))
+
+    def _no_shift(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        middle = torch.full((count,), PAD, device=self.device)
+        return middle, middle
+
+    def observe(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures."""
+        if self.frames is None:
+            return self.state[rows]
+        stacks = stack_rows(rows, self.start[rows], self.stack)
+        return normalize_pixels(self.frames.shifted(stacks, down, right))
+
+    def batch(
+        self,
+        size: int,
+        generator: np.random.Generator,
+        *,
+        next_observation: bool = False,
+        k: int = 1,
+        sample_k: bool = False,
+        hold_out: bool = False,
+    ) -> Batch:
+        """Transitions drawn uniformly, with replacement.
+
+        Args:
+          next_observation: give the observation k steps later too, under the same shift.
+          k: steps between the two; with `sample_k` drawn from 1..k for each.
+          hold_out: draw from the held-out episodes, without shifts.
+        """
+        rows = self.hold_out_rows if hold_out else self.train_rows
+        if next_observation and k > 1:
+            rows = rows[rows + k <= self.end[rows]]
+        if not len(rows):
+            raise DmcvbError(
+                f"there are no {'held-out ' if hold_out else ''}transitions to draw from (k = {k}); roll out more "
+                "episodes"
+            )
+        chosen = rows[self._to_device(generator.integers(len(rows), size=size))]
+        if hold_out or self.frames is None:
+            down, right = self._no_shift(size)
+        else:
+            down, right = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
+        later = steps = None
+        if next_observation:
+            steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
+            later = self.observe(chosen + steps, down, right)
+        return Batch(
+            observation=self.observe(chosen, down, right),
+            state=self.state[chosen],
+            action=self.action[chosen],
+            reward=self.reward[chosen],
+            discount=self.discount[chosen],
+            next_observation=later,
+            k=steps,
+        )
+
+    def _to_device(self, values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values).to(self.device)
+
+    def states_only(self) -> TrainingData:
+        """The same episodes for an agent that sees states: shares everything but the pictures."""
+        twin = object.__new__(TrainingData)
+        twin.__dict__.update(self.__dict__ | {"frames": None})
+        return twin
+
+
+def batches(
+    draw: Callable[[int], Batch], first: int, last: int, workers: int = 0, ahead: int = 4
+) -> Iterator[tuple[int, Batch]]:
+    """(step, batch) for steps first .. last - 1, in order; drawn ahead by threads where there are workers."""
+    if not workers:
+        yield from ((step, draw(step)) for step in range(first, last))
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        waiting = {step: pool.submit(draw, step) for step in range(first, min(first + ahead, last))}
+        for step in range(first, last):
+            batch = waiting.pop(step).result()
+            if step + ahead < last:
+                waiting[step + ahead] = pool.submit(draw, step + ahead)
+            yield step, batch
+
+
+def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(episodes, held out) of a source: its share, and which of those no agent learns from (5 %, none of one)."""
+    names = source.subset.episodes
+    generator = np.random.default_rng(seed)
+    order = generator.permutation(len(names))
+    count = max(1, round(source.share * len(names)))
+    out = min(math.ceil(HOLD_OUT * count), count - 1)
+    chosen = order[:count]
+    held = np.zeros(count, bool)
+    held[:out] = True
+    by_name = np.argsort(names[chosen])
+    return names[chosen][by_name], held[by_name]
+
+
+def default_memory() -> int:
+    """Bytes of pictures that are held: half of what the machine has free."""
+    pages = os.sysconf("SC_AVPHYS_PAGES") if "SC_AVPHYS_PAGES" in os.sysconf_names else 2**20
+    return pages * os.sysconf("SC_PAGE_SIZE") // 2
+
+
+def load_data(
+    sources: Sequence[Source],
+    *,
+    pixels: bool = True,
+    stack: int = FRAMES,
+    seed: int = 0,
+    device: str = "cpu",
+    memory: int | None = None,
+) -> TrainingData:
+    """Read subsets (mixed, where there are several) for training.
+
+    Args:
+      pixels: agents see pictures; else states.
+      stack: frames an observation.
+      seed: of the episode split and of shares.
+      memory: bytes of pictures to hold at most; larger data are read from the shards batch by batch.
+
+    Raises:
+      DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
+    """
+    subsets = [source.subset for source in sources]
+    shapes = {(subset.task, subset.record.size, training_views(subset)) for subset in subsets}
+    if len({(task, size, len(views)) for task, size, views in shapes}) != 1:
+        raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or picture sizes differ")
+    names = [training_views(subset) for subset in subsets]
+    if pixels and not names[0]:
+        raise DmcvbError(f"{subsets[0].name} has no pictures that agents are trained on")
+    chosen = [choose_episodes(source, seed) for source in sources]
+    lengths = [
+        subset.lengths[np.searchsorted(subset.episodes, e)] for subset, (e, _) in zip(subsets, chosen, strict=True)
+    ]
+    size = subsets[0].record.size
+    rows = int(sum((length + 1).sum() for length in lengths))
+    needed = rows * 3 * len(names[0]) * size**2 if pixels else 0
+    hold = pixels and needed <= (default_memory() if memory is None else memory)
+    held = torch.empty((rows, 3 * len(names[0]), size, size), dtype=torch.uint8) if hold else None
+    tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
+    where, first, returns = [], 0, []
+    for index, (subset, (episodes, _), length) in enumerate(zip(subsets, chosen, lengths, strict=True)):
+        returns.append(subset.returns[np.searchsorted(subset.episodes, episodes)])
+        step = np.arange(int(length.max()) + 1)
+        for part in range(0, len(episodes), READ_EPISODES):
+            few = episodes[part : part + READ_EPISODES]
+            within = step[None] <= length[part : part + READ_EPISODES, None]
+            e, t = np.nonzero(within)
+            where.append(np.stack([np.full(len(e), index), few[e], t], axis=1))
+            for name, table in tables.items():
+                table.append(subset.read(name, few)[e, t])
+            if hold:
+                for view, name in enumerate(names[index]):
+                    pictures = torch.from_numpy(subset.read(name, few)[e, t])
+                    held[first : first + len(e), 3 * view : 3 * view + 3] = pictures.permute(0, 3, 1, 2)
+            first += len(e)
+    frames = None
+    if hold:
+        frames = HeldFrames(held.to(device))
+    elif pixels:
+        frames = StoredFrames(subsets, names, np.concatenate(where), size)
+    columns = {name: torch.from_numpy(np.concatenate(parts)).float().to(device) for name, parts in tables.items()}
+    return TrainingData(
+        **columns,
+        lengths=np.concatenate(lengths).astype(np.int64),
+        held_out=np.concatenate([out for _, out in chosen]),
+        frames=frames,
+        stack=stack,
+        returns=np.concatenate(returns),
+    )
+
+
+def with_stack(data: TrainingData, stack: int) -> TrainingData:
+    """The same data seen in stacks of another number of frames."""
+    twin = object.__new__(TrainingData)
+    twin.__dict__.update(data.__dict__ | {"stack": stack})
+    return twin
+
+
+__all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data", "with_stack"]

@@ -1,0 +1,120 @@
+"""Networks of DMC-VB's agents: frame stacks, states or latents in, latents, actions, values or pictures out.
+
+Sizes are those of the paper's appendix "Architecture and hyperparameters". Frame stacks are
+(batch, channel, 64, 64) float in [-0.5, 0.5], channels = 3 x frames x views (9 for locomotion, 27 for mazes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+LATENT = 64
+"""Width of every encoder's output."""
+CHANNELS, STRIDES = (32, 64, 128, 256), (2, 2, 1, 1)
+"""Of the encoder's four 3x3 convolutions; 64 x 64 pictures become 16 x 16 x 256 = 65,536 features."""
+DECODER_CHANNELS, DECODER_STRIDES = (128, 64, 32), (1, 1, 2, 2)
+HIDDEN = (256, 256)
+"""Hidden layers of every MLP."""
+DOWNSCALE = 4
+
+
+def initialize(module: nn.Module) -> nn.Module:
+    """Orthogonal weights and zero biases in every linear and convolutional layer."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+            nn.init.orthogonal_(layer.weight)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+    return module
+
+
+class Trunk(nn.Sequential):
+    """(batch, features) -> (batch, 64) in (-1, 1): linear, LayerNorm, tanh."""
+
+    def __init__(self, features: int):
+        super().__init__(nn.Linear(features, LATENT), nn.LayerNorm(LATENT), nn.Tanh())
+        self.features = LATENT
+        initialize(self)
+
+
+class Convolutions(nn.Sequential):
+    """(batch, channel, size, size) -> (batch, 256 (size / 4)^2): four 3x3 convolutions with GELU, flattened."""
+
+    def __init__(self, channels: int, size: int = 64):
+        if size % DOWNSCALE:
+            raise ValueError(f"pictures of {size} pixels; the encoder needs a multiple of {DOWNSCALE}")
+        layers: list[nn.Module] = []
+        width = channels
+        for out, stride in zip(CHANNELS, STRIDES, strict=True):
+            layers += [nn.Conv2d(width, out, 3, stride, padding=1), nn.GELU()]
+            width = out
+        super().__init__(*layers, nn.Flatten())
+        self.features = width * (size // DOWNSCALE) ** 2
+        initialize(self)
+
+
+class Encoder(nn.Module):
+    """phi: an observation to a 64-d latent; `body` is shared by TD3-BC's actor and critic, `trunk` is not.
+
+    Args:
+      body: `Convolutions` for pictures, `nn.Identity` for states.
+      features: what the body gives.
+    """
+
+    def __init__(self, body: nn.Module, features: int):
+        super().__init__()
+        self.body, self.trunk = body, Trunk(features)
+        self.features = LATENT
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return self.trunk(self.body(observation))
+
+
+def observation_encoder(channels: int, size: int = 64) -> Encoder:
+    """phi for frame stacks."""
+    body = Convolutions(channels, size)
+    return Encoder(body, body.features)
+
+
+def state_encoder(state_size: int) -> Encoder:
+    """phi for states: the trunk alone, neither convolutions nor frame stack."""
+    return Encoder(nn.Identity(), state_size)
+
+
+class MLP(nn.Sequential):
+    """(batch, inputs) -> (batch, outputs): hidden layers 256, 256 with ReLU; tanh at the end if asked for."""
+
+    def __init__(self, inputs: int, outputs: int, tanh: bool = False, hidden: Sequence[int] = HIDDEN):
+        layers: list[nn.Module] = []
+        for width in hidden:
+            layers += [nn.Linear(inputs, width), nn.ReLU()]
+            inputs = width
+        super().__init__(*layers, nn.Linear(inputs, outputs), *([nn.Tanh()] if tanh else []))
+        initialize(self)
+
+
+class ObservationDecoder(nn.Module):
+    """psi: (batch, 64) -> (batch, channel, size, size), the encoder in reverse; no activation at the end."""
+
+    def __init__(self, channels: int, size: int = 64, features: int = LATENT):
+        super().__init__()
+        self.shape = (CHANNELS[-1], size // DOWNSCALE, size // DOWNSCALE)
+        self.linear = nn.Linear(features, CHANNELS[-1] * (size // DOWNSCALE) ** 2)
+        layers: list[nn.Module] = []
+        width = CHANNELS[-1]
+        for out, stride in zip((*DECODER_CHANNELS, channels), DECODER_STRIDES, strict=True):
+            layers += [nn.ConvTranspose2d(width, out, 3, stride, padding=1, output_padding=stride - 1), nn.GELU()]
+            width = out
+        self.deconvolutions = nn.Sequential(*layers[:-1])
+        initialize(self)
+
+    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        return self.deconvolutions(self.linear(latent).unflatten(1, self.shape))
+
+
+def state_decoder(state_size: int, features: int = LATENT) -> MLP:
+    """(batch, 64) -> (batch, state): an MLP without activation at the end."""
+    return MLP(features, state_size)

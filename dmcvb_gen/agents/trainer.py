@@ -1,0 +1,180 @@
+"""The one trainer of all agents: a learner and its data in, a learning curve out; goes on where it was stopped.
+
+Every random number of step i (which transitions, shifts, TD3's noise) comes from (seed, i), so a run that is stopped
+and resumed draws what it would have drawn.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from dmcvb_gen.agents.data import TrainingData, batches
+from dmcvb_gen.agents.learners import Batch, Learner
+from dmcvb_gen.errors import DmcvbError
+
+HOLD_OUT_BATCHES = 4
+"""Batches of the hold-out that a test loss is the mean of."""
+SAVE_SECONDS = 120.0
+"""Work that a stop may cost."""
+RESUME_FILE = "resume.safetensors"
+
+Curve = list[dict[str, Any]]
+"""A point: step, seconds since the start, losses, hold-out losses ("test_..."), and what `evaluate` gave."""
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How long and how to train (paper, table "Hyperparameters").
+
+    Attributes:
+      steps: Adam steps.
+      batch_size: transitions a step.
+      evaluate_every: steps between online evaluations; one at the end in any case.
+      points: points of the learning curve.
+      half: bfloat16 autocast. Pays for pictures, not for states.
+      compile: torch.compile of the losses.
+      workers: threads that draw batches ahead; 0 draws them in turn.
+    """
+
+    steps: int = 400_000
+    batch_size: int = 256
+    evaluate_every: int = 20_000
+    points: int = 50
+    half: bool = True
+    compile: bool = False
+    workers: int = 0
+
+
+def draw(learner: Learner, data: TrainingData, size: int, seed: int, step: int, hold_out: bool = False) -> Batch:
+    """The batch of a step, as the learner needs it."""
+    generator = np.random.default_rng((seed, step, int(hold_out)))
+    return data.batch(
+        size,
+        generator,
+        next_observation=learner.needs_next,
+        k=learner.k_max,
+        sample_k=learner.sample_k,
+        hold_out=hold_out,
+    )
+
+
+def hold_out_losses(learner: Learner, data: TrainingData, size: int, seed: int = 0) -> dict[str, float]:
+    """Losses on held-out episodes, always on the same batches; {} where nothing is held out."""
+    if not len(data.hold_out_rows):
+        return {}
+    sums: dict[str, float] = {}
+    for index in range(HOLD_OUT_BATCHES):
+        for name, value in learner.metrics(draw(learner, data, size, seed, index, hold_out=True)).items():
+            sums[f"test_{name}"] = sums.get(f"test_{name}", 0.0) + float(value) / HOLD_OUT_BATCHES
+    return sums
+
+
+def train(
+    learner: Learner,
+    data: TrainingData,
+    settings: TrainSettings,
+    *,
+    seed: int = 0,
+    folder: Path | None = None,
+    evaluate: Callable[[Learner], dict[str, Any]] | None = None,
+    tick: Callable[[int], None] = lambda steps: None,
+) -> Curve:
+    """Train a learner in place.
+
+    Args:
+      folder: where the state is kept while it trains; a run with such a state goes on from it.
+      evaluate: gives scores of the learner, added to the curve.
+      tick: told how many steps were made since the last call.
+
+    Raises:
+      DmcvbError: the folder holds the state of another learner, or a loss is no longer finite.
+    """
+    first, curve, spent = 0, [], 0.0
+    path = folder / RESUME_FILE if folder else None
+    if path is not None and path.exists():
+        first, curve, spent = _load_state(learner, path)
+        tick(first)
+    learner.half = settings.half
+    if settings.compile:
+        for name in learner.compiled:
+            setattr(learner, name, torch.compile(getattr(learner, name)))
+    log_every = max(1, settings.steps // settings.points)
+    started = saved = time.perf_counter()
+    sums: dict[str, torch.Tensor] = {}
+    counts: dict[str, int] = {}
+
+    def make(step: int) -> Batch:
+        return draw(learner, data, settings.batch_size, seed, step)
+
+    for step, batch in batches(make, first, settings.steps, settings.workers):
+        torch.manual_seed((seed << 32) + step)
+        for name, value in learner.update(batch).items():
+            sums[name] = sums.get(name, 0.0) + value
+            counts[name] = counts.get(name, 0) + 1
+        done = step + 1
+        tick(1)
+        evaluating = done % settings.evaluate_every == 0 or done == settings.steps
+        if evaluating or done % log_every == 0:
+            point = {"step": done, **{name: float(value) / counts[name] for name, value in sums.items()}}
+            bad = [name for name, value in point.items() if not np.isfinite(value)]
+            if bad:
+                raise DmcvbError(
+                    f"{bad[0]} is no longer finite at step {done}; look at the data with `dmcvb-gen verify`"
+                )
+            sums, counts = {}, {}
+            point |= hold_out_losses(learner, data, settings.batch_size)
+            if evaluating and evaluate:
+                point |= evaluate(learner)
+            curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})
+        if path is not None and time.perf_counter() - saved > SAVE_SECONDS and done < settings.steps:
+            _save_state(learner, path, done, curve, spent + time.perf_counter() - started)
+            saved = time.perf_counter()
+    return curve
+
+
+def forget(folder: Path) -> None:
+    """Remove the state of a training that is through."""
+    (folder / RESUME_FILE).unlink(missing_ok=True)
+
+
+def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: float) -> None:
+    tensors = {f"weights/{name}": value for name, value in learner.state_dict().items()}
+    for name, optimizer in learner.optimizers.items():
+        for index, state in optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer/{name}/{index}/{key}": value for key, value in state.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".partial")
+    facts = {"step": step, "curve": curve, "seconds": seconds}
+    # TD3-BC's frozen target shares its body: what is stored once must be stored as two
+    tensors = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
+    save_file(tensors, str(temporary), metadata={"facts": json.dumps(facts)})
+    temporary.replace(path)
+
+
+def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float]:
+    try:
+        with safe_open(str(path), "pt") as file:
+            facts = json.loads(file.metadata()["facts"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        learner.load_state_dict({n.removeprefix("weights/"): v for n, v in tensors.items() if n.startswith("weights/")})
+        for name, optimizer in learner.optimizers.items():
+            states: dict[int, dict[str, torch.Tensor]] = {}
+            for key, value in tensors.items():
+                if key.startswith(f"optimizer/{name}/"):
+                    index, entry = key.removeprefix(f"optimizer/{name}/").split("/")
+                    states.setdefault(int(index), {})[entry] = value
+            optimizer.load_state_dict(optimizer.state_dict() | {"state": states})
+    except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise DmcvbError(f"cannot resume from {path} ({reason}); delete it to start that training again") from None
+    return int(facts["step"]), facts["curve"], float(facts["seconds"])
