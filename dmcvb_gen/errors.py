@@ -41,3 +41,7 @@ class BackgroundError(DmcvbError):
 
 class RecipeError(DmcvbError):
     """A recipe that does not make sense."""
+
+
+class LayoutError(DmcvbError):
+    """A maze layout, or a place in one, that cannot be used."""

@@ -47,9 +47,9 @@ class ExogenousWalk:
         self._video = np.full((episodes, frames), -1, np.int16)
         self._index = np.full((episodes, frames), -1, np.int16)
         self._style = np.full((episodes, frames), -1, np.int16)
-        if task.style_geom_matid(TRAIN_STYLES[0]) is not None:
-            styles = TRAIN_STYLES if split == "train" else VAL_STYLES
-            self._style[:] = [[styles[int(rng.integers(len(styles)))]] for rng in generators["style"]]
+        looks = [look for style in (TRAIN_STYLES if split == "train" else VAL_STYLES) for look in task.looks(style)]
+        if looks:
+            self._style[:] = [[looks[int(rng.integers(len(looks)))]] for rng in generators["style"]]
         if setting.kind == "none":
             self._colors = np.broadcast_to(own, (episodes, frames, *own.shape))
             self._offset = None

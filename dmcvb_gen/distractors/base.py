@@ -61,7 +61,7 @@ class Exogenous:
       material_rgb: (..., material, 3) float32 in [0, 1], the model's materials in their order.
       background_video: (...,) int16, index of the video seen through the sky; -1: the model's own sky.
       background_frame: (...,) int16, frame of that video; -1 with the model's own sky.
-      style: (...,) int16, visual style of a maze; -1: none.
+      style: (...,) int16, visual look of a maze, its style * 100 + variant; -1: none.
     """
 
     camera_position: np.ndarray

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, PREFIX, ant_maze_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
 
@@ -15,7 +16,7 @@ LOCOMOTION_TASKS = tuple(_LOCOMOTION)
 
 def task_ids() -> tuple[str, ...]:
     """The names that `get_task` takes."""
-    return LOCOMOTION_TASKS
+    return LOCOMOTION_TASKS + ANT_MAZE_TASKS
 
 
 @functools.cache
@@ -27,11 +28,14 @@ def get_task(task_id: str) -> Task:
     """
     if task_id in _LOCOMOTION:
         return _LOCOMOTION[task_id]()
+    if task_id.startswith(PREFIX):
+        return ant_maze_task(task_id)
     raise UnknownNameError("task", task_id, task_ids())
 
 
 __all__ = [
     "ACTION_REPEAT",
+    "ANT_MAZE_TASKS",
     "LOCOMOTION_TASKS",
     "PHYSICS_SPEC",
     "EpisodeBatch",

@@ -72,8 +72,15 @@ class Task(abc.ABC):
     goal_geoms: tuple[int, ...] = ()
     """Geoms left out of the hidden-goal pictures."""
 
+    unstored_fields: tuple[str, ...] = ()
+    """Fields of the state that a physics state alone does not give."""
+
+    def looks(self, style: int) -> tuple[int, ...]:
+        """The visual looks of a style (labels `style`); none where a task has no styles."""
+        return ()
+
     def style_geom_matid(self, style: int) -> np.ndarray | None:
-        """(geom,) int: material of every geom under a visual style; None where a task has no styles."""
+        """(geom,) int: material of every geom under a visual look; None where a task has no styles."""
         return None
 
     @property

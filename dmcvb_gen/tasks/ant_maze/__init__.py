@@ -1,0 +1,55 @@
+"""Ant mazes: task ids in, tasks out.
+
+"ant-maze-empty7x7" is one of DMC-VB's layouts; "ant-maze-mine:*****/*...*/*****" carries a layout of its own;
+an ending "@geodesic" takes the shortest path's length for the reward.
+"""
+
+from __future__ import annotations
+
+import re
+
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.tasks.ant_maze.distance import REWARDS
+from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, PAPER_NAMES, fixed_pairs, get_layout, load_layout, make_layout
+from dmcvb_gen.tasks.ant_maze.task import AntMaze
+
+PREFIX = "ant-maze-"
+ANT_MAZE_TASKS = tuple(PREFIX + name for name in LAYOUTS)
+_ID = re.compile(r"^ant-maze-(?P<name>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?(@(?P<reward>\w+))?$")
+
+
+def ant_maze_task(task_id: str) -> AntMaze:
+    """The task of an id.
+
+    Raises:
+      UnknownNameError, LayoutError: no such layout or reward, or a layout that cannot be used.
+    """
+    found = _ID.match(task_id)
+    if not found or (not found["rows"] and found["name"] not in LAYOUTS):
+        raise UnknownNameError("task", task_id, ANT_MAZE_TASKS)
+    reward = found["reward"] or REWARDS[0]
+    if reward not in REWARDS:
+        raise UnknownNameError("reward", reward, REWARDS)
+    layout = make_layout(found["name"], found["rows"]) if found["rows"] else get_layout(found["name"])
+    return AntMaze(layout, reward, task_id)
+
+
+def layout_task_id(path) -> str:
+    """The task id that carries the layout of a text file.
+
+    Raises:
+      LayoutError: the file is no layout.
+    """
+    layout = load_layout(path)
+    return f"{PREFIX}{layout.name}:{layout.text}"
+
+
+__all__ = [
+    "ANT_MAZE_TASKS",
+    "LAYOUTS",
+    "PAPER_NAMES",
+    "AntMaze",
+    "ant_maze_task",
+    "fixed_pairs",
+    "layout_task_id",
+]

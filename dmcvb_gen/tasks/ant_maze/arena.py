@@ -1,0 +1,121 @@
+"""The ant in its maze as one MuJoCo model, from dm_control's locomotion library and labmaze's textures.
+
+All visual looks are in the model: a look changes only which material a geom has. The goal's sphere is a
+mocap body, so that each episode of a batch puts it elsewhere.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
+
+WALL_HEIGHT = 2.0
+"""Meters."""
+GOAL_RADIUS, GOAL_HEIGHT = 0.5, 0.5
+"""Meters; the sphere rests on the floor."""
+PHYSICS_STEP = 0.001
+SKY = "sky_02"
+STYLES = (1, 2, 3, 4, 5)
+TEXTURES_PER_STYLE = 2
+"""Wall textures and floor textures taken of each labmaze style (the first by name that are not alike)."""
+CAMERAS = {
+    "top": "top_camera",
+    "egocentric": "walker/egocentric",
+    "follow": "walker/follow",
+    "overhead": "walker/overhead",
+}
+"""View -> camera of the model."""
+
+
+@dataclass(frozen=True)
+class Arena:
+    """A layout's model.
+
+    Attributes:
+      model: compiled; shared, never changed.
+      looks: look -> (geom,) int, the material of every geom; a look is style * 100 + wall texture * 10 + floor texture.
+      goal_geom: index of the goal's sphere.
+    """
+
+    model: mujoco.MjModel
+    looks: dict[int, np.ndarray]
+    goal_geom: int
+
+
+def look_numbers(style: int) -> tuple[int, ...]:
+    """All looks of a style."""
+    each = range(TEXTURES_PER_STYLE)
+    return tuple(style * 100 + wall * 10 + floor for wall in each for floor in each)
+
+
+def _textures(paths: dict[str, str]) -> list[str]:
+    """The files of a style's textures, one brightness of a color each."""
+    names = [name for name in sorted(paths) if not name.endswith(("_bright", "_team"))]
+    return [paths[name] for name in names[-TEXTURES_PER_STYLE:]]
+
+
+@functools.cache
+def build_arena(layout: Layout) -> Arena:
+    """The arena of a layout, with the ant and the goal."""
+    import labmaze
+    from dm_control.locomotion.arenas import labmaze_textures, mazes
+    from dm_control.locomotion.props import target_sphere
+    from dm_control.locomotion.walkers import ant
+    from labmaze import assets
+
+    maze = labmaze.FixedMazeWithRandomGoals(entity_layer=layout.entity_layer, num_spawns=1, num_objects=1)
+    arena = mazes.MazeWithTargets(
+        maze=maze, xy_scale=CELL, z_height=WALL_HEIGHT, skybox_texture=labmaze_textures.SkyBox(SKY)
+    )
+    arena.regenerate()
+    walker = ant.Ant()
+    walker.create_root_joints(arena.attach(walker))
+    observables = walker.observables
+    _ = observables.bodies_pos, observables.bodies_quats, observables.end_effectors_pos  # each adds its sensors
+    for sensor in walker.mjcf_model.sensor.get_children("rangefinder"):
+        sensor.remove()  # costly rays that no state holds
+    torso = walker.root_body
+    torso.add("camera", name="follow", pos=[-1, 0, 2], xyaxes=[0, -1, 0, 2, 0, 1])
+    torso.add("camera", name="overhead", pos=[0, 0, 3], xyaxes=[0, -1, 0, 1, 0, 0])
+    goal = target_sphere.TargetSphere(radius=GOAL_RADIUS, height_above_ground=GOAL_HEIGHT)
+    arena.attach(goal).mocap = "true"
+
+    root = arena.mjcf_model
+    root.option.timestep = PHYSICS_STEP
+    repeats: dict[str, tuple] = {}
+    for geom in root.worldbody.geom:
+        if geom.material is not None and re.match(r"(wall|floor)", geom.name):
+            kind = "wall" if geom.name.startswith("wall") else "floor"
+            repeats[geom.name] = (kind, *np.round(geom.material.texrepeat, 6).tolist())
+    for geom in root.find("body", "maze_body").geom:
+        geom.rgba = [0, 0, 0, 0]  # their faces are drawn by textured planes
+    names: dict[tuple, str] = {}
+    for style in STYLES:
+        files = {
+            "wall": _textures(assets.get_wall_texture_paths(f"style_{style:02}")),
+            "floor": _textures(assets.get_floor_texture_paths(f"style_{style:02}")),
+        }
+        for kind, paths in files.items():
+            for number, path in enumerate(paths):
+                texture = root.asset.add("texture", type="2d", name=f"{kind}_{style}_{number}", file=path)
+                for repeat in sorted({value for value in repeats.values() if value[0] == kind}):
+                    name = f"look_{kind}_{style}_{number}_{len(names)}"
+                    root.asset.add("material", name=name, texture=texture, texrepeat=repeat[1:])
+                    names[repeat, style, number] = name
+
+    model = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
+    looks = {}
+    for style in STYLES:
+        for look in look_numbers(style):
+            materials = np.array(model.geom_matid)
+            for geom, repeat in repeats.items():
+                number = look // 10 % 10 if repeat[0] == "wall" else look % 10
+                materials[model.geom(geom).id] = model.mat(names[repeat, style, number]).id
+            looks[look] = materials
+    return Arena(model, looks, model.geom("target/geom").id)

@@ -1,0 +1,140 @@
+"""How far it is to the goal: layout and goal in, fields of shortest-path distance out (scikit-fmm).
+
+Two measures. "saturated" is DMC-VB's: travel times of a wave from the whole goal cell, on a grid of 10
+pixels a cell, as fast as the distance to the nearest wall up to half a cell (the "saturated fast marching
+square"), looked up at the ant's pixel. "geodesic" is the shortest path itself: unit speed, from the goal's
+exact position, interpolated between pixels.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import skfmm
+from scipy import ndimage
+
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
+
+PIXELS = 10
+"""Pixels a cell's side."""
+REWARDS = ("saturated", "geodesic")
+
+
+class DistanceField:
+    """Distances to a goal on the pixels of a layout.
+
+    Attributes:
+      values: (row, column) float64 at pixel centers, meters ("geodesic") or seconds of a wave that moves one meter
+        a second far from walls ("saturated"); inside walls, the value of the nearest floor pixel.
+      largest: the largest value on the floor, d_max.
+    """
+
+    def __init__(self, values: np.ndarray, largest: float):
+        self.values, self.largest = values, largest
+
+
+@functools.cache
+def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Floor pixels (bool), the saturated speed there, and for every pixel the index of the nearest floor pixel."""
+    floor = np.kron(~layout.walls, np.ones((PIXELS, PIXELS), bool))
+    to_wall = ndimage.distance_transform_edt(floor)
+    nearest = ndimage.distance_transform_edt(~floor, return_distances=False, return_indices=True)
+    return floor, np.minimum(to_wall / (PIXELS / 2), 1.0), nearest
+
+
+def _finish(times: np.ndarray, layout: Layout) -> DistanceField:
+    floor, _, nearest = _floor(layout)
+    filled = np.ma.filled(times, np.nan)
+    return DistanceField(filled[tuple(nearest)], float(np.nanmax(filled[floor])))
+
+
+@functools.cache
+def saturated_field(layout: Layout, goal_cell: tuple[int, int]) -> DistanceField:
+    """DMC-VB's measure; 0 in the whole goal cell.
+
+    Raises:
+      LayoutError: the goal is in a wall.
+    """
+    layout.check_cell(goal_cell, "goal")
+    floor, speed, _ = _floor(layout)
+    row, column = (index * PIXELS for index in goal_cell)
+    inside = np.zeros_like(floor)
+    inside[row : row + PIXELS, column : column + PIXELS] = True
+    phi = np.ma.MaskedArray(np.where(inside, 0.0, 1.0), ~floor)
+    times = skfmm.travel_time(phi, np.where(floor, speed, 1.0), dx=CELL / PIXELS)
+    return _finish(np.ma.where(inside, 0.0, times), layout)
+
+
+def geodesic_field(layout: Layout, goal: np.ndarray) -> DistanceField:
+    """The shortest path's length, meters, from the goal's position (x, y)."""
+    floor, _, _ = _floor(layout)
+    centers = (np.stack(np.indices(floor.shape), axis=-1) + 0.5) / PIXELS - 0.5
+    away = np.linalg.norm(layout.world(centers) - np.asarray(goal)[:2], axis=-1)
+    start = 2 * CELL / PIXELS  # straight lines this near: a wave from a single pixel would be square
+    times = skfmm.travel_time(np.ma.MaskedArray(away - start, ~floor), np.ones_like(away), dx=CELL / PIXELS)
+    return _finish(np.ma.where(away <= start, away, times + start), layout)
+
+
+def make_field(reward: str, layout: Layout, goal: np.ndarray) -> DistanceField:
+    """The field of a measure for a goal position (x, y), meters.
+
+    Raises:
+      UnknownNameError: no such measure.
+      LayoutError: the goal is in a wall.
+    """
+    cell = tuple(int(index) for index in np.rint(layout.grid(np.asarray(goal)[:2])))
+    if reward == "saturated":
+        return saturated_field(layout, cell)
+    if reward == "geodesic":
+        layout.check_cell(cell, "goal")
+        return geodesic_field(layout, goal)
+    raise UnknownNameError("reward", reward, REWARDS)
+
+
+def look_up(reward: str, layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Distances of many episodes at once, each from its own field.
+
+    Args:
+      fields: (n, row, column) values.
+      positions: (n, 2) x and y, meters; anywhere, also outside of the maze.
+
+    Returns:
+      (n,) float64, finite.
+    """
+    height, width = fields.shape[1:]
+    pixel = (layout.grid(positions) + 0.5) * PIXELS  # pixel i covers [i, i + 1)
+    each = np.arange(len(fields))
+    if reward == "saturated":
+        index = np.rint(pixel - 1).astype(int)
+        row, column = np.clip(index[:, 0], 0, height - 1), np.clip(index[:, 1], 0, width - 1)
+        return fields[each, row, column]
+    low = np.clip(pixel - 0.5, 0, [height - 1.0, width - 1.0])
+    corner = np.minimum(low.astype(int), [height - 2, width - 2])
+    weight = low - corner
+    row, column = corner.T
+    top = fields[each, row, column] * (1 - weight[:, 1]) + fields[each, row, column + 1] * weight[:, 1]
+    bottom = fields[each, row + 1, column] * (1 - weight[:, 1]) + fields[each, row + 1, column + 1] * weight[:, 1]
+    return top * (1 - weight[:, 0]) + bottom * weight[:, 0]
+
+
+def descend(layout: Layout, field: DistanceField, start: np.ndarray, step: float = 0.05) -> np.ndarray:
+    """The path down the field from a position: (point, 2) x and y, meters, until it stops falling."""
+    position, path = np.asarray(start, float)[:2], [np.asarray(start, float)[:2]]
+    stack, reach = field.values[None], CELL / PIXELS
+    turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    around = reach * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    floor = _floor(layout)[0].astype(float)[None]
+    here = look_up("geodesic", layout, stack, position[None])[0]
+    for _ in range(int(sum(layout.shape) * CELL * 4 / step)):
+        near = position + around
+        values = look_up("geodesic", layout, np.repeat(stack, len(near), axis=0), near)
+        open_ = look_up("geodesic", layout, np.repeat(floor, len(near), axis=0), near) > 0.5
+        best = int(np.argmin(np.where(open_, values, np.inf)))
+        if values[best] >= here:
+            break
+        position = position + around[best] * (step / reach)
+        here = look_up("geodesic", layout, stack, position[None])[0]
+        path.append(position)
+    return np.array(path)

@@ -1,0 +1,184 @@
+"""Maze layouts: rows of text in, walls, free cells and their places in the world out.
+
+A layout is a rectangle of `*` (wall) and space or `.` (floor). The outer cells are walls, all floor is
+connected. Row 0 is the north side (largest y).
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from dmcvb_gen.errors import LayoutError
+
+CELL = 2.5
+"""Meters a side of a cell (paper, appendix on the ant maze)."""
+MAX_CELLS = 31
+"""Cells a side that a layout may have."""
+
+LAYOUTS = {
+    "empty7x7": "*******/*     */*     */*     */*     */*     */*******",
+    "easy7x7a": "*******/** *  */*  *  */*  *  */*     */*    **/*******",
+    "easy7x7b": "*******/*     */*  *  */* **  */*  ** */*     */*******",
+    "easy7x7c": "*******/*     */* *   */* *   */* *** */*     */*******",
+    "medium7x7a": "*******/*  *  */*    **/*  *  */* * * */*     */*******",
+    "medium7x7b": "*******/*     */*** * */*     */*  ** */*     */*******",
+    "medium7x7c": "*******/*  *  */** *  */*     */* **  */*    **/*******",
+}
+"""DMC-VB's seven layouts, rows joined by "/" (the authors' benchmark code)."""
+
+PAPER_NAMES = {
+    "empty7x7": "ant-maze/empty",
+    "easy7x7a": "ant-maze/single-obstacle",
+    "easy7x7b": "ant-maze/single-obstacle",
+    "easy7x7c": "ant-maze/single-obstacle",
+    "medium7x7a": "ant-maze/multi-obstacle",
+    "medium7x7b": "ant-maze/multi-obstacle",
+    "medium7x7c": "ant-maze/multi-obstacle",
+}
+"""Layout -> the row of the paper's tables that it belongs to."""
+
+NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_]*$")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A checked layout.
+
+    Attributes:
+      name: letters, digits and underscores.
+      rows: its rows, "*" and ".".
+    """
+
+    name: str
+    rows: tuple[str, ...]
+
+    @functools.cached_property
+    def walls(self) -> np.ndarray:
+        """(row, column) bool."""
+        return np.array([[character == "*" for character in row] for row in self.rows])
+
+    @functools.cached_property
+    def free(self) -> tuple[tuple[int, int], ...]:
+        """(row, column) of every floor cell, in reading order."""
+        return tuple(map(tuple, np.argwhere(~self.walls).tolist()))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return self.walls.shape
+
+    @property
+    def entity_layer(self) -> str:
+        """As labmaze reads it."""
+        return "".join(row.replace(".", " ") + "\n" for row in self.rows)
+
+    @property
+    def text(self) -> str:
+        """Rows joined by "/"."""
+        return "/".join(self.rows)
+
+    def world(self, cells: np.ndarray) -> np.ndarray:
+        """(..., row and column) -> (..., x and y) of the cells' centers, meters."""
+        cells, (rows, columns) = np.asarray(cells, float), self.shape
+        return np.stack([(cells[..., 1] - (columns - 1) / 2) * CELL, ((rows - 1) / 2 - cells[..., 0]) * CELL], axis=-1)
+
+    def grid(self, positions: np.ndarray) -> np.ndarray:
+        """(..., x and y) meters -> (..., row and column), whole numbers at the cells' centers."""
+        positions, (rows, columns) = np.asarray(positions, float), self.shape
+        return np.stack(
+            [(rows - 1) / 2 - positions[..., 1] / CELL, (columns - 1) / 2 + positions[..., 0] / CELL], axis=-1
+        )
+
+    def check_cell(self, cell: tuple[int, int], what: str) -> None:
+        """Raises LayoutError where a start or a goal is not on the floor."""
+        if tuple(cell) not in self.free:
+            raise LayoutError(
+                f"{what} {tuple(cell)} is no floor cell of layout {self.name!r}; floor: {', '.join(map(str, self.free))}"
+            )
+
+
+def make_layout(name: str, text: str) -> Layout:
+    """A layout from its text (rows on lines, or joined by "/").
+
+    Raises:
+      LayoutError: a wrong character, ragged rows, a hole in the outer wall, floor that is not connected.
+    """
+    if not NAME.match(name):
+        raise LayoutError(f"layout name {name!r}: use letters, digits and underscores")
+    rows = [row.rstrip("\r") for row in re.split(r"[\n/]", text)]
+    while rows and not rows[-1].strip():
+        rows.pop()
+    while rows and not rows[0].strip():
+        rows.pop(0)
+    width = max((len(row) for row in rows), default=0)
+    for number, row in enumerate(rows):
+        wrong = set(row) - set("* .")
+        if wrong:
+            raise LayoutError(f"layout {name!r}, row {number}: {sorted(wrong)[0]!r}; rows hold '*' (wall) and ' ' (floor)")
+        if len(row) != width:
+            raise LayoutError(f"layout {name!r}, row {number} has {len(row)} cells, others have {width}")
+    if len(rows) < 3 or width < 3 or max(len(rows), width) > MAX_CELLS:
+        raise LayoutError(f"layout {name!r} is {len(rows)} x {width} cells; give 3 to {MAX_CELLS} a side")
+    layout = Layout(name, tuple(row.replace(" ", ".") for row in rows))
+    edge = np.ones(layout.shape, bool)
+    edge[1:-1, 1:-1] = False
+    if (edge & ~layout.walls).any():
+        row, column = np.argwhere(edge & ~layout.walls)[0]
+        raise LayoutError(f"layout {name!r} has a hole in its outer wall at row {row}, column {column}; close it with '*'")
+    labels, parts = ndimage.label(~layout.walls)
+    if parts == 0 or len(layout.free) < 2:
+        raise LayoutError(f"layout {name!r} needs two floor cells at least, a start and a goal")
+    if parts > 1:
+        row, column = np.argwhere(labels == 2)[0]
+        raise LayoutError(
+            f"layout {name!r} has floor that cannot be reached (row {row}, column {column}); connect all floor cells"
+        )
+    return layout
+
+
+@functools.cache
+def get_layout(name: str) -> Layout:
+    """One of DMC-VB's seven layouts."""
+    return make_layout(name, LAYOUTS[name])
+
+
+def load_layout(path: str | Path) -> Layout:
+    """A layout from the user's text file, named after the file.
+
+    Raises:
+      LayoutError: the file cannot be read or is no layout.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise LayoutError(f"cannot read layout {path} ({error}); give a text file of '*' and ' '") from None
+    name = re.sub(r"[^A-Za-z0-9_]", "_", path.stem).lstrip("_") or "layout"
+    return make_layout(name, text)
+
+
+def fixed_pairs(layout: Layout, count: int, seed: int) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """`count` different (start, goal) pairs of cells, from a seed (benchmark B3).
+
+    Raises:
+      LayoutError: the layout has fewer pairs.
+    """
+    cells = len(layout.free)
+    if count > cells * (cells - 1):
+        raise LayoutError(
+            f"layout {layout.name!r} has {cells * (cells - 1)} (start, goal) pairs, {count} are asked for; "
+            "give fewer --fixed-goals"
+        )
+    rng = np.random.default_rng([seed, 0xF1ED])
+    chosen = rng.choice(cells * (cells - 1), size=count, replace=False)
+    pairs = []
+    for number in chosen:
+        start, goal = divmod(int(number), cells - 1)
+        pairs.append((layout.free[start], layout.free[goal + (goal >= start)]))
+    return pairs

@@ -1,0 +1,297 @@
+"""An ant that looks for a goal in a maze: batches of episodes, the reward from a field of distances.
+
+dm_control's locomotion library is the authority: from the same physics state and actions a composer
+environment of the same maze gives the same observations and physics (tests/test_ant_maze.py).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from dmcvb_gen.tasks.ant_maze.arena import CAMERAS, GOAL_HEIGHT, GOAL_RADIUS, PHYSICS_STEP, build_arena, look_numbers
+from dmcvb_gen.tasks.ant_maze.distance import look_up, make_field
+from dmcvb_gen.tasks.ant_maze.layouts import Layout
+from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, Task
+
+EPISODE_STEPS = 1200
+"""Agent steps of 60 seconds."""
+SPAWN_NOISE, GOAL_NOISE = 0.25, 0.5
+"""Meters that spawn and goal lie off their cells' centers at most, along x and along y."""
+JOINT_NOISE = 0.1
+"""Radians of noise on the ant's joints in episodes with a fixed start and goal (benchmark B3)."""
+REACH = 2.0
+"""Meters between torso and goal within which a touch is possible during a control step: the ant spans 1.3."""
+TOUCH_THRESHOLD = 1e-3
+"""Newton above which a touch sensor says 1 (dm_control)."""
+
+FIELDS = {
+    "distance_to_target": 1,
+    "target_position": 3,
+    "target_vector": 3,
+    "target_activated": 1,
+    "appendages_pos": 12,
+    "bodies_pos": 39,
+    "bodies_quats": 52,
+    "body_height": 1,
+    "egocentric_target_vector": 3,
+    "end_effectors_pos": 12,
+    "joints_pos": 8,
+    "joints_vel": 8,
+    "sensors_accelerometer": 3,
+    "sensors_gyro": 3,
+    "sensors_touch": 9,
+    "sensors_velocimeter": 3,
+    "world_zaxis": 3,
+    "walker_position": 3,
+}
+BEHAVIOUR_FIELDS = (
+    "target_position",
+    "target_vector",
+    "body_height",
+    "egocentric_target_vector",
+    "end_effectors_pos",
+    "joints_pos",
+    "joints_vel",
+    "sensors_gyro",
+    "sensors_touch",
+    "sensors_velocimeter",
+    "world_zaxis",
+    "walker_position",
+)
+"""What behaviour policies see; what is left out follows from the joints, or is noise (the accelerometer)."""
+
+
+class AntMazeBatch(EpisodeBatch):
+    def __init__(self, task: AntMaze, size: int, threads: int = 1):
+        super().__init__(task, size, threads)
+        bind, model = self.sims.bind, task.model
+        self._qpos, self._qvel, self._mocap = bind("qpos"), bind("qvel"), bind("mocap_pos")
+        self._xmat, self._xpos = bind("xmat"), bind("xpos")
+        self._geom_xpos, self._geom_xmat = bind("geom_xpos"), bind("geom_xmat")
+        self._sensors = bind("sensordata")
+        self._torso = model.body("walker/torso").id
+        self._ant = np.array([i for i in range(model.ngeom) if model.geom(i).name.startswith("walker/")])
+        capsule = model.geom_type[self._ant] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self._half = np.where(capsule, model.geom_size[self._ant, 1], 0.0)
+        self._radius = model.geom_size[self._ant, 0]
+        self._columns_of = {
+            "bodies_pos": _sensor_columns(model, "_ego_body_pos"),
+            "bodies_quats": _sensor_columns(model, "_ego_body_quat"),
+            "end_effectors_pos": _sensor_columns(model, "_end_effector"),
+            "sensors_accelerometer": _sensor_columns(model, "torso_accel"),
+            "sensors_gyro": _sensor_columns(model, "torso_gyro"),
+            "sensors_touch": _sensor_columns(model, "_touch"),
+            "sensors_velocimeter": _sensor_columns(model, "torso_vel"),
+        }
+        shape = tuple(10 * cells for cells in task.layout.shape)
+        self._fields, self._largest = np.zeros((size, *shape)), np.ones(size)
+        self._touched = np.zeros(size, bool)
+
+    # -- starting -----------------------------------------------------------------------------
+
+    def _initialize(self, ids, generators):
+        layout = self.task.layout
+        for sim, rng in zip(ids, generators, strict=True):
+            start = int(rng.integers(len(layout.free)))
+            goal = int(rng.integers(len(layout.free) - 1))
+            goal += goal >= start
+            offsets = rng.uniform(-1, 1, 4)
+            self._place(
+                sim,
+                layout.world(layout.free[start]) + SPAWN_NOISE * offsets[:2],
+                layout.world(layout.free[goal]) + GOAL_NOISE * offsets[2:],
+                rng.uniform(0, 2 * np.pi),
+            )
+        self._refresh(ids)
+
+    def reset_fixed(
+        self, generators: Sequence[np.random.Generator], pairs: Sequence[tuple], ids: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Start episodes at given (start, goal) cells; noise is on the ant's joints alone.
+
+        Returns:
+          (size, state) float64.
+
+        Raises:
+          LayoutError: a start or a goal in a wall.
+        """
+        ids, layout = self._all if ids is None else np.asarray(ids, int), self.task.layout
+        self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        for sim, rng, (start, goal) in zip(ids, generators, pairs, strict=True):
+            layout.check_cell(start, "start")
+            layout.check_cell(goal, "goal")
+            # The same for all episodes of a pair: yaw and offsets come from the cells alone.
+            own = np.random.default_rng([*start, *goal])
+            offsets = own.uniform(-1, 1, 4)
+            self._place(
+                sim,
+                layout.world(start) + SPAWN_NOISE * offsets[:2],
+                layout.world(goal) + GOAL_NOISE * offsets[2:],
+                own.uniform(0, 2 * np.pi),
+            )
+            self._qpos[sim, 7:] = rng.uniform(-JOINT_NOISE, JOINT_NOISE, self._qpos.shape[1] - 7)
+        self._refresh(ids)
+        return self.state()
+
+    def _place(self, sim: int, start: np.ndarray, goal: np.ndarray, yaw: float) -> None:
+        self._qpos[sim] = 0
+        self._qpos[sim, :2] = start
+        self._qpos[sim, 3], self._qpos[sim, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+        self._mocap[sim, 0] = *goal, 0
+
+    def _refresh(self, ids):
+        # Accelerometer and touch are of the last stage; dm_control's reset computes them without actuation.
+        self._ctrl[ids] = 0
+        self.sims.forward(ids=ids)
+        self._touched[ids] = False
+        for sim in ids:
+            field = make_field(self.task.reward, self.task.layout, self._mocap[sim, 0])
+            self._fields[sim], self._largest[sim] = field.values, field.largest
+        self._touched[ids] = self._touching(ids)
+
+    # -- stepping -----------------------------------------------------------------------------
+
+    def _advance(self, ids):
+        ids = self._all if ids is None else ids
+        away = np.linalg.norm(self._mocap[ids, 0] + [0, 0, GOAL_HEIGHT] - self._xpos[ids, self._torso], axis=1)
+        near = ids[away < REACH]
+        if len(near) < len(ids):
+            super()._advance(ids[away >= REACH])
+        if len(near):  # a touch counts at any physics step, as in dm_control
+            for _ in range(self.task.substeps):
+                self.sims.step(ids=near, nstep=1, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+                self._touched[near] |= self._touching(near)
+
+    def _touching(self, ids: np.ndarray) -> np.ndarray:
+        """(len(ids),) bool: whether a geom of the ant overlaps the goal's sphere."""
+        centers = self._geom_xpos[np.ix_(ids, self._ant)]
+        axes = self._geom_xmat[np.ix_(ids, self._ant)].reshape(len(ids), -1, 3, 3)[..., 2]
+        to_goal = (self._mocap[ids, 0] + [0, 0, GOAL_HEIGHT])[:, None] - centers
+        along = np.clip((to_goal * axes).sum(axis=-1), -self._half, self._half)
+        gap = np.linalg.norm(to_goal - along[..., None] * axes, axis=-1) - self._radius - GOAL_RADIUS
+        return (gap < 0).any(axis=1)
+
+    # -- what it gives ------------------------------------------------------------------------
+
+    def goal(self) -> np.ndarray:
+        """(size, 3): center of the goal's sphere, meters."""
+        return self._mocap[:, 0] + [0, 0, GOAL_HEIGHT]
+
+    def distance(self) -> np.ndarray:
+        """(size,): distance to the goal over its maximum in the maze, in [0, 1]."""
+        position = self._xpos[:, self._torso, :2]
+        return look_up(self.task.reward, self.task.layout, self._fields, position) / self._largest
+
+    def state(self):
+        position, goal = self._xpos[:, self._torso], self.goal()
+        rotation = self._xmat[:, self._torso].reshape(self.size, 3, 3)
+        vector = goal - position
+        values = {name: self._sensors[:, columns] for name, columns in self._columns_of.items()}
+        values |= {
+            "distance_to_target": np.linalg.norm(vector, axis=1, keepdims=True),
+            "target_position": goal,
+            "target_vector": vector,
+            "target_activated": self._touched[:, None],
+            "appendages_pos": values["end_effectors_pos"],
+            "body_height": position[:, 2:],
+            "egocentric_target_vector": np.einsum("ni,nij->nj", vector, rotation),
+            "joints_pos": self._qpos[:, 7:],
+            "joints_vel": self._qvel[:, 6:],
+            "sensors_touch": values["sensors_touch"] > TOUCH_THRESHOLD,
+            "world_zaxis": self._xmat[:, self._torso, 6:],
+            "walker_position": position,
+        }
+        return np.concatenate([np.asarray(values[name], np.float64) for name in FIELDS], axis=1)
+
+    def _control_reward(self):
+        return -np.clip(self.distance(), 0.0, 1.0)
+
+    def _control_terminated(self):
+        return self._touched.copy()
+
+
+def _sensor_columns(model: mujoco.MjModel, suffix: str) -> np.ndarray:
+    """Columns of sensordata of the sensors whose names end so, in the model's order."""
+    columns: list[int] = []
+    for index in range(model.nsensor):
+        if model.sensor(index).name.endswith(suffix):
+            columns.extend(range(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index]))
+    return np.array(columns, int)
+
+
+class AntMaze(Task):
+    """An ant in a maze, rewarded with minus its distance to the goal over the largest distance (SPEC: r = -d/d_max).
+
+    Args:
+      layout: the maze.
+      reward: how distance is measured, "saturated" (DMC-VB's) or "geodesic" (the shortest path).
+      id: the task's name.
+    """
+
+    state_fields = FIELDS
+    max_steps = EPISODE_STEPS
+    substeps = 25  # 1 ms physics, 25 ms control
+    views = tuple(CAMERAS)
+    cameras = tuple(CAMERAS.values())
+    return_range = (-float(ACTION_REPEAT * EPISODE_STEPS), 0.0)
+    unstored_fields = ("sensors_accelerometer", "sensors_touch", "target_activated")
+    """Fields of a state that depend on the step before it, so that a physics state alone does not give them."""
+
+    def __init__(self, layout: Layout, reward: str, id: str):
+        self.layout, self.reward, self.id = layout, reward, id
+
+    @functools.cached_property
+    def model(self):
+        assert build_arena(self.layout).model.opt.timestep == PHYSICS_STEP
+        return build_arena(self.layout).model
+
+    @functools.cached_property
+    def goal_geoms(self):
+        return (build_arena(self.layout).goal_geom,)
+
+    @property
+    def behaviour_indices(self):
+        slices = self.state_slices
+        return np.concatenate([np.arange(slices[name].start, slices[name].stop) for name in BEHAVIOUR_FIELDS])
+
+    def looks(self, style: int) -> tuple[int, ...]:
+        """The looks of a labmaze style: combinations of its wall and floor textures."""
+        return look_numbers(style)
+
+    def style_geom_matid(self, style):
+        return build_arena(self.layout).looks.get(style)
+
+    def goal_in_sight(self, view: str, physics: np.ndarray, exogenous) -> np.ndarray:
+        """(frame,) bool: whether the goal's sphere reaches into the picture (walls may still hide it).
+
+        Args:
+          physics: (frame, physics) float64.
+          exogenous: labels with leading shape (frame,).
+        """
+        from dmcvb_gen.rendering.cameras import matrices
+
+        index = self.views.index(view)
+        fovy = np.radians(self.model.cam_fovy[self.model.camera(self.cameras[index]).id])
+        goal = physics[:, _mocap_columns(self.model)] + [0, 0, GOAL_HEIGHT]
+        rotation = matrices(exogenous.camera_quaternion[:, index].astype(np.float64))
+        seen = np.einsum("ni,nij->nj", goal - exogenous.camera_position[:, index], rotation)
+        depth, aside = -seen[:, 2], np.linalg.norm(seen[:, :2], axis=1)
+        angle = np.arctan(np.sqrt(2) * np.tan(fovy / 2))  # of the picture's corners
+        outside = aside * np.cos(angle) - depth * np.sin(angle)  # distance from the cone around the picture
+        return outside < GOAL_RADIUS * 1.01
+
+    def batch(self, size: int, threads: int = 1) -> AntMazeBatch:
+        return AntMazeBatch(self, size, threads)
+
+
+def _mocap_columns(model: mujoco.MjModel) -> slice:
+    """Where the goal's position lies in a physics state (`PHYSICS_SPEC`)."""
+    from dmcvb_gen.tasks.base import PHYSICS_SPEC
+
+    before = PHYSICS_SPEC & (int(mujoco.mjtState.mjSTATE_MOCAP_POS) - 1)
+    start = mujoco.mj_stateSize(model, before)
+    return slice(start, start + 3)

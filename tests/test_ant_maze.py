@@ -1,0 +1,364 @@
+"""Ant mazes against dm_control's composer environment, brute-force distances and hand-made layouts."""
+
+import heapq
+
+import labmaze
+import mujoco
+import numpy as np
+import pytest
+from dm_control import composer, mjcf
+from dm_control.locomotion.arenas import mazes
+from dm_control.locomotion.props import target_sphere
+from dm_control.locomotion.tasks import random_goal_maze
+from dm_control.locomotion.walkers import ant
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dmcvb_gen.errors import LayoutError, UnknownNameError
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, fixed_pairs, layout_task_id
+from dmcvb_gen.tasks.ant_maze.arena import GOAL_HEIGHT, GOAL_RADIUS, WALL_HEIGHT
+from dmcvb_gen.tasks.ant_maze.distance import PIXELS, descend, geodesic_field, look_up, make_field, saturated_field
+from dmcvb_gen.tasks.ant_maze.layouts import CELL, get_layout, make_layout
+
+
+def composer_environment(layout, goal):
+    """dm_control's own environment of a layout, its goal at (x, y)."""
+    maze = labmaze.FixedMazeWithRandomGoals(entity_layer=layout.entity_layer, num_spawns=1, num_objects=1)
+    arena = mazes.MazeWithTargets(maze=maze, xy_scale=CELL, z_height=WALL_HEIGHT)
+    walker = ant.Ant()
+    sphere = target_sphere.TargetSphere(radius=GOAL_RADIUS, height_above_ground=GOAL_HEIGHT)
+    task = random_goal_maze.RepeatSingleGoalMaze(
+        walker, arena, target=sphere, contact_termination=False, aliveness_threshold=-2
+    )
+    for observable in task.observables.values():
+        if "camera" in str(type(observable)).lower():
+            observable.enabled = False
+    environment = composer.Environment(task, time_limit=60, random_state=0)
+
+    def place(random_state):
+        task._maze_arena.regenerate()
+        mjcf.get_attachment_frame(sphere.mjcf_model).pos = [*goal, 0]
+
+    task.initialize_episode_mjcf = place
+    environment.reset()
+    sphere.reset(environment.physics)  # dm_control's own spawn may lie on the goal
+    return environment, sphere
+
+
+def composer_state(environment, sphere, names):
+    """The observations of dm_control's environment by their names."""
+    task, physics = environment.task, environment.physics
+    values = {}
+    for name in names:
+        observable = getattr(task._walker.observables, name)
+        value = np.asarray(observable.observation_callable(physics)())
+        if name == "sensors_touch":
+            value = value > 1e-3
+        values[name] = np.ravel(value).astype(float)
+    return values
+
+
+WALKER_FIELDS = (
+    "appendages_pos",
+    "bodies_pos",
+    "bodies_quats",
+    "body_height",
+    "end_effectors_pos",
+    "joints_pos",
+    "joints_vel",
+    "sensors_accelerometer",
+    "sensors_gyro",
+    "sensors_touch",
+    "sensors_velocimeter",
+    "world_zaxis",
+)
+
+
+@pytest.mark.parametrize(
+    ("layout", "seed", "kind", "steps"),
+    [("medium7x7a", 0, "random", 150), ("easy7x7c", 1, "extreme", 150), ("empty7x7", 2, "zero", 60)],
+)
+def test_agrees_with_dm_control(layout, seed, kind, steps):
+    """Physics and observations equal dm_control's over an episode; both sides end at the same step."""
+    task = get_task(f"ant-maze-{layout}")
+    batch = task.batch(2)
+    state = batch.reset([np.random.default_rng([seed, i]) for i in range(2)])
+    environment, sphere = composer_environment(task.layout, batch.goal()[0, :2])
+    physics = environment.physics
+    with physics.reset_context():
+        physics.data.qpos[:] = batch._qpos[0]
+    rng = np.random.default_rng(seed)
+    slices, largest = task.state_slices, 0.0
+    for _ in range(steps):
+        expected = composer_state(environment, sphere, WALKER_FIELDS)
+        for name, value in expected.items():
+            difference = np.abs(state[0, slices[name]] - value).max()
+            largest = max(largest, difference / max(1.0, np.abs(value).max()))
+        ours = dict(zip(slices, (state[0, part] for part in slices.values()), strict=True))
+        torso = physics.bind(environment.task._walker.root_body)
+        np.testing.assert_array_equal(ours["walker_position"], torso.xpos)
+        vector = physics.bind(sphere.geom).xpos - torso.xpos
+        np.testing.assert_allclose(ours["target_vector"], vector, atol=1e-12)
+        ego = environment.task._walker.transform_vec_to_egocentric_frame(physics, vector)
+        np.testing.assert_allclose(ours["egocentric_target_vector"], ego, atol=1e-12)
+        action = {
+            "random": rng.uniform(-1, 1, 8),
+            "extreme": rng.choice([-1.0, 1.0], 8),
+            "zero": np.zeros(8),
+        }[kind]
+        result = batch.step(np.stack([action, -action]))
+        state = result.state
+        for _ in range(2):
+            if environment.step(action).last():
+                break
+        np.testing.assert_array_equal(batch._qpos[0], physics.data.qpos)
+        assert bool(result.terminated[0]) == bool(sphere.activated)
+        if sphere.activated:
+            break
+    assert largest <= 1e-12
+
+
+def test_touch_ends_the_episode_where_dm_control_says_so():
+    """An ant thrown at the goal ends at the same control step as dm_control's, whatever the moment of the touch."""
+    task = get_task("ant-maze-empty7x7")
+    batch = task.batch(1)
+    ends = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        batch.reset([rng])
+        angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(1.3, 2.5)
+        goal = np.array([0.3, -0.2])
+        batch._mocap[0, 0] = [*goal, 0]
+        batch._qpos[0, :2] = goal + away * np.array([np.cos(angle), np.sin(angle)])
+        batch._qvel[0, :2] = -rng.uniform(2, 6) * np.array([np.cos(angle), np.sin(angle)])
+        batch._refresh(np.array([0]))
+        environment, sphere = composer_environment(task.layout, goal)
+        with environment.physics.reset_context():
+            environment.physics.data.qpos[:] = batch._qpos[0]
+            environment.physics.data.qvel[:] = batch._qvel[0]
+        for _ in range(15):
+            action = rng.uniform(-1, 1, 8)
+            result = batch.step(action[None])
+            for _ in range(2):
+                if environment.step(action).last():
+                    break
+            assert bool(result.terminated[0]) == bool(sphere.activated)
+            if sphere.activated:
+                np.testing.assert_array_equal(batch._qpos[0], environment.physics.data.qpos)
+                assert result.state[0, task.state_slices["target_activated"]] == 1
+                ends += 1
+                break
+    assert ends >= 4
+
+
+def test_small_steps_are_the_same_steps():
+    """Stepping one by one near the goal changes no bit."""
+    task = get_task("ant-maze-empty7x7")
+    one, many = task.batch(1), task.batch(1)
+    for batch in (one, many):
+        batch.reset([np.random.default_rng(3)])
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        action = rng.uniform(-1, 1, (1, 8))
+        one._ctrl[:] = many._ctrl[:] = action
+        one.sims.step(nstep=25, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+        for _ in range(25):
+            many.sims.step(nstep=1, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+        np.testing.assert_array_equal(one.physics(), many.physics())
+        np.testing.assert_array_equal(one.state(), many.state())
+
+
+def test_state_comes_back_from_physics():
+    """Putting a stored physics state back gives the stored state, but for what the step before left in the sensors."""
+    task = get_task("ant-maze-easy7x7a")
+    batch, other = task.batch(2), task.batch(2)
+    batch.reset([np.random.default_rng(i) for i in range(2)])
+    rng = np.random.default_rng(0)
+    known = np.ones(task.state_size, bool)
+    for name in task.unstored_fields:
+        known[task.state_slices[name]] = False
+    assert known.sum() == 167 - 13
+    for _ in range(10):
+        action = rng.uniform(-1, 1, (2, 8))
+        before = batch.physics()
+        result = batch.step(action)
+        other.set_physics(before)
+        again = other.step(action)
+        np.testing.assert_array_equal(again.state, result.state)
+        np.testing.assert_array_equal(again.reward, result.reward)
+        np.testing.assert_array_equal(other.set_physics(batch.physics())[:, known], result.state[:, known])
+
+
+def test_starts_and_goals():
+    """Spawns cover all free cells within their noise, goals too, never the same cell; yaw is uniform."""
+    task = get_task("ant-maze-medium7x7b")
+    layout, count = task.layout, 400
+    batch = task.batch(count)
+    state = batch.reset([np.random.default_rng([5, i]) for i in range(count)])
+    slices = task.state_slices
+    start, goal = state[:, slices["walker_position"]][:, :2], state[:, slices["target_position"]][:, :2]
+    for positions, noise in ((start, 0.25), (goal, 0.5)):
+        cells = np.rint(layout.grid(positions)).astype(int)
+        assert set(map(tuple, cells.tolist())) == set(layout.free)
+        off = np.abs(positions - layout.world(cells))
+        assert off.max() <= noise + 1e-9 and off.max() > 0.9 * noise
+    assert (np.rint(layout.grid(start)) != np.rint(layout.grid(goal))).any(axis=1).all()
+    yaw = 2 * np.arctan2(batch._qpos[:, 6], batch._qpos[:, 3])
+    counts = np.histogram(yaw % (2 * np.pi), 8, (0, 2 * np.pi))[0]
+    assert counts.min() > 25
+    assert ((batch.distance() > 0) & (batch.distance() <= 1)).all()
+
+
+def test_fixed_pairs():
+    layout = get_layout("easy7x7b")
+    pairs = fixed_pairs(layout, 5, seed=3)
+    assert pairs == fixed_pairs(layout, 5, seed=3) != fixed_pairs(layout, 5, seed=4)
+    assert len(set(pairs)) == 5 and all(start != goal for start, goal in pairs)
+    cells = len(layout.free)
+    assert len(set(fixed_pairs(layout, cells * (cells - 1), 0))) == cells * (cells - 1)
+    with pytest.raises(LayoutError, match="fixed-goals"):
+        fixed_pairs(layout, cells * (cells - 1) + 1, 0)
+    task = get_task("ant-maze-easy7x7b")
+    batch = task.batch(3)
+    state = batch.reset_fixed([np.random.default_rng(i) for i in range(3)], [pairs[0]] * 3)
+    slices = task.state_slices
+    for name in ("target_position", "walker_position"):
+        assert np.ptp(state[:, slices[name]], axis=0).max() == 0
+    assert np.ptp(state[:, slices["joints_pos"]], axis=0).min() > 0
+    with pytest.raises(LayoutError, match="start"):
+        batch.reset_fixed([np.random.default_rng(0)] * 3, [((0, 0), (1, 1))] * 3)
+
+
+# -- distances ------------------------------------------------------------------------------------
+
+
+@st.composite
+def mazes_of_text(draw):
+    """Random connected layouts: a walk through a block of wall."""
+    rows, columns = draw(st.integers(5, 8)), draw(st.integers(5, 8))
+    grid = np.full((rows, columns), "*")
+    row, column = draw(st.integers(1, rows - 2)), draw(st.integers(1, columns - 2))
+    grid[row, column] = "."
+    for move in draw(st.lists(st.sampled_from("NESW"), min_size=6, max_size=40)):
+        dr, dc = {"N": (-1, 0), "S": (1, 0), "E": (0, 1), "W": (0, -1)}[move]
+        row, column = np.clip(row + dr, 1, rows - 2), np.clip(column + dc, 1, columns - 2)
+        grid[row, column] = "."
+    text = "\n".join("".join(line) for line in grid)
+    return text if (grid == ".").sum() > 1 else "\n".join(["****", "*..*", "****"])
+
+
+def dijkstra(layout, goal, fine=10):
+    """Shortest paths by Dijkstra on a grid with 32 directions, meters; never through a wall."""
+    floor = np.kron(~layout.walls, np.ones((fine, fine), bool))
+    unit = CELL / fine
+    moves = [(a, b) for a in range(-4, 5) for b in range(-4, 5) if np.gcd(a, b) == 1]
+    row, column = ((layout.grid(goal) + 0.5) * fine).astype(int)
+    offset = (np.array([row, column]) + 0.5) / fine - 0.5
+    first = float(np.linalg.norm(layout.world(offset) - goal))
+    distance = np.full(floor.shape, np.inf)
+    distance[row, column] = first
+    queue = [(first, int(row), int(column))]
+    while queue:
+        here, r, c = heapq.heappop(queue)
+        if here > distance[r, c]:
+            continue
+        for a, b in moves:
+            r2, c2 = r + a, c + b
+            if not (0 <= r2 < floor.shape[0] and 0 <= c2 < floor.shape[1]) or not floor[r2, c2]:
+                continue
+            between = np.linspace(0, 1, 2 * max(abs(a), abs(b)) + 1)[1:-1]
+            if not floor[np.rint(r + a * between).astype(int), np.rint(c + b * between).astype(int)].all():
+                continue
+            there = here + unit * np.hypot(a, b)
+            if there < distance[r2, c2] - 1e-12:
+                distance[r2, c2] = there
+                heapq.heappush(queue, (there, r2, c2))
+    return np.where(floor, distance, np.nan)
+
+
+@settings(max_examples=8, deadline=None)
+@given(mazes_of_text(), st.integers(0, 10**6))
+def test_geodesic_field_is_the_shortest_path(text, seed):
+    layout = make_layout("random", text)
+    rng = np.random.default_rng(seed)
+    goal = layout.world(layout.free[rng.integers(len(layout.free))]) + rng.uniform(-0.5, 0.5, 2)
+    field = geodesic_field(layout, goal)
+    brute = dijkstra(layout, goal)
+    floor = np.isfinite(brute)
+    # Fast marching is exact to a pixel or so; the grid's 32 directions are within 1 %.
+    assert np.abs(field.values[floor] - brute[floor]).max() <= 1.5 * CELL / PIXELS + 0.05 * brute[floor].max()
+    assert np.isfinite(field.values).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(mazes_of_text(), st.integers(0, 10**6), st.sampled_from(["saturated", "geodesic"]))
+def test_rewards_are_between_minus_one_and_zero(text, seed, reward):
+    """0 at the goal, -1 at the farthest floor pixel, finite everywhere, in walls and outside too."""
+    layout = make_layout("random", text)
+    rng = np.random.default_rng(seed)
+    cell = layout.free[rng.integers(len(layout.free))]
+    goal = layout.world(cell)
+    field = make_field(reward, layout, goal)
+    values = np.repeat(field.values[None], 300, axis=0)
+    reach = np.array(layout.shape[::-1]) * CELL / 2
+    distance = look_up(reward, layout, values, rng.uniform(-1.2, 1.2, (300, 2)) * reach) / field.largest
+    assert np.isfinite(distance).all() and distance.min() >= 0 and distance.max() <= 1 + 1e-9
+    assert look_up(reward, layout, values[:1], goal[None])[0] <= 0.15 * CELL
+    floor = np.kron(~layout.walls, np.ones((PIXELS, PIXELS), bool))
+    assert np.isclose(field.values[floor].max(), field.largest)
+
+
+@pytest.mark.parametrize("task_id", ANT_MAZE_TASKS)
+def test_distance_falls_along_the_shortest_path(task_id):
+    layout = get_task(task_id).layout
+    goal = layout.world(layout.free[0])
+    field = geodesic_field(layout, goal)
+    for cell in layout.free[1:]:
+        path = descend(layout, field, layout.world(cell))
+        values = look_up("geodesic", layout, np.repeat(field.values[None], len(path), axis=0), path)
+        assert np.linalg.norm(path[-1] - goal) < CELL / PIXELS + 0.06
+        assert (np.diff(values) < 0.02).all() and values[-1] < values[0] - 1
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum() + np.linalg.norm(path[-1] - goal)
+        assert abs(length - field.values[tuple((np.array(cell) * PIXELS + PIXELS // 2).tolist())]) < 0.5
+        saturated = saturated_field(layout, layout.free[0])
+        along = look_up("saturated", layout, np.repeat(saturated.values[None], len(path), axis=0), path)
+        assert along[-1] == 0 and along[0] > 0 and along[0] >= along[len(along) // 2] >= 0
+
+
+# -- layouts --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("*****\n*   *\n** **", "hole"),
+        ("*****\n* * *\n*****", "cannot be reached"),
+        ("*****\n*   *\n****", "cells, others"),
+        ("*****\n* x *\n*****", "'x'"),
+        ("***\n***\n***", "two floor cells"),
+        ("", "0 x 0"),
+    ],
+)
+def test_bad_layouts(text, message):
+    with pytest.raises(LayoutError, match=message):
+        make_layout("mine", text)
+
+
+def test_own_layout(tmp_path):
+    path = tmp_path / "my maze.txt"
+    path.write_text("******\n*    *\n* ** *\n*    *\n******\n\n")
+    task = get_task(layout_task_id(path))
+    assert task.id.startswith("ant-maze-my_maze:") and task.layout.shape == (5, 6)
+    state = task.batch(1).reset([np.random.default_rng(0)])
+    assert state.shape == (1, 167)
+    with pytest.raises(LayoutError, match="cannot read"):
+        layout_task_id(tmp_path / "none.txt")
+
+
+def test_unknown_names():
+    with pytest.raises(UnknownNameError, match="empty7x7"):
+        get_task("ant-maze-empty")
+    with pytest.raises(UnknownNameError, match="geodesic"):
+        get_task("ant-maze-empty7x7@geodesi")
+    assert get_task("ant-maze-empty7x7@geodesic").reward == "geodesic"
