@@ -16,6 +16,7 @@ COMMANDS = {
     "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
     "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
     "verify": ("release:verify", "Check that a release is what it says."),
+    "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
     "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
     "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
     "select-checkpoints": ("behaviours:select_checkpoints", "Pick a run's expert, medium and mixed checkpoints."),

@@ -1,4 +1,4 @@
-"""verify."""
+"""verify, regenerate."""
 
 from __future__ import annotations
 
@@ -38,3 +38,78 @@ def verify(context, path, backgrounds, as_json):
         checked = ", ".join(f"{count:,} {name}" for name, count in result.checked.items())
         click.echo(f"{path}: {'sound' if result.sound else f'{len(result.findings)} findings'} ({checked})")
     context.exit(0 if result.sound else 1)
+
+
+def parse_episodes(context, parameter, text):
+    """ "100:150" -> (100, 150); a click callback."""
+    from dmcvb_gen.cli.rollout import parse_range
+
+    try:
+        return parse_range(text)
+    except click.UsageError as error:
+        raise click.UsageError(error.message.replace("--range", "--episodes")) from None
+
+
+only_option = click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets. Repeatable.")
+episodes_option = click.option(
+    "--episodes", metavar="A:B", callback=parse_episodes, help="Only the shards that hold episodes A to B - 1."
+)
+workers_option = click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+
+
+def frames_bar(as_json):
+    """A progress bar of painted frames."""
+    return tqdm(unit=" frames", unit_scale=True, disable=as_json or None)
+
+
+@click.command()
+@click.argument("path", metavar="RELEASE")
+@only_option
+@episodes_option
+@click.option("--check", is_flag=True, help="Only compare digests; change nothing.")
+@click.option("--out", type=click.Path(), help="Make the shards beside, in this folder.")
+@click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
+@click.option("--device", help="Paint on cpu or cuda instead of where the manifest says.")
+@workers_option
+@json_option
+@click.pass_context
+def regenerate(context, path, only, episodes, check, out, backgrounds, device, workers, as_json):
+    """Make a release's shards again from its manifest alone, bit for bit.
+
+    Repairs damaged and missing shards in place, unless --check or --out is given. Exit code 1 when a shard comes
+    out otherwise; what differs in the environment, and how far the values are, is said then.
+
+    \b
+    dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
+    dmcvb-gen regenerate releases/mini
+    """
+    from dmcvb_gen.release import regenerate as work
+
+    if check and out:
+        raise click.UsageError("Give --check or --out, not both.")
+    arguments = dict(only=only, episodes=episodes, backgrounds=backgrounds, device=device, workers=workers)
+    with frames_bar(as_json) as bar:
+        arguments["tick"] = bar.update
+        if out:
+            outcome = work.remake(path, out, **arguments)
+        else:
+            outcome = (work.check if check else work.repair)(path, **arguments)
+    if as_json:
+        print_json(
+            {
+                "sound": outcome.sound,
+                "shards": [dataclasses.asdict(shard) for shard in outcome.shards],
+                "environment": outcome.environment,
+            }
+        )
+    else:
+        for shard in outcome.shards:
+            click.echo(shard)
+        if any(shard.equal is False for shard in outcome.shards):
+            for name, (there, here) in outcome.environment.items():
+                click.echo(f"environment: {name} was {there}, is {here}")
+            if not outcome.environment:
+                click.echo("environment: the same versions and processor as when the release was made")
+        count = len(outcome.shards)
+        click.echo(f"{out or path}: {count} shards made again" if count else f"{path}: nothing is damaged or missing")
+    context.exit(0 if outcome.sound else 1)

@@ -1,0 +1,162 @@
+"""Regenerating: a release's shards come out bit for bit; damage is repaired, sound shards stay as they are."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.release.regenerate import check, remake, repair
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
+from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
+
+NAME = "walker-walk/random/dynamic"
+
+
+@pytest.fixture
+def copy(small_release, tmp_path):
+    shutil.copytree(small_release, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def files_of(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def stamps_of(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_part_of_a_release_comes_out_with_its_digests(small_release):
+    before = stamps_of(small_release)
+    outcome = check(small_release, ["*/*/dynamic"], (2, 3))
+    [shard] = outcome.shards
+    assert outcome.sound and shard.equal and (shard.subset, shard.shard) == (NAME, 1)
+    assert outcome.environment == {} and stamps_of(small_release) == before
+
+
+def test_nothing_but_the_manifest_is_needed(small_release, tmp_path):
+    (tmp_path / "bare").mkdir()
+    shutil.copy(small_release / "manifest.json", tmp_path / "bare")
+    outcome = repair(tmp_path / "bare")
+    assert outcome.sound and len(outcome.shards) == 6
+    assert files_of(tmp_path / "bare").keys() - {tmp_path / "bare/manifest.json"}
+    for path, data in files_of(small_release).items():
+        if path.name != ".created" and "preview" not in path.parts:
+            assert (tmp_path / "bare" / path.relative_to(small_release)).read_bytes() == data
+
+
+def test_damaged_and_missing_shards_are_repaired_and_sound_ones_not_touched(copy, small_release):
+    pixels = next(file for file in open_release(copy)[NAME].commits[1].files if "/pixels/" in file.path).path
+    data = bytearray((copy / pixels).read_bytes())
+    data[len(data) // 2] ^= 1
+    (copy / pixels).write_bytes(data)
+    state = next(f for f in open_release(copy)["walker-walk/random/none"].commits[0].files if "/state/" in f.path).path
+    (copy / state).unlink()
+    (copy / commit_path("walker-walk/random/static", 1)).unlink()
+    before = stamps_of(copy)
+    outcome = repair(copy)
+    assert outcome.sound and {(shard.subset.split("/")[-1], shard.shard) for shard in outcome.shards} == {
+        ("dynamic", 1),
+        ("none", 0),
+        ("static", 1),
+    }
+    assert all(shard.repaired and shard.was for shard in outcome.shards)
+    assert verify(copy).sound and not list(copy.glob(".regenerate-*"))
+    touched = {path for path, stamp in stamps_of(copy).items() if before.get(path) != stamp}
+    sound = ("dynamic.zarr", "/c/0"), ("none.zarr", "/c/1"), ("static.zarr", "/c/")
+    sound = {path for path in touched for subset, shard in sound if subset in str(path) and shard in str(path)}
+    sound -= {path for path in sound if "static.zarr" in str(path) and "/c/1" in str(path)}
+    assert not sound and (copy / "manifest.json") not in touched
+    for path, data in files_of(small_release).items():
+        assert (copy / path.relative_to(small_release)).read_bytes() == data
+
+
+def test_lost_metadata_is_put_back(copy):
+    (copy / f"{NAME}.zarr/zarr.json").write_text("{")
+    shutil.rmtree(copy / f"{NAME}.zarr/pixels")
+    assert repair(copy).sound and verify(copy).sound
+    assert repair(copy).shards == ()
+
+
+def change_actions(folder):
+    """Another machine's data: other values under digests of their own."""
+    group = zarr.open_group(str(folder / f"{NAME}.zarr"), mode="r+", use_consolidated=False)
+    group["action"][0] = group["action"][0] * 0.5
+    pixels = group["pixels"][0]
+    pixels[:5] = np.minimum(pixels[:5], 250) + 3
+    group["pixels"][0] = pixels
+    path = folder / commit_path(NAME, 0)
+    commit = parse_commit(path.read_text())
+    files = [
+        file.model_copy(
+            update={"bytes": (folder / file.path).stat().st_size, "sha256": sha256_file(folder / file.path)}
+        )
+        for file in commit.files
+    ]
+    write_json_atomically(path, commit.model_copy(update={"files": tuple(files)}))
+    manifest = open_release(folder).manifest
+    manifest = manifest.model_copy(update={"environments": ({**manifest.environments[0], "cpu": "Another 9000"},)})
+    finish_release(folder, manifest)
+
+
+def test_a_difference_is_said_with_how_far_and_what_differs_in_the_environment(copy):
+    change_actions(copy)
+    result = CliRunner().invoke(main, ["regenerate", str(copy), "--only", NAME, "--episodes", "0:1", "--check"])
+    assert result.exit_code == 1
+    assert "action differ, state equal" in result.output and "pixels: max 3, mean" in result.output
+    assert "environment: cpu was Another 9000, is" in result.output
+
+
+def test_a_shard_that_comes_out_otherwise_is_not_put_in(copy):
+    change_actions(copy)
+    pixels = next(file for file in open_release(copy)[NAME].commits[0].files if "/pixels/" in file.path).path
+    (copy / pixels).write_bytes(b"rubbish")
+    before = files_of(copy)
+    outcome = repair(copy)
+    assert not outcome.sound and [shard.repaired for shard in outcome.shards] == [False]
+    assert files_of(copy) == before
+
+
+def test_beside_it_makes_an_equal_release(small_release, tmp_path):
+    outcome = remake(small_release, tmp_path / "beside", ["*/*/none"])
+    assert outcome.sound and all(shard.equal for shard in outcome.shards)
+    assert list(open_release(tmp_path / "beside").subsets) == ["walker-walk/random/none"]
+    with pytest.raises(StoreError, match="leave --out away"):
+        remake(small_release, small_release)
+
+
+def test_bad_requests_say_what_to_do(small_release, tmp_path, copy):
+    with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
+        check(small_release, ["cheetah-run"])
+    with pytest.raises(StoreError, match="no subset has episodes 7:9"):
+        check(small_release, episodes=(7, 9))
+    with pytest.raises(StoreError, match="holds no release"):
+        check(tmp_path)
+    with pytest.raises(StoreError, match="not those that.*--backgrounds"):
+        data = json.loads((copy / "manifest.json").read_text())
+        for subset in data["subsets"]:
+            if subset["backgrounds"]:
+                subset["backgrounds"]["digest"] = "0" * 64
+        (copy / "manifest.json").write_text(json.dumps(data))
+        check(copy, [NAME])
+    data["schema_version"] = 99
+    (copy / "manifest.json").write_text(json.dumps(data))
+    result = CliRunner().invoke(main, ["regenerate", str(copy)])
+    assert result.exit_code == 2 and "install a newer dmcvb-gen" in result.output
+
+
+def test_a_policy_that_is_nowhere_is_named(copy):
+    data = json.loads((copy / "manifest.json").read_text())
+    data["subsets"][0]["policies"] = [{"name": "mine", "digest": "f" * 64, "path": "policies/mine.safetensors"}]
+    (copy / "manifest.json").write_text(json.dumps(data))
+    with pytest.raises(StoreError, match="policies/mine.safetensors"):
+        check(copy)
