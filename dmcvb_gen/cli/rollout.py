@@ -29,6 +29,7 @@ def _out_default(name: str) -> Path:
 @click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
 @click.option("--episodes-per-goal", type=click.IntRange(1), default=10, show_default=True, help="With --fixed-goals.")
 @click.option("--layout", "layouts", multiple=True, help="Mazes: a layout's name or text file, instead of TASK.")
+@click.option("--reward", type=click.Choice(["saturated", "geodesic"]), help="Mazes: DMC-VB's distance, or the path's.")
 @click.option("--episodes", type=click.IntRange(1), help="Episodes a subset.  [default: 20]")
 @click.option("--steps", type=click.IntRange(1), help="Steps a subset, instead of --episodes.")
 @click.option("--range", "episode_range", metavar="A:B", help="Only the shards that hold episodes A to B - 1.")
@@ -122,9 +123,11 @@ def parse_range(text: str | None) -> tuple[int, int] | None:
 def _recipe_from_options(tasks, options):
     from dmcvb_gen.distractors.base import DistractorSetting
     from dmcvb_gen.rollout.plan import single_recipe
-    from dmcvb_gen.rollout.recipe import is_maze
+    from dmcvb_gen.rollout.recipe import is_maze, task_folder
 
     tasks = (*tasks, *(_layout_task(layout) for layout in options["layouts"]))
+    if options["reward"] == "geodesic":
+        tasks = tuple(f"{task}@geodesic" if is_maze(task) else task for task in tasks)
     levels = options["levels"] or ("random",)
     mazes = [task for task in tasks if is_maze(task)]
     if mazes and len(mazes) < len(tasks):
@@ -142,7 +145,7 @@ def _recipe_from_options(tasks, options):
             for name in options["settings"] or ("none",)
         ]
     episodes = options["episodes"] or (None if options["steps"] else 20)
-    name = "-".join(dict.fromkeys([*(Path(task).stem for task in tasks), *levels]))
+    name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))
     return single_recipe(
         tasks,
         levels,
@@ -169,7 +172,9 @@ def _background_source(given: str) -> str:
 
 
 def _layout_task(layout: str) -> str:
-    return f"ant-maze:{layout}" if Path(layout).suffix or Path(layout).exists() else f"ant-maze-{layout}"
+    from dmcvb_gen.tasks.ant_maze import layout_task_id
+
+    return layout_task_id(layout) if Path(layout).suffix or Path(layout).exists() else f"ant-maze-{layout}"
 
 
 def _progress(plan, as_json):
@@ -284,7 +289,7 @@ def info(path, as_json):
             numbers = (f"{paper[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max"))
             table.add_row("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers, style="dim")
     console = Console()
-    console.width = max(console.width, 132)  # a cut number is worse than a wrapped line
+    console.width = max(console.width, 152)  # a cut number is worse than a wrapped line
     console.print(table)
     console.print(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
 

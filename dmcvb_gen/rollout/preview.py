@@ -37,6 +37,51 @@ def _views(subset: Subset) -> list[str]:
     return hidden if hidden and subset.setting in ("hidden", "fixed") else visible
 
 
+MAP_SCALE = 1.1
+"""Width of the top view over the maze's (dm_control's arena)."""
+
+
+def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale: int) -> np.ndarray:
+    """(step, h, w, 3): the top view under the distance field, with the path walked so far."""
+    from matplotlib import colormaps
+
+    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.ant_maze.distance import look_up, make_field
+
+    task = get_task(subset.task)
+    frames = _enlarge(values["pixels/top"][steps], scale)
+    size, reach = frames.shape[1], MAP_SCALE * max(task.layout.shape) * 2.5 / 2
+    place = (np.arange(size) + 0.5) / size * 2 * reach - reach
+    x, y = (part.ravel() for part in np.meshgrid(place, -place))
+    where = np.stack([x, y], axis=1)
+    state = values["state"]
+    goal = state[0, task.state_slices["target_position"]]
+    field = make_field(task.reward, task.layout, goal)
+    floor = np.kron(~task.layout.walls, np.ones((10, 10)))
+    stacked = np.broadcast_to(field.values, (len(where), *field.values.shape))
+    distance = look_up("geodesic", task.layout, stacked, where) / field.largest
+    open_ = look_up("geodesic", task.layout, np.broadcast_to(floor, stacked.shape), where) > 0.5
+    colors = (colormaps["viridis"](1 - distance)[:, :3] * 255).reshape(size, size, 3)
+    blend = np.where(open_.reshape(size, size, 1), 0.45, 0.0)
+    frames = (frames * (1 - blend) + colors * blend).astype(np.uint8)
+    position = state[:, task.state_slices["walker_position"]][:, :2]
+    points = np.stack([(position[:, 0] / reach + 1) / 2 * size, (1 - position[:, 1] / reach) / 2 * size], axis=1)
+    out = []
+    for frame, step in zip(frames, steps, strict=True):
+        picture = Image.fromarray(frame)
+        draw = ImageDraw.Draw(picture)
+        if step > 0:
+            draw.line([tuple(point) for point in points[: step + 1]], fill=(255, 40, 40), width=max(1, scale // 2))
+        gx, gy = (goal[0] / reach + 1) / 2 * size, (1 - goal[1] / reach) / 2 * size
+        draw.ellipse([gx - scale, gy - scale, gx + scale, gy + scale], outline=(0, 255, 0))
+        out.append(np.asarray(picture))
+    return np.stack(out)
+
+
+def _is_maze(subset: Subset) -> bool:
+    return "pixels/top" in subset.pixel_arrays
+
+
 def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
     """Evenly spaced frames of one episode side by side, a row a view, under a caption; (h, w, 3) uint8."""
     length = int(subset.read("length", [episode])[0])
@@ -45,6 +90,9 @@ def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, sc
     for name in _views(subset):
         frames = subset.episode(episode, [name, "length"])[name][steps]
         rows.append(np.concatenate(list(_enlarge(frames, scale)), axis=1))
+    if _is_maze(subset):
+        drawn = _map(subset, subset.episode(episode, ["state", "length", "pixels/top"]), steps, scale)
+        rows.append(np.concatenate(list(drawn), axis=1))
     picture = np.concatenate(rows)
     value = float(subset.read("return", [episode])[0])
     caption = f"{subset.name}  episode {episode}  {length} steps  return {value:.1f}"
@@ -73,7 +121,10 @@ def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = 200) -
         values = subset.episode(episode)
         views = [values[name] for name in _views(subset)]
         steps = np.minimum(np.arange(frames), len(views[0]) - 1)
-        picture = np.concatenate([_enlarge(view[steps], scale) for view in views], axis=1)
+        rows = [_enlarge(view[steps], scale) for view in views]
+        if _is_maze(subset):
+            rows.append(_map(subset, values, steps, scale))
+        picture = np.concatenate(rows, axis=1)
         label = _label(subset.name, picture.shape[2])
         columns.append(np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1))
     per_row = max(1, int(np.ceil(np.sqrt(len(columns) * 1.5))))

@@ -160,7 +160,7 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
                     raise UnknownNameError("level", level, LEVELS)
                 for given in pattern.settings:
                     setting = normalize_setting(task_id, given)
-                    name = f"{_folder(task_id)}/{level}/{setting}"
+                    name = f"{task_folder(task_id)}/{level}/{setting}"
                     if name in requests:
                         raise RecipeError(f"recipe {recipe.name!r} asks for {name} twice; keep one of the entries")
                     requests[name] = _request(pattern, task, name, level, setting)
@@ -170,13 +170,10 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     return tuple(requests.values())
 
 
-def _folder(task_id: str) -> str:
-    """A task id as a folder name (a layout given by its file is named after the file)."""
-    return re.sub(
-        r"[^A-Za-z0-9_.-]",
-        "-",
-        Path(task_id).stem if ":" not in task_id else task_id.split(":")[0] + "-" + Path(task_id).stem,
-    )
+def task_folder(task_id: str) -> str:
+    """A task id as a folder name: without a maze's rows, if it carries its own."""
+    head, _, reward = task_id.partition("@")
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", head.split(":")[0] + (f"-{reward}" if reward else ""))
 
 
 def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting: str) -> SubsetRequest:

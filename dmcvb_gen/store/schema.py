@@ -154,7 +154,8 @@ def picture_layout_for(setting: str) -> str:
     Moving pictures are smaller as differences of neighboring pixels, a color channel at a time; where the camera
     stands still, zstd finds the repeated rows by itself, and is faster to read.
     """
-    return "channel-delta-zstd" if setting.startswith("dynamic") else "zstd"
+    moving = setting.startswith("dynamic") or setting in ("visible", "hidden", "fixed")
+    return "channel-delta-zstd" if moving else "zstd"
 
 
 def create_arrays(

@@ -6,7 +6,10 @@ mocap body, so that each episode of a batch puts it elsewhere.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes.util
 import functools
+import os
 import re
 from dataclasses import dataclass
 
@@ -60,14 +63,29 @@ def _textures(paths: dict[str, str]) -> list[str]:
     return [paths[name] for name in names[-TEXTURES_PER_STYLE:]]
 
 
+@contextlib.contextmanager
+def _quiet_renderer_choice():
+    """dm_control looks for a window system when it is imported, and complains; nothing is drawn with it here."""
+    if "MUJOCO_GL" in os.environ:
+        yield
+        return
+    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+
+
 @functools.cache
 def build_arena(layout: Layout) -> Arena:
     """The arena of a layout, with the ant and the goal."""
     import labmaze
-    from dm_control.locomotion.arenas import labmaze_textures, mazes
-    from dm_control.locomotion.props import target_sphere
-    from dm_control.locomotion.walkers import ant
     from labmaze import assets
+
+    with _quiet_renderer_choice():
+        from dm_control.locomotion.arenas import labmaze_textures, mazes
+        from dm_control.locomotion.props import target_sphere
+        from dm_control.locomotion.walkers import ant
 
     maze = labmaze.FixedMazeWithRandomGoals(entity_layer=layout.entity_layer, num_spawns=1, num_objects=1)
     arena = mazes.MazeWithTargets(

@@ -1,0 +1,52 @@
+"""show-maze."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from dmcvb_gen.cli.common import json_option, print_json
+
+
+def _cell(context, parameter, value):
+    if value is None:
+        return None
+    parts = value.split(",")
+    if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
+        raise click.BadParameter(f"{value!r} is not ROW,COLUMN, e.g. 1,5")
+    return int(parts[0]), int(parts[1])
+
+
+@click.command("show-maze")
+@click.argument("layout")
+@click.option("--start", callback=_cell, metavar="ROW,COLUMN", help="A floor cell.  [default: the farthest]")
+@click.option("--goal", callback=_cell, metavar="ROW,COLUMN", help="A floor cell.  [default: the farthest]")
+@click.option("--out", type=click.Path(path_type=Path), help="The picture.  [default: LAYOUT.png]")
+@json_option
+def show_maze(layout, start, goal, out, as_json):
+    """Write a picture of a layout, its distances to a goal and the path there.
+
+    LAYOUT is a name (empty7x7, medium7x7a, ...) or a text file of '*' and spaces.
+
+    \b
+    dmcvb-gen show-maze medium7x7a
+    dmcvb-gen show-maze my_maze.txt --start 1,1 --goal 3,5 --out my_maze.png
+    """
+    from dmcvb_gen.errors import UnknownNameError
+    from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, get_layout, load_layout
+    from dmcvb_gen.tasks.ant_maze.picture import save_maze_picture
+
+    name = layout.removeprefix("ant-maze-")
+    if name in LAYOUTS:
+        chosen = get_layout(name)
+    elif Path(layout).suffix or Path(layout).exists():
+        chosen = load_layout(layout)
+    else:
+        raise UnknownNameError("layout", layout, LAYOUTS)
+    out = out or Path(f"{chosen.name}.png")
+    facts = save_maze_picture(chosen, out, start, goal)
+    if as_json:
+        return print_json({"layout": chosen.name, "rows": list(chosen.rows), "picture": str(out), **facts})
+    click.echo("\n".join(chosen.rows))
+    click.echo(f"{out}: path of {facts['path_m']:.1f} m from {tuple(facts['start'])} to {tuple(facts['goal'])}")

@@ -1,0 +1,81 @@
+"""Pictures of mazes: a layout, its distance field, paths through it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.tasks.ant_maze.distance import REWARDS, descend, geodesic_field, make_field
+from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
+
+
+def farthest_cells(layout: Layout) -> tuple[tuple[int, int], tuple[int, int]]:
+    """A start and a goal cell with the longest shortest path between them."""
+    best, pair = -1.0, (layout.free[0], layout.free[-1])
+    for goal in layout.free:
+        field = geodesic_field(layout, layout.world(goal))
+        for start in layout.free:
+            value = field.values[start[0] * 10 + 5, start[1] * 10 + 5]
+            if value > best:
+                best, pair = value, (start, goal)
+    return pair
+
+
+def save_maze_picture(
+    layout: Layout, path: str | Path, start: tuple[int, int] | None = None, goal: tuple[int, int] | None = None
+) -> dict:
+    """Write a PNG of a layout with the distance field of each reward to a goal, and the path down it.
+
+    Args:
+      start, goal: (row, column) cells; the farthest pair by default.
+
+    Returns:
+      start, goal, length of the shortest path (m) and largest distance (m).
+
+    Raises:
+      LayoutError: a start or a goal in a wall.
+      DmcvbError: the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    far_start, far_goal = farthest_cells(layout)
+    start, goal = start or far_start, goal or far_goal
+    layout.check_cell(start, "start")
+    layout.check_cell(goal, "goal")
+    rows, columns = layout.shape
+    extent = (-columns * CELL / 2, columns * CELL / 2, -rows * CELL / 2, rows * CELL / 2)
+    floor = np.kron(~layout.walls, np.ones((10, 10), bool))
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    axes = figure.subplots(1, 1 + len(REWARDS))
+    axes[0].imshow(np.where(floor, 1.0, 0.3), cmap="gray", vmin=0, vmax=1, extent=extent)
+    for row, column in layout.free:
+        x, y = layout.world((row, column))
+        axes[0].text(x, y, f"{row},{column}", ha="center", va="center", fontsize=8)
+    axes[0].set_title(f"{layout.name}: {len(layout.free)} floor cells (row, column)")
+    facts = {}
+    for axis, reward in zip(axes[1:], REWARDS, strict=True):
+        field = make_field(reward, layout, layout.world(goal))
+        shown = np.ma.MaskedArray(-field.values / field.largest, ~floor)
+        image = axis.imshow(shown, extent=extent, cmap="viridis", vmin=-1, vmax=0)
+        axis.contour(np.flipud(shown), levels=12, extent=extent, colors="white", linewidths=0.4, linestyles="solid")
+        walked = descend(layout, field, layout.world(start))
+        axis.plot(*walked.T, color="red", linewidth=2)
+        axis.plot(*layout.world(start), "o", color="red")
+        axis.plot(*layout.world(goal), "o", color="lime", markersize=10)
+        axis.set_title(f"reward {reward}")
+        figure.colorbar(image, ax=axis, label="reward of a control step", shrink=0.8)
+        facts[reward] = field
+    for axis in axes:
+        axis.set_xlabel("x (m)")
+        axis.set_facecolor("0.3")
+    axes[0].set_ylabel("y (m)")
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise DmcvbError(f"cannot write {path} ({error}); give another --out ending in .png") from None
+    geodesic = facts["geodesic"]
+    length = float(geodesic.values[start[0] * 10 + 5, start[1] * 10 + 5])
+    return {"start": list(start), "goal": list(goal), "path_m": length, "largest_m": geodesic.largest}
