@@ -1,4 +1,4 @@
-"""verify, regenerate."""
+"""verify, regenerate, repaint."""
 
 from __future__ import annotations
 
@@ -113,3 +113,39 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
         count = len(outcome.shards)
         click.echo(f"{out or path}: {count} shards made again" if count else f"{path}: nothing is damaged or missing")
     context.exit(0 if outcome.sound else 1)
+
+
+@click.command()
+@click.argument("path", metavar="RELEASE")
+@only_option
+@click.option("--distractor", help="none, static or dynamic.  [default: as each subset has]")
+@click.option("--difficulty", type=click.Choice(["easy", "medium", "hard"]), help="[default: as each subset has]")
+@click.option("--size", type=int, help="Pixels a side.  [default: as each subset has]")
+@click.option("--renderer", help="warp or opengl.  [default: as each subset has]")
+@click.option("--samples", type=click.IntRange(1, 8), help="Samples a pixel: 1, 2, 4 or 8.")
+@click.option("--backgrounds", metavar="FOLDER", help="builtin, or a folder of videos.  [default: the recipe's]")
+@click.option("--split", type=click.Choice(["train", "val"]), help="Videos and styles.  [default: the recipe's]")
+@click.option("--label", "labels", multiple=True, type=click.Choice(["depth", "segmentation"]), help="Store these too.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
+@click.option("--name", help="Name of the new release.  [default: NAME-repainted]")
+@click.option("--out", type=click.Path(), required=True, help="Folder of the new release.")
+@workers_option
+@json_option
+def repaint(path, out, as_json, backgrounds, **options):
+    """Give episodes new pixels, from their stored physics states: nothing is simulated.
+
+    \b
+    dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\
+        --out releases/mini84
+    """
+    from dmcvb_gen.cli.rollout import _background_source
+    from dmcvb_gen.release.repaint import repaint as run
+
+    backgrounds = backgrounds and _background_source(backgrounds)
+    with frames_bar(as_json) as bar:
+        manifest = run(path, out, backgrounds=backgrounds, tick=bar.update, **options)
+    if as_json:
+        return print_json({"out": out, "complete": manifest.complete, "subsets": [s.name for s in manifest.subsets]})
+    for subset in manifest.subsets:
+        click.echo(f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}")
+    click.echo(f"{out}: repainted; look at it: dmcvb-gen preview {out}")

@@ -155,6 +155,12 @@ def make_jobs(
     Raises:
       DmcvbError: policies or backgrounds are not there, or not those of the manifest.
     """
+    for entry in manifest.lineage:
+        if entry.get("labels"):
+            raise StoreError(
+                f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "
+                "repaint that release again instead of regenerating this one"
+            )
     recipe, requests = recipe_of(manifest)
     files = {record.name: policy_files(root, record, requests.get(record.name)) for record in shards.values()}
     sources = {

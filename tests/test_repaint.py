@@ -1,0 +1,115 @@
+"""Repainting: new pixels from stored physics, equal to what a rollout would have painted; nothing is simulated."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.behaviours import simulate
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
+from dmcvb_gen.release.regenerate import check
+from dmcvb_gen.release.repaint import repaint
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rendering import available_renderers
+from dmcvb_gen.store import open_release
+from tests.conftest import roll_out, small_recipe
+
+
+@pytest.fixture
+def no_simulation(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise AssertionError("repainting simulated")
+
+    monkeypatch.setattr(simulate, "simulate", refuse)
+    monkeypatch.setattr("dmcvb_gen.rollout.worker.simulate", refuse)
+
+
+@pytest.fixture(scope="module")
+def dynamic(small_release, tmp_path_factory):
+    out = tmp_path_factory.mktemp("repainted") / "r"
+    repaint(small_release, out, ["*/*/none"], distractor="dynamic")
+    return out
+
+
+def shard_bytes(folder, name):
+    files = sorted((folder / f"{name}.zarr").rglob("c/**/*"))
+    return {path.relative_to(folder): path.read_bytes() for path in files if path.is_file()}
+
+
+def test_a_repainted_subset_has_the_bytes_of_a_rolled_out_one(small_release, dynamic):
+    name = "walker-walk/random/dynamic"
+    assert shard_bytes(dynamic, name) == shard_bytes(small_release, name) != {}
+    digests = [open_release(folder)[name].record.digest for folder in (small_release, dynamic)]
+    assert digests[0] == digests[1]
+
+
+def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dynamic, small_release):
+    assert verify(dynamic).sound and check(dynamic, episodes=(2, 3)).sound
+    manifest = open_release(dynamic).manifest
+    [lineage] = manifest.lineage
+    assert lineage["kind"] == "repaint" and lineage["from"] == "small 1.0.0" and len(lineage["manifest_sha256"]) == 64
+    assert lineage["subsets"] == {"walker-walk/random/dynamic": "walker-walk/random/none"}
+    assert manifest.name == "small-repainted" and manifest.complete
+
+
+def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, no_simulation):
+    repaint(small_release, tmp_path / "r", ["*/*/static"], size=24, labels=["depth", "segmentation"])
+    old, new = (open_release(folder)["walker-walk/random/static"] for folder in (small_release, tmp_path / "r"))
+    assert new.read("pixels").shape == (3, 501, 24, 24, 3)
+    for name in set(old.arrays) - {"pixels"}:
+        np.testing.assert_array_equal(old.read(name), new.read(name))
+    depth, geoms = new.read("depth", [0])[0], new.read("segmentation", [0])[0]
+    assert depth.shape == geoms.shape == (501, 24, 24) and depth.dtype == np.float32
+    assert depth.max() > 1 and ((geoms >= 0) == (depth > 0)).mean() > 0.99 and len(np.unique(geoms)) > 3
+    assert verify(tmp_path / "r").sound
+    with pytest.raises(StoreError, match="depth and segmentation"):
+        check(tmp_path / "r")
+
+
+@pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")
+def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
+    roll_out(small_recipe(subsets=[pattern]), tmp_path / "warp")
+    options = ["--renderer", "opengl", "--name", "gl", "--out", str(tmp_path / "gl")]
+    result = CliRunner().invoke(main, ["repaint", str(tmp_path / "warp"), *options])
+    assert result.exit_code == 0, result.output
+    old, new = (open_release(tmp_path / f)["walker-walk/random/none"].read("pixels") for f in ("warp", "gl"))
+    assert 0 < np.abs(old.astype(int) - new).mean() < 15
+    assert open_release(tmp_path / "gl").manifest.recipe["renderer"]["backend"] == "opengl"
+
+
+def test_an_interrupted_repaint_goes_on(small_release, dynamic, tmp_path, no_simulation):
+    shutil.copytree(dynamic, tmp_path / "r")
+    (tmp_path / "r/commits/walker-walk/random/dynamic/00001.json").unlink()
+    manifest = repaint(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic")
+    assert manifest.complete and manifest.subsets[0].digest == open_release(dynamic).manifest.subsets[0].digest
+
+
+def test_mistakes_are_refused_before_any_painting(small_release, tmp_path):
+    with pytest.raises(RecipeError, match="both become walker-walk/random/static.*--only"):
+        repaint(small_release, tmp_path / "r", distractor="static")
+    with pytest.raises(DmcvbError, match="8 to 1024"):
+        repaint(small_release, tmp_path / "r", size=4)
+    with pytest.raises(DmcvbError, match="warp"):
+        repaint(small_release, tmp_path / "r", renderer="povray")
+    with pytest.raises(DmcvbError, match="dynamic"):
+        repaint(small_release, tmp_path / "r", ["*/*/none"], distractor="blurry")
+    with pytest.raises(StoreError, match="the release itself"):
+        repaint(small_release, small_release)
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_damaged_source_is_not_painted(small_release, tmp_path):
+    shutil.copytree(small_release, tmp_path / "copy")
+    file = next(
+        f for f in open_release(tmp_path / "copy")["walker-walk/random/none"].commits[0].files if "physics" in f.path
+    )
+    data = bytearray((tmp_path / "copy" / file.path).read_bytes())
+    data[100] ^= 255
+    (tmp_path / "copy" / file.path).write_bytes(data)
+    with pytest.raises(StoreError, match="does not have its digest; run `dmcvb-gen regenerate"):
+        repaint(tmp_path / "copy", tmp_path / "r", ["*/*/none"], size=8)
