@@ -6,6 +6,7 @@ import json
 from importlib import resources
 from pathlib import Path
 
+from dmcvb_gen.behaviours.policy_file import read_header
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 
 LEVELS = ("expert", "medium", "mixed")
@@ -44,6 +45,25 @@ def bundled_policies(task_id: str, level: str) -> list[Path]:
             f"{task_id}` and `dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
         )
     return files
+
+
+def levels_of(behaviour: str | Path) -> list[str]:
+    """Levels that a run folder or a folder of level files has policies for; a single policy file's own level.
+
+    Raises:
+      PolicyFileError: there are none.
+    """
+    path = Path(behaviour)
+    if path.is_file():
+        return [read_header(path).level or path.stem]
+    for folder in (path / "selected", path):
+        levels = [level for level in LEVELS if level_files(folder, level)]
+        if levels:
+            return levels
+    raise PolicyFileError(
+        f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {behaviour}` first, "
+        "or give a policy file"
+    )
 
 
 def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = None) -> list[Path]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policy_file import Evaluation, Policy
 from dmcvb_gen.behaviours.simulate import Simulation, simulate
-from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
 
 
 def evaluate(
@@ -27,9 +27,7 @@ def evaluate(
         threads=threads,
     )
     returns = out.returns
-    success = speed = None
-    if task.id.startswith("ant-maze"):
-        success = float(out.terminated.mean())
+    success, speed = maze_scores(task, out)
     return (
         Evaluation(
             mean=float(returns.mean()),
@@ -43,3 +41,18 @@ def evaluate(
         ),
         out,
     )
+
+
+def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float | None]:
+    """Share of episodes that reached the goal, and their mean speed towards it.
+
+    Speed is the straight distance to the goal at the start over the time it took, in m/s, as in the benchmarks;
+    None where no episode got there, both None for a task without a goal.
+    """
+    part = task.state_slices.get("distance_to_target")
+    if part is None:
+        return None, None
+    reached = simulation.terminated
+    seconds = simulation.length * ACTION_REPEAT * task.control_timestep
+    speed = simulation.state[:, 0, part.start] / seconds
+    return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None

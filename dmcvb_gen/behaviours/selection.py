@@ -7,6 +7,7 @@ share of the way is counted from the random policy's return to the converged one
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,16 +17,21 @@ import numpy as np
 from dmcvb_gen.behaviours.evaluation import evaluate
 from dmcvb_gen.behaviours.policy_file import (
     Evaluation,
+    Policy,
     PolicyHeader,
     load_policy,
     random_policy,
     read_header,
     save_policy,
 )
+from dmcvb_gen.behaviours.run_log import read_rows
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.store.manifest import write_json_atomically
 from dmcvb_gen.tasks import get_task
 
+LEVELS = ("expert", "medium", "mixed")
+MAZE_LEVELS = ("expert", "medium")
+"""The paper has no mixed data of mazes."""
 EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
 MEDIUM_TOLERANCE = 0.1
 """How far (as a share of the way) an accepted medium checkpoint may be from 50 %."""
@@ -125,28 +131,35 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
     return Convergence(value, error, True)
 
 
-def read_curve(folder: Path) -> list[tuple[int, float, Path]]:
-    """(agent step, return, policy file) of every evaluated checkpoint of a run, in order.
+Point = tuple[int, float, Path | None]
+"""Agent step, return, policy file; None where the file was thinned away."""
 
-    A checkpoint that is being written or thinned away while we look is left out.
+
+def read_curve(folder: Path) -> list[Point]:
+    """Every evaluation of a run, in order of steps: those of progress.csv and of the checkpoints' own headers.
+
+    A checkpoint that is being written while we look is left out.
     """
-    curve = []
-    for path in sorted((Path(folder) / "checkpoints").glob("*.safetensors")):
+    curve: dict[int, Point] = {
+        int(row["step"]): (int(row["step"]), float(row["return_mean"]), None) for row in read_rows(folder)
+    }
+    for path in (Path(folder) / "checkpoints").glob("*.safetensors"):
         try:
             header = read_header(path)
         except PolicyFileError:
             continue
         if header.evaluation is not None:
-            curve.append((header.agent_step, header.evaluation.mean, path))
-    return curve
+            curve[header.agent_step] = (header.agent_step, header.evaluation.mean, path)
+    return [curve[step] for step in sorted(curve)]
 
 
 def pick_checkpoints(
-    curve: Sequence[tuple[int, float, Path]],
+    curve: Sequence[Point],
     base: float,
     convergence: Convergence,
     measure: Callable[[Path], Evaluation],
     task: str = "",
+    levels: Sequence[str] = LEVELS,
 ) -> Selection:
     """Pick levels from a curve; every pick is measured on fresh episodes before it is accepted.
 
@@ -154,23 +167,20 @@ def pick_checkpoints(
       curve: (agent step, return, policy file), in order of steps.
       base: return at 0 % of the way.
       measure: evaluates a policy file on fresh episodes.
+      levels: what to pick, of `LEVELS`.
     """
     picks: dict[str, tuple[Pick, ...]] = {}
     reasons: dict[str, str] = {}
     way = convergence.value - base
-    measured: dict[Path, Evaluation] = {}
+    check = functools.cache(measure)
 
     def share(value: float) -> float:
         return (value - base) / way
 
-    def check(path: Path) -> Evaluation:
-        if path not in measured:
-            measured[path] = measure(path)
-        return measured[path]
-
-    if not len(curve) or not way > 0:
+    curve = [point for point in curve if point[2] is not None]
+    if not curve or not way > 0:
         reason = convergence.reason or "the run has no evaluated checkpoint yet"
-        return Selection(task, base, convergence, {}, {level: reason for level in ("expert", "medium", "mixed")})
+        return Selection(task, base, convergence, {}, {level: reason for level in levels})
     if not convergence.converged:
         reasons["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
     else:
@@ -210,6 +220,8 @@ def pick_checkpoints(
         )
     else:
         picks["medium"] = (Pick("medium", MEDIUM_SHARE, medium.step, medium.estimate, medium.path, medium.evaluation),)
+    if "mixed" not in levels:
+        return Selection(task, base, convergence, picks, reasons)
     chosen, taken = [], set()
     for index, target in enumerate(np.linspace(0, MEDIUM_SHARE, MIXED_COUNT)):
         found = nearest(float(target), MIXED_TOLERANCE, taken)
@@ -238,21 +250,35 @@ def select_checkpoints(
     """
     folder = Path(folder)
     curve = read_curve(folder)
-    if not curve:
+    files = [path for _, _, path in curve if path]
+    if not files:
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
-    task = get_task(read_header(curve[0][2]).task)
-    base = 0.0
-    if task.return_range[1] <= 0:
-        base = evaluate(random_policy(task), task, episodes, seed)[0].mean
-    convergence = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
+    task = get_task(read_header(files[0]).task)
+    mazes = task.return_range[1] <= 0
+    base = evaluate(random_policy(task), task, episodes, seed)[0].mean if mazes else 0.0
+    measured: dict[Path, tuple[Policy, Evaluation]] = {}
 
     def measure(path: Path) -> Evaluation:
-        return evaluate(load_policy(path, task), task, episodes, seed, deterministic)[0]
+        if path not in measured:
+            policy = load_policy(path, task)
+            measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic)[0]
+        return measured[path][1]
 
-    selection = pick_checkpoints(curve, base, convergence, measure, task.id)
+    for attempt in range(5):
+        convergence = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
+        try:
+            levels = MAZE_LEVELS if mazes else LEVELS
+            selection = pick_checkpoints(curve, base, convergence, measure, task.id, levels)
+            break
+        except PolicyFileError:
+            curve, before = read_curve(folder), files
+            files = [path for _, _, path in curve if path]
+            # The run may have thinned a checkpoint away since the curve was read; a damaged one is a real error.
+            if attempt == 4 or set(before) <= set(files):
+                raise
     for level, picks in selection.picks.items():
         for pick in picks:
-            policy = load_policy(pick.path, task)
+            policy = measured[Path(pick.path)][0]
             header: PolicyHeader = policy.header.model_copy(update={"level": level, "evaluation": pick.evaluation})
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
     write_json_atomically(folder / "selection.json", selection_json(selection))
@@ -263,7 +289,7 @@ def select_checkpoints(
 def selection_json(selection: Selection) -> dict:
     """A selection as plain values."""
     levels = {}
-    for level in ("expert", "medium", "mixed"):
+    for level in LEVELS:
         picks = [
             asdict(pick) | {"evaluation": pick.evaluation and pick.evaluation.model_dump()}
             for pick in selection.picks.get(level, ())
@@ -277,7 +303,7 @@ def selection_json(selection: Selection) -> dict:
     }
 
 
-def plot_selection(curve: Sequence[tuple[int, float, Path]], selection: Selection, path: Path) -> None:
+def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> None:
     """The learning curve with the picks marked, a PNG."""
     import matplotlib
 

@@ -69,7 +69,6 @@ class Episodes:
 
     Args:
       rng: draws which episodes start standing.
-      step: () -> agent steps so far; makes the stream of each new episode another one.
     """
 
     def __init__(self, run: SacRun, rng: np.random.Generator):
@@ -100,12 +99,16 @@ class Episodes:
             self.elapsed[ended] = 0
         return state
 
-    def saved(self) -> dict[str, torch.Tensor]:
-        return {"physics": torch.from_numpy(self.batch.physics()), "elapsed": torch.from_numpy(self.elapsed.copy())}
+    def saved(self, state: np.ndarray) -> dict[str, torch.Tensor]:
+        """The episodes where they are; `state` too, as touch sensors do not follow from the physics."""
+        parts = {"physics": self.batch.physics(), "elapsed": self.elapsed, "state": state}
+        return {name: torch.from_numpy(part.copy()) for name, part in parts.items()}
 
     def restore(self, saved: dict[str, torch.Tensor]) -> np.ndarray:
+        """Put the episodes where they were; gives the state."""
         self.elapsed = saved["elapsed"].numpy().copy()
-        return self.batch.set_physics(saved["physics"].numpy())
+        self.batch.set_physics(saved["physics"].numpy())
+        return saved["state"].numpy().copy()
 
 
 class SacRun(Run):
@@ -147,7 +150,7 @@ class SacRun(Run):
                     "learner": learner.state(),
                     "buffer": {"position": buffer.position, "full": buffer.full, "size": buffer.size},
                     "rng": json.dumps(rng.bit_generator.state),
-                    "episodes": episodes.saved(),
+                    "episodes": episodes.saved(state),
                     "owed": owed,
                     "next_evaluation": next_evaluation,
                 }

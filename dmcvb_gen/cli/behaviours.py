@@ -109,7 +109,7 @@ def select_checkpoints(run, episodes, seed, deterministic, as_json):
 @click.option(
     "--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: all bundled]"
 )
-@click.option("--behaviour", metavar="FILE|RUN", help="A policy file or run instead of the bundled one.")
+@click.option("--behaviour", metavar="FILE|RUN", help="A policy file or a run's picks instead of the bundled ones.")
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @click.option("--deterministic", is_flag=True)
@@ -117,21 +117,27 @@ def select_checkpoints(run, episodes, seed, deterministic, as_json):
 def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, as_json):
     """Returns of behaviour policies over fresh episodes, beside the paper's.
 
-    Without TASK: every bundled policy.
+    Without TASK: every bundled policy, and random actions in its task; with --behaviour, that policy or run.
 
     \b
     dmcvb-gen evaluate-behaviour
     dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
     """
-    from dmcvb_gen.behaviours.bundled import bundled_levels, resolve_policies
+    from dmcvb_gen.behaviours.bundled import bundled_levels, levels_of, resolve_policies
+    from dmcvb_gen.behaviours.evaluation import maze_scores
     from dmcvb_gen.behaviours.paper import paper_returns
-    from dmcvb_gen.behaviours.policy_file import load_policy, random_policy
+    from dmcvb_gen.behaviours.policy_file import load_policy, random_policy, read_header
     from dmcvb_gen.behaviours.simulate import simulate
     from dmcvb_gen.rollout.info import return_statistics
     from dmcvb_gen.tasks import get_task, task_ids
 
+    if behaviour:
+        levels = levels or levels_of(behaviour)
+        named = [level for level in levels if level != "random"]
+        files = [path for level in named for path in resolve_policies("", level, behaviour)]
+        tasks = tasks or sorted({read_header(path).task for path in files})
     rows = []
-    for task_id in tasks or task_ids():
+    for task_id in tasks or [task_id for task_id in task_ids() if bundled_levels(task_id)]:
         task = get_task(task_id)
         for level in levels or [*bundled_levels(task_id), "random"]:
             if level == "random":
@@ -143,19 +149,23 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, 
             )
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
             row |= dict(mode="deterministic" if deterministic else "sampled", returns=return_statistics(out.returns))
-            if task.return_range[1] <= 0:
-                row["success"] = float(out.terminated.mean())
+            success, speed = maze_scores(task, out)
+            row |= {} if success is None else dict(success=success, speed=speed)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
     if as_json:
         return print_json(rows)
-    table = Table(title=f"{episodes} episodes each, seed {seed}")
+    mazes = any("success" in row for row in rows)
+    table = Table(title=f"{episodes} episodes each, seed {seed}, {rows[0]['mode']} actions")
     columns = ("mean", "std", "min", "p25", "median", "p75", "max")
-    for column in ("task", "level", *columns):
+    for column in ("task", "level", *columns, *(("success", "speed m/s") if mazes else ())):
         table.add_column(column, justify="left" if column in ("task", "level") else "right")
     for row in rows:
-        table.add_row(row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in columns))
+        extra = []
+        if "success" in row:
+            extra = [f"{row['success']:.0%}", "-" if row["speed"] is None else f"{row['speed']:.2f}"]
+        table.add_row(row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in columns), *extra)
         if row["paper"]:
             table.add_row("", "  DMC-VB paper", *(f"{row['paper'][key]:.1f}" for key in columns), style="dim")
     console = Console()
-    console.width = max(console.width, 110)
+    console.width = max(console.width, 130 if mazes else 110)
     console.print(table)
