@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import subprocess
-import sys
-import time
-
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.policy_file import PolicyHeader, load_policy
+from dmcvb_gen.behaviours.defaults import parse_settings, run_config
+from dmcvb_gen.behaviours.policy_file import PolicyHeader
+from dmcvb_gen.behaviours.runs import RunConfig, check_same
 from dmcvb_gen.behaviours.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
-from dmcvb_gen.behaviours.training import Run, RunConfig, open_run, standing_states
+from dmcvb_gen.behaviours.training import SacRun, open_run, standing_states
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 
+torch.set_num_threads(1)
 TINY = dict(warmup_steps=64, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4)
 TINY |= dict(train_episode_steps=20, bfloat16=False)
 
@@ -136,19 +134,6 @@ def test_the_buffer_keeps_the_latest():
     torch.testing.assert_close(sample["next_observation"], sample["observation"] + 1)
 
 
-def test_a_resumed_run_ends_where_an_uninterrupted_one_does_in_steps_and_files(tmp_path):
-    open_run(tmp_path / "whole", config(), False).train()
-    open_run(tmp_path / "parts", config(steps=80), False).train()
-    run = open_run(tmp_path / "parts", config(), True)
-    run.train()
-    assert run.step == 160
-    names = [sorted(path.name for path in (tmp_path / f / "checkpoints").iterdir()) for f in ("whole", "parts")]
-    assert names[0] == names[1] == ["0000000080.safetensors", "0000000160.safetensors"]
-    first, second = (load_policy(tmp_path / f / "checkpoints" / names[0][0]) for f in ("whole", "parts"))
-    for name, value in first.weights.items():  # the part before the interruption is the same to the bit
-        torch.testing.assert_close(value, second.weights[name], rtol=0, atol=0)
-
-
 def test_a_learner_continues_from_its_state_with_the_same_bits():
     first, batch = learner(), batch_of()
     for _ in range(5):
@@ -162,34 +147,6 @@ def test_a_learner_continues_from_its_state_with_the_same_bits():
     torch.set_rng_state(state["torch_rng"])
     second.update(batch)
     torch.testing.assert_close(first.critic.head, second.critic.head, rtol=0, atol=0)
-
-
-@pytest.mark.slow
-def test_a_killed_run_resumes(tmp_path):
-    settings = [
-        f"--set={name}={value}".replace("True", "true").replace("False", "false") for name, value in TINY.items()
-    ]
-    command = [sys.executable, "-m", "dmcvb_gen", "train-behaviour", "cheetah-run", "--out", str(tmp_path / "run")]
-    command += ["--steps", "4000", "--evaluate-every", "80", *settings]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.time() + 120
-    while len(list((tmp_path / "run").glob("checkpoints/*"))) < 3 and time.time() < deadline:
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
-    reached = len(list((tmp_path / "run").glob("checkpoints/*")))
-    assert reached >= 3
-    run = open_run(tmp_path / "run", Run_config(tmp_path / "run", steps=400), True)
-    run.train()
-    assert run.step == 400
-    with (tmp_path / "run" / "progress.csv").open() as file:
-        assert int(list(csv.DictReader(file))[-1]["step"]) == 400
-
-
-def Run_config(folder, **changes):
-    import json
-
-    return RunConfig(**json.loads((folder / "run.json").read_text()) | changes)
 
 
 def test_a_run_folder_is_not_mixed_up(tmp_path):
@@ -206,21 +163,6 @@ def test_a_run_folder_is_not_mixed_up(tmp_path):
         open_run(tmp_path / "other", config(), True)
 
 
-def test_a_failed_save_leaves_the_previous_one_whole(tmp_path, monkeypatch):
-    open_run(tmp_path / "run", config(steps=80), False).train()
-    state = (tmp_path / "run" / "resume" / "state.pt").read_bytes()
-
-    def full(value, path):
-        path.write_bytes(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(DmcvbError, match="previous checkpoint is whole"):
-        open_run(tmp_path / "run", config(), True).train()
-    assert (tmp_path / "run" / "resume" / "state.pt").read_bytes() == state
-    assert not list((tmp_path / "run" / "resume").glob("*.partial"))
-
-
 def test_standing_states_stand():
     task = get_task("humanoid-walk")
     batch = task.batch(3)
@@ -232,19 +174,50 @@ def test_standing_states_stand():
     "arguments, words",
     [
         (["walker-fly"], "walker-walk"),
-        (["walker-walk", "--algo", "dreamer"], "sac"),
+        (["walker-walk", "--algo", "dreamer"], "Known: ppo, sac, sb3-sac, td3, tqc."),
         (["walker-walk", "--set", "speed=3"], "learning_rate"),
+        (["walker-walk", "--algo", "ppo", "--set", "buffer_size=3"], "clip_range"),
         (["walker-walk", "--set", "speed"], "key=value"),
+        (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),
+        (["walker-walk", "--set", "actor_hidden=wide"], "the default is (256, 256)"),
+        (["walker-walk", "--algo", "td3", "--set", "batch_size=0"], "greater than 0"),
         (["walker-walk", "--steps", "0"], "x>=1"),
+        (["walker-walk", "--steps", "100"], "all warm-up (5000 steps)"),
         (["walker-walk", "--config", "/nowhere.yaml"], "nowhere"),
     ],
 )
 def test_bad_commands_say_what_is_wrong(tmp_path, arguments, words):
     result = CliRunner().invoke(main, ["train-behaviour", *arguments, "--out", str(tmp_path / "run")])
     assert result.exit_code == 2 and words in result.output and not (tmp_path / "run").exists()
+    assert len(result.output.strip().splitlines()) == 1 or "Usage" in result.output
+
+
+def test_settings_come_from_a_file_and_the_command_wins(tmp_path):
+    (tmp_path / "s.yaml").write_text("learning_rate: 1e-4\nbatch_size: 32\nactor_hidden: [8, 8]\n")
+    settings = parse_settings(("batch_size=64",), tmp_path / "s.yaml", "sac")
+    assert settings == {"learning_rate": 1e-4, "batch_size": 64, "actor_hidden": [8, 8]}
+    (tmp_path / "s.yaml").write_text("- 3\n")
+    with pytest.raises(DmcvbError, match="learning_rate: 0.0003"):
+        parse_settings((), tmp_path / "s.yaml", "sac")
+
+
+def test_a_resumed_run_keeps_what_is_not_given_and_refuses_what_differs():
+    found = config(seed=4, settings={"batch_size": 16})
+    assert run_config("cheetah-run", "sac", {}, found) == found
+    longer = run_config("cheetah-run", "sac", {"discount": 0.99}, found, steps=500, seed=None)
+    check_same("runs/x", found, longer)  # naming a default is no difference
+    assert longer.steps == 500
+    for changed in (
+        run_config("cheetah-run", "sac", {}, found, seed=5),
+        run_config("cheetah-run", "sac", {"discount": 0.9}, found),
+        run_config("walker-walk", "sac", {}, found),
+        run_config("cheetah-run", "td3", {}, found),
+    ):
+        with pytest.raises(DmcvbError, match="holds a run with"):
+            check_same("runs/x", found, changed)
 
 
 def test_the_class_and_the_config_name_the_same_run(tmp_path):
-    assert Run(tmp_path, config()).header.command.startswith(
+    assert SacRun(tmp_path, config()).header.command.startswith(
         "dmcvb-gen train-behaviour cheetah-run --algo sac --steps 160"
     )

@@ -1,0 +1,229 @@
+"""Runs that were stopped, killed or out of disk go on as if nothing had happened."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import fcntl
+import json
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from dmcvb_gen.behaviours import runs
+from dmcvb_gen.behaviours.policy_file import load_policy, read_header
+from dmcvb_gen.behaviours.run_log import COLUMNS, read_rows
+from dmcvb_gen.behaviours.runs import RunConfig
+from dmcvb_gen.behaviours.sac import ReplayBuffer
+from dmcvb_gen.behaviours.training import open_run
+from dmcvb_gen.errors import DmcvbError
+
+torch.set_num_threads(1)
+TINY = {
+    "sac": dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4),
+    "sb3-sac": dict(learning_starts=24, batch_size=16, hidden=[16], simulations=4, normalize_observation=True),
+    "tqc": dict(learning_starts=24, batch_size=16, hidden=[16], simulations=4, n_quantiles=5),
+    "td3": dict(learning_starts=24, batch_size=16, hidden=[16, 8], simulations=4),
+    "ppo": dict(n_steps=10, batch_size=20, hidden=[16], simulations=4, n_epochs=2),
+}
+TINY["sac"] |= dict(train_episode_steps=20, bfloat16=False)
+
+
+@pytest.fixture(autouse=True)
+def quick_evaluations(monkeypatch):
+    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
+
+
+def config(algorithm="sac", steps=160, every=40, **changes):
+    fields = dict(task="cheetah-run", algorithm=algorithm, steps=steps, seed=0, settings=TINY[algorithm])
+    return RunConfig(**fields | dict(evaluate_every=every, evaluate_sparse=every) | changes)
+
+
+def train(folder, resume=False, **changes):
+    run = open_run(folder, config(**changes), resume)
+    run.train()
+    return run
+
+
+def leaves(value, name=""):
+    """Every number, text and tensor of a nested state by its place."""
+    if isinstance(value, dict):
+        return {place: leaf for key, part in value.items() for place, leaf in leaves(part, f"{name}/{key}").items()}
+    if isinstance(value, list | tuple):
+        return leaves(dict(enumerate(value)), name)
+    return {name: value}
+
+
+def assert_same_run(first, second, buffer=True):
+    """All but the seconds is equal to the bit: learner, random states, simulations, policies, curve, replay."""
+    ours, theirs = leaves(first.saved()), leaves(second.saved())
+    assert ours.keys() == theirs.keys()
+    for name in ours.keys() - {"/seconds", "/buffer/size", "/buffer/rows"}:
+        if name.startswith("/buffer") and not buffer:
+            continue
+        if isinstance(ours[name], torch.Tensor):
+            torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=0, equal_nan=True)
+        else:
+            assert ours[name] == theirs[name], name
+    names = [sorted(path.name for path in (run.folder / "checkpoints").iterdir()) for run in (first, second)]
+    assert names[0] == names[1] and names[0]
+    for name in names[0]:
+        one, other = (load_policy(run.folder / "checkpoints" / name) for run in (first, second))
+        assert one.header.evaluation == other.header.evaluation
+        assert all(torch.equal(value, other.weights[key]) for key, value in one.weights.items())
+    curves = [[row | {"seconds": ""} for row in read_rows(run.folder)] for run in (first, second)]
+    assert curves[0] == curves[1]
+    for path in (first.folder / "resume").glob("*.f32"):
+        assert path.read_bytes() == (second.folder / "resume" / path.name).read_bytes()
+
+
+@pytest.mark.parametrize("algorithm", TINY)
+def test_a_stopped_and_resumed_run_is_an_uninterrupted_one_to_the_bit(tmp_path, algorithm):
+    whole = train(tmp_path / "whole", algorithm=algorithm)
+    train(tmp_path / "parts", algorithm=algorithm, steps=80)
+    np.random.seed(99), torch.manual_seed(99)  # nothing may come from what this process did before
+    assert_same_run(whole, train(tmp_path / "parts", True, algorithm=algorithm))
+
+
+def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):
+    """Touch sensors do not follow from the physics state alone."""
+    fields = dict(task="ant-maze-empty7x7", settings=TINY["sac"] | {"train_episode_steps": 100}, every=1000)
+    whole = train(tmp_path / "whole", **fields)
+    train(tmp_path / "parts", **fields, steps=80)
+    parts = train(tmp_path / "parts", True, **fields)
+    for name in ("observation", "next_observation", "reward"):
+        path = f"resume/{name}.f32"
+        assert (whole.folder / path).read_bytes() == (parts.folder / path).read_bytes()
+
+
+SCRIPT = """
+import json, sys, torch
+from dmcvb_gen.behaviours import runs, sb3, training
+torch.set_num_threads(1)
+runs.EVALUATION_EPISODES = 2
+sb3.SAVE_SECONDS = training.SAVE_SECONDS = 0  # save at each evaluation
+training.open_run(sys.argv[1], runs.RunConfig(**json.loads(sys.argv[2])), True).train()
+"""
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "td3"])
+def test_a_killed_run_resumes_to_the_same_bits(tmp_path, algorithm):
+    fields = json.dumps(vars(config(algorithm, steps=100_000)))
+    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", SCRIPT, str(tmp_path / "killed"), fields])
+    deadline = time.time() + 120
+    while len(list((tmp_path / "killed").glob("checkpoints/0*"))) < 3 and time.time() < deadline:
+        assert process.poll() is None, "the run ended by itself"
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    # What the kill may leave: a log line half written, files half written, a checkpoint newer than the saved state.
+    with (tmp_path / "killed" / "progress.csv").open("a") as file:
+        file.write("99")
+    (tmp_path / "killed" / "resume" / "state.partial").write_bytes(b"half")
+    (tmp_path / "killed" / "checkpoints" / ".0000000999.safetensors.partial").write_bytes(b"half")
+    run = open_run(tmp_path / "killed", config(algorithm, steps=100_000), True)
+    steps = (run.saved()["step"] // 40 + 2) * 40
+    killed = train(tmp_path / "killed", True, algorithm=algorithm, steps=steps)
+    whole = train(tmp_path / "whole", algorithm=algorithm, steps=steps)
+    for path in (whole.folder / "resume").glob("*.f32"):
+        with (killed.folder / "resume" / path.name).open("r+b") as file:
+            file.truncate(path.stat().st_size)
+    assert_same_run(whole, killed, buffer=False)  # place and size differ, as the killed run was meant to be longer
+
+
+@contextlib.contextmanager
+def largest_file(size):
+    """No file grows beyond `size` bytes, as on a full disk: the write fails with an OSError."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
+def test_a_disk_that_fills_up_while_saving_leaves_the_previous_state(tmp_path, algorithm):
+    run = train(tmp_path / "run", algorithm=algorithm, steps=80)
+    path = tmp_path / "run" / "resume" / "state.pt"
+    before = path.read_bytes()
+    checkpoints = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    with largest_file(len(before) - 1000), pytest.raises(DmcvbError, match="previous saved state is whole.*--resume"):
+        train(tmp_path / "run", True, algorithm=algorithm)
+    assert path.read_bytes() == before and not list((tmp_path / "run").rglob("*.partial"))
+    assert set(checkpoints) <= set((tmp_path / "run" / "checkpoints").iterdir())
+    whole = train(tmp_path / "whole", algorithm=algorithm)
+    assert_same_run(whole, train(tmp_path / "run", True, algorithm=algorithm))
+    assert run.step == 80
+
+
+def test_a_disk_that_fills_up_while_a_checkpoint_is_written_leaves_no_half_of_it(tmp_path):
+    train(tmp_path / "run", steps=80)
+    with largest_file(2000), pytest.raises(DmcvbError, match="previous saved state is whole"):
+        train(tmp_path / "run", True)
+    assert [read_header(path).agent_step for path in sorted((tmp_path / "run" / "checkpoints").iterdir())] == [40, 80]
+
+
+def test_no_room_for_the_replay_buffer_is_said_before_anything_is_trained(tmp_path):
+    with largest_file(1_000_000), pytest.raises(DmcvbError, match="cannot write the run"):
+        train(tmp_path / "run", steps=1_000_000)
+    assert not list((tmp_path / "run" / "checkpoints").iterdir())
+
+
+def test_a_run_that_is_made_longer_keeps_its_replay_buffer(tmp_path):
+    def fill(buffer, values):
+        for value in values:
+            row = np.full((1, 2), value, np.float32)
+            buffer.add(observation=row, next_observation=row, action=row[:, :1], reward=row[:, 0], terminated=[0])
+
+    short = ReplayBuffer(6, 2, 1, tmp_path)
+    fill(short, range(1, 9))
+    assert short.full and sorted(short.arrays["reward"]) == [3, 4, 5, 6, 7, 8]
+    short.flush()
+    longer = ReplayBuffer(10, 2, 1, tmp_path)
+    longer.restore(short.position, short.full, short.size)
+    assert len(longer) == 6
+    fill(longer, [9, 10])
+    assert len(longer) == 8 and set(longer.arrays["reward"][:8]) == set(range(3, 11))
+    assert len(ReplayBuffer(4, 2, 1, tmp_path).arrays["reward"]) == 10  # never shorter: nothing is thrown away
+
+
+def test_two_processes_do_not_train_in_one_folder(tmp_path):
+    run = open_run(tmp_path / "run", config(), False)
+    (tmp_path / "run" / "resume").mkdir()
+    with (tmp_path / "run" / "resume" / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(DmcvbError, match="another process"):
+            run.train()
+
+
+def test_a_saved_state_that_holds_code_or_rubbish_is_refused(tmp_path):
+    run = open_run(tmp_path / "run", config(), False)
+    (tmp_path / "run" / "resume").mkdir()
+    path = tmp_path / "run" / "resume" / "state.pt"
+    for content in (print, "rubbish"):
+        torch.save(content, path) if callable(content) else path.write_text(content)
+        with pytest.raises(DmcvbError, match="cannot be read"):
+            run.train()
+
+
+def test_csv_and_tensorboard_tell_the_same(tmp_path):
+    run = train(tmp_path / "run", steps=80)
+    rows = read_rows(run.folder)
+    assert [row["step"] for row in rows] == ["40", "80"] and tuple(rows[0]) == COLUMNS
+    with (run.folder / "progress.csv").open() as file:
+        assert list(csv.DictReader(file)) == rows
+    events = EventAccumulator(str(run.folder / "tensorboard"))
+    events.Reload()
+    assert {"training/critic_loss", "training/entropy", "evaluation/return_std"} <= set(events.Tags()["scalars"])
+    for row, event in zip(rows, events.Scalars("evaluation/return_mean"), strict=True):
+        assert event.step == int(row["step"]) and event.value == pytest.approx(float(row["return_mean"]), rel=1e-5)
+        policy = read_header(run.folder / "checkpoints" / f"{event.step:010d}.safetensors")
+        assert policy.evaluation.mean == pytest.approx(event.value, rel=1e-5)
