@@ -99,7 +99,8 @@ class Layout:
         """Raises LayoutError where a start or a goal is not on the floor."""
         if tuple(cell) not in self.free:
             raise LayoutError(
-                f"{what} {tuple(cell)} is no floor cell of layout {self.name!r}; floor: {', '.join(map(str, self.free))}"
+                f"{what} {tuple(cell)} is no floor cell of layout {self.name!r}; "
+                f"floor: {', '.join(map(str, self.free))}"
             )
 
 
@@ -120,7 +121,9 @@ def make_layout(name: str, text: str) -> Layout:
     for number, row in enumerate(rows):
         wrong = set(row) - set("* .")
         if wrong:
-            raise LayoutError(f"layout {name!r}, row {number}: {sorted(wrong)[0]!r}; rows hold '*' (wall) and ' ' (floor)")
+            raise LayoutError(
+                f"layout {name!r}, row {number}: {sorted(wrong)[0]!r}; rows hold '*' (wall) and ' ' (floor)"
+            )
         if len(row) != width:
             raise LayoutError(f"layout {name!r}, row {number} has {len(row)} cells, others have {width}")
     if len(rows) < 3 or width < 3 or max(len(rows), width) > MAX_CELLS:
@@ -130,7 +133,9 @@ def make_layout(name: str, text: str) -> Layout:
     edge[1:-1, 1:-1] = False
     if (edge & ~layout.walls).any():
         row, column = np.argwhere(edge & ~layout.walls)[0]
-        raise LayoutError(f"layout {name!r} has a hole in its outer wall at row {row}, column {column}; close it with '*'")
+        raise LayoutError(
+            f"layout {name!r} has a hole in its outer wall at row {row}, column {column}; close it with '*'"
+        )
     labels, parts = ndimage.label(~layout.walls)
     if parts == 0 or len(layout.free) < 2:
         raise LayoutError(f"layout {name!r} needs two floor cells at least, a start and a goal")
