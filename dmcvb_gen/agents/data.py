@@ -40,10 +40,18 @@ READ_EPISODES = 10
 
 @dataclass(frozen=True)
 class Source:
-    """A part of a subset: `share` of its episodes, drawn once by `seed`."""
+    """A part of a subset.
+
+    Attributes:
+      share: of its episodes, drawn by the seed of the split.
+      episodes: so many of its episodes instead.
+      goal_pair: only episodes of this fixed (start, goal) pair (mazes).
+    """
 
     subset: Subset
     share: float = 1.0
+    episodes: int | None = None
+    goal_pair: int | None = None
 
 
 @dataclass(frozen=True)
@@ -279,8 +287,15 @@ class TrainingData(Dataset):
 
     def states_only(self) -> TrainingData:
         """The same episodes for an agent that sees states: shares everything but the pictures."""
+        return self._with(frames=None)
+
+    def with_stack(self, stack: int) -> TrainingData:
+        """The same episodes seen in stacks of another number of frames."""
+        return self._with(stack=stack)
+
+    def _with(self, **changes) -> TrainingData:
         twin = object.__new__(TrainingData)
-        twin.__dict__.update(self.__dict__ | {"frames": None})
+        twin.__dict__.update(self.__dict__ | changes)
         return twin
 
 
@@ -303,9 +318,12 @@ def batches(
 def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """(episodes, held out) of a source: its share, and which of those no agent learns from (5 %, none of one)."""
     names = source.subset.episodes
-    generator = np.random.default_rng(seed)
-    order = generator.permutation(len(names))
-    count = max(1, round(source.share * len(names)))
+    if source.goal_pair is not None:
+        names = names[source.subset.read("goal_pair") == source.goal_pair]
+        if not len(names):
+            raise DmcvbError(f"{source.subset.name} has no episodes of goal pair {source.goal_pair}")
+    order = np.random.default_rng(seed).permutation(len(names))
+    count = min(source.episodes or max(1, round(source.share * len(names))), len(names))
     out = min(math.ceil(HOLD_OUT * count), count - 1)
     chosen = order[:count]
     held = np.zeros(count, bool)
@@ -389,11 +407,4 @@ def load_data(
     )
 
 
-def with_stack(data: TrainingData, stack: int) -> TrainingData:
-    """The same data seen in stacks of another number of frames."""
-    twin = object.__new__(TrainingData)
-    twin.__dict__.update(data.__dict__ | {"stack": stack})
-    return twin
-
-
-__all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data", "with_stack"]
+__all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data"]

@@ -1,0 +1,184 @@
+"""Online evaluation: a policy and the subset it learned from in, scores of fresh episodes out, all in one batch.
+
+The episodes are those of the subset's task, painted by its renderer at its size, with its kind of distractors: unseen
+`val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from dmcvb_gen.agents.data import Normalization, normalize_pixels, training_views
+from dmcvb_gen.agents.learners import Policy
+from dmcvb_gen.distractors import ExogenousWalk
+from dmcvb_gen.rollout.plan import renderer_for
+from dmcvb_gen.rollout.recipe import distractor_of
+from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.store import Subset
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+
+STREAM_NAME = "validate"
+"""Of the evaluation's streams: no release is made from it."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Returns of online episodes.
+
+    Attributes:
+      mean, stderr: of the returns; the standard error is std / sqrt(episodes), std with n - 1.
+      returns: of each episode.
+      success: share of the episodes that the task ended (mazes), else None.
+      speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None.
+      seconds: that it took.
+      pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
+    """
+
+    mean: float
+    stderr: float
+    returns: tuple[float, ...]
+    success: float | None = None
+    speed: float | None = None
+    seconds: float = 0.0
+    pictures: np.ndarray | None = field(default=None, repr=False)
+
+    def facts(self) -> dict[str, Any]:
+        """Everything but the pictures, as plain values."""
+        names = ("mean", "stderr", "returns", "success", "speed", "seconds")
+        return {name: getattr(self, name) for name in names}
+
+
+class Evaluator:
+    """Evaluates policies on one subset's task; a renderer is started once and kept.
+
+    Args:
+      subset: what the policy learned from; its setting, size and renderer are evaluated on.
+      pixels: the policies see pictures; else states.
+      normalization: of the states, for policies that see them.
+      stack: frames an observation.
+      episodes: run side by side, each once.
+      seed: of the evaluation's streams.
+      pair: the fixed (start, goal) cells of a maze's episodes, instead of random ones.
+      max_steps: cut episodes short (for tests and smoke runs).
+      backgrounds: where the `val` videos are, if not where the manifest says.
+      device: of policy and renderer.
+
+    Raises:
+      DmcvbError: the renderer cannot start here, or there are no `val` videos.
+    """
+
+    def __init__(
+        self,
+        subset: Subset,
+        *,
+        pixels: bool = True,
+        normalization: Normalization | None = None,
+        stack: int = 3,
+        episodes: int = 30,
+        seed: int = 1,
+        pair: tuple | None = None,
+        max_steps: int | None = None,
+        backgrounds: str | None = None,
+        device: str = "cpu",
+        threads: int = 1,
+        shots: int = 8,
+    ):
+        self.subset, self.task = subset, get_task(subset.task)
+        self.setting = distractor_of(subset.task, subset.setting)
+        self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
+        self.steps = min(max_steps or self.task.max_steps, self.task.max_steps)
+        self.device, self.normalization, self.stack = torch.device(device), normalization, stack
+        self.pair, self.renderer = pair, None
+        if pixels:
+            recorded = subset.record.backgrounds
+            source = backgrounds or (recorded["source"] if recorded else "builtin")
+            on = "cuda" if self.device.type == "cuda" and subset.record.renderer["name"] == "warp" else "cpu"
+            self.renderer, self._videos = renderer_for(subset.record, source, "val", on)
+            if hasattr(self.renderer, "worlds"):
+                self.renderer.worlds = episodes  # frames a launch: more would only be padding
+            arrays = training_views(subset)
+            self.hide_goal = arrays[0].startswith("pixels_hidden_goal")
+            self.views = [name.split("/")[1] for name in arrays] if "/" in arrays[0] else list(self.task.views)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self.renderer is not None:
+            self.renderer.close()
+
+    def streams(self, name: str) -> list[np.random.Generator]:
+        """The evaluation's own streams; the same for every policy, so that scores are compared on like episodes."""
+        names = (STREAM_NAME, self.subset.task, self.subset.setting)
+        return [episode_stream(self.seed, names, episode, name) for episode in range(self.episodes)]
+
+    def __call__(self, policy: Policy) -> Score:
+        """Roll the policy out. It is asked for one action a step, for all episodes at once."""
+        started = time.perf_counter()
+        task, count = self.task, self.episodes
+        batch = task.batch(count, self.threads)
+        starts = self.streams("initial_state")
+        state = batch.reset(starts) if self.pair is None else batch.reset_fixed(starts, [self.pair] * count)
+        distance = _distance(task, state)
+        walk = None
+        if self.renderer is not None:
+            generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
+            walk = ExogenousWalk(task, self.setting, self.steps + 1, generators, self._videos, split="val")
+        returns, length = np.zeros(count), np.full(count, self.steps)
+        active, ended = np.ones(count, bool), np.zeros(count, bool)
+        stack: np.ndarray | None = None
+        pictures = []
+        for step in range(self.steps):
+            if walk is None:
+                observation = self.normalization(torch.from_numpy(state).float()).to(self.device)
+            else:
+                stack = self._see(stack, batch.physics(), walk, step, active)
+                if step % max(1, self.steps // self.shots) == 0:
+                    pictures.append(stack[0, -1, :3].transpose(1, 2, 0).copy())
+                observation = normalize_pixels(torch.from_numpy(stack).to(self.device).flatten(1, 2))
+            with torch.no_grad(), policy.precision():
+                action = policy.act(observation).float().clamp(-1, 1).cpu().numpy()
+            result = batch.step(action, active)
+            state = result.state
+            returns += result.reward  # episodes that are over earn nothing
+            length[result.terminated & active] = step + 1
+            ended |= result.terminated
+            active &= ~result.terminated
+            if not active.any():
+                break
+        success = speed = None
+        if distance is not None:
+            success = float(ended.mean())
+            seconds = length * ACTION_REPEAT * task.control_timestep
+            speed = float((distance / seconds)[ended].mean()) if ended.any() else None
+        return Score(
+            mean=float(returns.mean()),
+            stderr=float(returns.std(ddof=1) / math.sqrt(count)) if count > 1 else 0.0,
+            returns=tuple(float(value) for value in returns),
+            success=success,
+            speed=speed,
+            seconds=time.perf_counter() - started,
+            pictures=np.stack(pictures) if pictures else None,
+        )
+
+    def _see(self, stack, physics, walk: ExogenousWalk, step: int, active: np.ndarray) -> np.ndarray:
+        """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
+        rows = np.flatnonzero(active)
+        labels = walk.frame(step, physics)[rows]
+        painted = self.renderer.render(physics[rows], labels, self.views, hide_goal=self.hide_goal)
+        frames = painted.transpose(0, 1, 4, 2, 3).reshape(len(rows), -1, *painted.shape[2:4])
+        if stack is None:
+            return np.repeat(frames[:, None], self.stack, axis=1)
+        stack[:, :-1] = stack[:, 1:].copy()
+        stack[rows, -1] = frames
+        return stack
+
+
+def _distance(task, state: np.ndarray) -> np.ndarray | None:
+    """(episode,) meters to the goal, for tasks that have one."""
+    part = task.state_slices.get("distance_to_target")
+    return None if part is None else state[:, part][:, 0]

@@ -1,0 +1,247 @@
+"""The benchmarks as tables: a release's subsets in, cells (agent, pre-training set, policy set) out.
+
+b1         every agent on every level and distractor                           (paper, section 5.1)
+b2         encoders from mixed data, policies from 20 expert episodes          (section 5.2)
+b3         encoders from hidden random goals, policies from ten episodes of one fixed goal (section 5.3)
+ablations  frames of a stack, k of inverse dynamics, share of the data         (appendix)
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from dmcvb_gen.agents.catalog import Agent, parse_agent
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.rollout.recipe import is_maze
+from dmcvb_gen.store import Release
+
+BENCHMARKS = ("b1", "b2", "b3", "ablations")
+POLICY_SETS = (("expert",), ("medium",), ("expert", "medium"), ("mixed",), ("random",))
+"""Levels of the data that a policy learns from, B1; mazes have the first two."""
+SETTINGS = ("none", "static", "dynamic")
+B1_AGENTS = ("state-bc", "bc", "td3-bc", "id+bc", "lfd+bc", "ae+bc", "state+bc")
+"""The paper's columns; DINO's needs weights, so it is asked for by name."""
+FEW_EPISODES = 20
+"""B2: 1 % of the paper's expert subset of 2,000 episodes."""
+B2_AGENTS = ("id+bc", "bc+bc", "lfd+bc", "ae+bc")
+B3_AGENTS = ("bc+bc", "id+bc")
+ABLATION_AGENTS = ("bc:frames=1", "bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10,sample")
+SHARES = (0.01, 0.05, 0.1, 0.25, 0.5)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a subset by name, as `agents.data.Source`."""
+
+    subset: str
+    share: float = 1.0
+    episodes: int | None = None
+    goal_pair: int | None = None
+
+    @property
+    def label(self) -> str:
+        level = self.subset.split("/")[-2]
+        if self.goal_pair is not None:
+            return f"{level} goal {self.goal_pair}"
+        if self.episodes is not None:
+            return f"{self.episodes} {level}"
+        return level if self.share == 1 else f"{100 * self.share:g}% {level}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of a benchmark: an agent, what its encoder and what its policy learns from.
+
+    Attributes:
+      policy: parts that the policy learns from; it is evaluated in the task and setting of the first.
+      pretrain: parts that the encoder learns from; the policy's, where empty.
+    """
+
+    benchmark: str
+    task: str
+    setting: str
+    agent: Agent
+    policy: tuple[Part, ...]
+    pretrain: tuple[Part, ...] = ()
+
+    @property
+    def policy_label(self) -> str:
+        return "+".join(part.label for part in self.policy)
+
+    @property
+    def pretrain_parts(self) -> tuple[Part, ...]:
+        return (self.pretrain or self.policy) if self.agent.pretrain else ()
+
+    @property
+    def subsets(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(part.subset for part in (*self.pretrain_parts, *self.policy)))
+
+    @property
+    def id(self) -> str:
+        """A file name, different for every cell of a release."""
+        parts = [self.benchmark, self.task, self.setting, self.agent.name, self.policy_label]
+        parts += ["from " + "+".join(part.label for part in self.pretrain)] if self.pretrain else []
+        return "_".join(slug(part) for part in parts)
+
+    def facts(self) -> dict[str, Any]:
+        """Everything that decides the cell, as plain values."""
+        return asdict(self) | {"agent": asdict(self.agent), "agent_name": self.agent.name}
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Subsets that a part of a benchmark needs, and how to make them."""
+
+    benchmark: str
+    task: str
+    subsets: tuple[str, ...]
+    command: str
+
+
+def slug(text: str) -> str:
+    """A piece of a file name."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "-", text.replace("%", "pc")).strip("-")
+
+
+def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> tuple[list[Cell], list[Missing]]:
+    """The cells that a release has the data for, and what is missing for the others.
+
+    Args:
+      name: one of `BENCHMARKS`.
+      agents: names instead of the benchmark's own.
+
+    Raises:
+      UnknownNameError: no such benchmark or agent.
+    """
+    makers = {"b1": _b1, "b2": _b2, "b3": _b3, "ablations": _ablations}
+    if name not in makers:
+        raise UnknownNameError("benchmark", name, BENCHMARKS)
+    shelf = _Shelf(release)
+    chosen = [parse_agent(agent) for agent in agents]
+    cells = list(makers[name](shelf, chosen))
+    return list(dict.fromkeys(cells)), shelf.missing(name)
+
+
+class _Shelf:
+    """The subsets of a release by (task, level, setting); remembers what was asked for in vain."""
+
+    def __init__(self, release: Release):
+        self._names = {(s.task, s.level, s.setting): name for name, s in release.subsets.items()}
+        self._records = {name: subset.record for name, subset in release.subsets.items()}
+        self.tasks = tuple(dict.fromkeys(subset.task for subset in release.subsets.values()))
+        self._asked: dict[str, list[tuple[str, str]]] = {}
+
+    def settings(self, task: str) -> list[str]:
+        """Settings of a task: those there are, in the paper's order, other difficulties last."""
+        have = dict.fromkeys(setting for t, _, setting in self._names if t == task)
+        return sorted(have, key=lambda s: (SETTINGS.index(s) if s in SETTINGS else 9, s))
+
+    def find(self, task: str, levels: Iterable[str], setting: str) -> tuple[str, ...] | None:
+        """Names of the subsets, or None where one is missing (which is then noted)."""
+        lacking = [(level, setting) for level in levels if (task, level, setting) not in self._names]
+        if lacking:
+            self._asked.setdefault(task, []).extend(lacking)
+            return None
+        return tuple(self._names[task, level, setting] for level in levels)
+
+    def parts(self, task: str, levels: Iterable[str], setting: str, **share: Any) -> tuple[Part, ...] | None:
+        names = self.find(task, levels, setting)
+        return names and tuple(Part(name, **share) for name in names)
+
+    def episodes(self, name: str) -> int:
+        return self._records[name].episodes
+
+    def missing(self, benchmark: str) -> list[Missing]:
+        found = []
+        for task, lacking in self._asked.items():
+            lacking = list(dict.fromkeys(lacking))
+            have = [(level, setting) for t, level, setting in self._names if t == task]
+            levels = dict.fromkeys(level for level, _ in have + lacking)
+            settings = dict.fromkeys(setting for _, setting in have + lacking)
+            count = max(
+                (self._records[self._names[task, level, setting]].episodes for level, setting in have), default=100
+            )
+            command = f"dmcvb-gen rollout {task} " + " ".join(f"--level {level}" for level in levels)
+            if is_maze(task):
+                goals = [setting for setting in settings if setting != "fixed"]
+                lines = [f"{command} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}"] if goals else []
+                lines += [f"{command} --fixed-goals 5"] if "fixed" in settings else []
+                command = "; ".join(f"{line} --out releases/{slug(benchmark)}-{i}" for i, line in enumerate(lines))
+            else:
+                command += "".join(f" --distractor {s}" for s in settings)
+                command += f" --episodes {count} --out releases/{slug(benchmark)}"
+            names = tuple(f"{task}/{level}/{setting}" for level, setting in lacking)
+            found.append(Missing(benchmark, task, names, command))
+        return found
+
+
+def _b1(shelf: _Shelf, agents: list[Agent]):
+    agents = agents or [parse_agent(name) for name in B1_AGENTS]
+    for task in shelf.tasks:
+        maze = is_maze(task)
+        settings = ["visible"] if maze else list(dict.fromkeys([*SETTINGS, *shelf.settings(task)]))
+        for levels in POLICY_SETS[:2] if maze else POLICY_SETS:
+            state_done = False
+            for setting in settings:
+                parts = shelf.parts(task, levels, setting)
+                if not parts:
+                    continue
+                for agent in agents:
+                    if agent.sees_state and state_done:
+                        continue  # states know of no distractors: one cell serves all
+                    yield Cell("b1", task, setting, agent, parts)
+                state_done = True
+
+
+def _b2(shelf: _Shelf, agents: list[Agent]):
+    encoders = [agent for agent in agents if agent.pretrain] or [parse_agent(name) for name in B2_AGENTS]
+    bc, reference = parse_agent("bc"), parse_agent("bc")
+    for task in [task for task in shelf.tasks if not is_maze(task)]:
+        full = shelf.parts(task, ["expert"], "none")
+        if full:
+            yield Cell("b2", task, "none", reference, full)  # scores are shares of this one
+        for setting in shelf.settings(task):
+            few = shelf.parts(task, ["expert"], setting, episodes=FEW_EPISODES)
+            mixed = shelf.parts(task, ["mixed"], setting)
+            if not few:
+                continue
+            yield Cell("b2", task, setting, bc, few)
+            if mixed:
+                yield Cell("b2", task, setting, bc, few + mixed)
+                for agent in encoders:
+                    yield Cell("b2", task, setting, agent, few, mixed)
+
+
+def _b3(shelf: _Shelf, agents: list[Agent]):
+    encoders = [agent for agent in agents if agent.pretrain] or [parse_agent(name) for name in B3_AGENTS]
+    mazes = [task for task in shelf.tasks if is_maze(task)]
+    if not mazes:
+        shelf.find("ant-maze-empty7x7", ["expert"], "hidden")
+        shelf.find("ant-maze-empty7x7", ["expert"], "fixed")
+    for task in mazes:
+        fixed, hidden = shelf.find(task, ["expert"], "fixed"), shelf.parts(task, ["expert"], "hidden")
+        if not fixed:
+            continue
+        for pair in range(max(1, shelf.episodes(fixed[0]) // 10)):
+            ten = (Part(fixed[0], goal_pair=pair),)
+            yield Cell("b3", task, "fixed", parse_agent("bc"), ten)
+            for agent in encoders if hidden else ():
+                yield Cell("b3", task, "fixed", agent, ten, hidden)
+
+
+def _ablations(shelf: _Shelf, agents: list[Agent]):
+    agents = agents or [parse_agent(name) for name in ABLATION_AGENTS]
+    for task in shelf.tasks:
+        for setting in ["visible"] if is_maze(task) else shelf.settings(task):
+            parts = shelf.parts(task, ["expert"], setting)
+            if not parts:
+                continue
+            for agent in agents:
+                yield Cell("ablations", task, setting, agent, parts)
+            pictures = [agent for agent in agents if agent.name == "bc"]
+            for share, agent in itertools.product(SHARES, pictures):
+                yield Cell("ablations", task, setting, agent, (Part(parts[0].subset, share=share),))
