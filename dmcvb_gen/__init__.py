@@ -1,3 +1,30 @@
 """dmcvb-gen: the open generator behind a DMC-VB style benchmark."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dmcvb_gen.readers.register import register
+
+if TYPE_CHECKING:
+    from dmcvb_gen.readers.release import ReleaseReader
+
 __version__ = "0.1.0"
+
+
+def open(path: str, storage_options: dict | None = None) -> ReleaseReader:
+    """Open a release for reading: `dmcvb_gen.open("releases/demo")["walker-walk/expert/dynamic"]`.
+
+    Args:
+      path: its folder, or any fsspec URL ("s3://bucket/name"), which is read in place.
+      storage_options: passed to fsspec for a URL.
+
+    Raises:
+      StoreError: there is no release, it cannot be read, or the URL needs a package that is not installed.
+    """
+    from dmcvb_gen.readers.release import open_for_reading
+
+    return open_for_reading(path, storage_options)
+
+
+register()  # so that gymnasium.make knows our names wherever this package is imported

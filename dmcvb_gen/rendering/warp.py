@@ -54,6 +54,8 @@ class WarpRenderer(Renderer):
     """See the module and `Renderer`."""
 
     name = "warp"
+    worlds = WORLDS
+    """Frames a launch; may be lowered before the first picture, where few frames are painted at a time."""
 
     def __init__(
         self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
@@ -101,7 +103,7 @@ class WarpRenderer(Renderer):
         mjw, wp, mjm = _mjw(), _warp(), self.task.model
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(mjm)
-            self._data = mjw.make_data(mjm, nworld=WORLDS)
+            self._data = mjw.make_data(mjm, nworld=self.worlds)
             self._textures = [self._texture(i) for i in range(mjm.ntex)]
         self._floor_materials = np.unique(mjm.geom_matid[mjm.geom_type == 0])
         self._floor_materials = self._floor_materials[self._floor_materials >= 0]
@@ -135,7 +137,7 @@ class WarpRenderer(Renderer):
             with _warp().ScopedDevice(self._device):
                 context = mjw.create_render_context(
                     self.task.model,
-                    nworld=WORLDS,
+                    nworld=self.worlds,
                     cam_res=(self.size, self.size * self.samples),  # a block of rows a sample
                     cam_active=[camera],
                     render_rgb=True,
@@ -172,8 +174,8 @@ class WarpRenderer(Renderer):
     ) -> np.ndarray:
         indices = check_frames(self.task, physics, exogenous, views)
         out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
-        for first in range(0, len(physics), WORLDS):
-            part = slice(first, min(first + WORLDS, len(physics)))
+        for first in range(0, len(physics), self.worlds):
+            part = slice(first, min(first + self.worlds, len(physics)))
             for column, view in enumerate(indices):
                 out[part, column] = self._launch(physics[part], exogenous[part], view, hide_goal)[0]
         return out
@@ -185,8 +187,8 @@ class WarpRenderer(Renderer):
         indices = check_frames(self.task, physics, exogenous, views)
         shape = (len(physics), len(indices), self.size, self.size)
         depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
-        for first in range(0, len(physics), WORLDS):
-            part = slice(first, min(first + WORLDS, len(physics)))
+        for first in range(0, len(physics), self.worlds):
+            part = slice(first, min(first + self.worlds, len(physics)))
             for column, view in enumerate(indices):
                 _, depth[part, column], segmentation[part, column] = self._launch(
                     physics[part], exogenous[part], view, False, labels=True
@@ -194,11 +196,11 @@ class WarpRenderer(Renderer):
         return {"depth": depth, "segmentation": segmentation}
 
     def _launch(self, physics, exogenous, view, hide_goal, labels=False):
-        """Up to WORLDS frames of one view: pictures, and depth and segmentation if asked for."""
+        """Up to `worlds` frames of one view: pictures, and depth and segmentation if asked for."""
         mjw, wp, mjm, count = _mjw(), _warp(), self.task.model, len(physics)
         camera = camera_ids(self.task)[view]
         context, data = self._context(camera, labels), self._data
-        rows = np.minimum(np.arange(WORLDS), count - 1)  # unused worlds repeat the last frame
+        rows = np.minimum(np.arange(self.worlds), count - 1)  # unused worlds repeat the last frame
         exogenous = exogenous[rows]
         pose = self._kinematics(physics)
 
@@ -208,18 +210,18 @@ class WarpRenderer(Renderer):
                 target.assign(np.ascontiguousarray(value, np.float32))
 
             put(data.geom_xpos, pose["geom_xpos"][rows])
-            put(data.geom_xmat, pose["geom_xmat"][rows].reshape(WORLDS, -1, 3, 3))
+            put(data.geom_xmat, pose["geom_xmat"][rows].reshape(self.worlds, -1, 3, 3))
             if mjm.nlight:
                 put(data.light_xpos, pose["light_xpos"][rows])
                 put(data.light_xdir, pose["light_xdir"][rows])
-            cam_xpos = np.zeros((WORLDS, mjm.ncam, 3))
-            cam_xmat = np.zeros((WORLDS, mjm.ncam, 3, 3))
+            cam_xpos = np.zeros((self.worlds, mjm.ncam, 3))
+            cam_xmat = np.zeros((self.worlds, mjm.ncam, 3, 3))
             cam_xpos[:, camera] = exogenous.camera_position[:, view]
             cam_xmat[:, camera] = matrices(exogenous.camera_quaternion[:, view].astype(np.float64))
             put(data.cam_xpos, cam_xpos)
             put(data.cam_xmat, cam_xmat)
 
-            rgba = np.empty((WORLDS, mjm.nmat, 4), np.float32)
+            rgba = np.empty((self.worlds, mjm.nmat, 4), np.float32)
             rgba[..., :3] = exogenous.material_rgb
             rgba[..., 3] = np.where(mjm.mat_rgba[:, 3] > 0, 1.0, 0.0)
             self._model.mat_rgba = wp.array(rgba, dtype=wp.vec4)
@@ -284,7 +286,7 @@ class WarpRenderer(Renderer):
         wp, mjm = _warp(), self.task.model
         skies = np.flatnonzero(mjm.tex_type == 2)
         own = int(skies[0]) if len(skies) else -1
-        textures, index = list(self._textures), np.full(WORLDS, own)
+        textures, index = list(self._textures), np.full(self.worlds, own)
         keys = {}
         for world, key in enumerate(zip(exogenous.background_video, exogenous.background_frame, strict=True)):
             if key[0] < 0:

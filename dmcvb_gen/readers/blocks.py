@@ -1,0 +1,148 @@
+"""Steps for training: a few whole episodes are read at a time and their steps mixed; batches of numpy arrays out.
+
+Reading whole episodes costs a tenth of reading single frame stacks from the store, so a stream draws episodes in a
+shuffled order, holds `buffer` of them in memory, and mixes their steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.store import Subset
+
+
+def stack_channels(frames: np.ndarray) -> np.ndarray:
+    """(..., stack, view, height, width, 3) -> (..., stack * view * 3, height, width), oldest frame first."""
+    moved = np.moveaxis(frames, -1, -3)
+    return moved.reshape(*moved.shape[:-5], -1, *moved.shape[-2:])
+
+
+class Block:
+    """Episodes in memory, their rows one after the other.
+
+    Args:
+      pictures: names of picture arrays; none: states alone.
+      stack: frames a stack; the first frame of an episode is repeated before it (paper, section 4).
+      next_step: give what comes next, too.
+    """
+
+    def __init__(
+        self, subset: Subset, episodes: Sequence[int], pictures: Sequence[str], stack: int = 3, next_step: bool = False
+    ):
+        names = ["state", "action", "reward", "discount", "length"]
+        loaded = [subset.episode(int(episode), [*names, *pictures]) for episode in episodes]
+        lengths = np.array([int(values["length"]) for values in loaded])
+        starts = np.cumsum(lengths + 1) - (lengths + 1)
+        self.stack, self.next_step = stack, next_step
+        self.episode = np.repeat(np.asarray(episodes, int), lengths)
+        self.step = np.concatenate([np.arange(length) for length in lengths])
+        self._start = np.repeat(starts, lengths)
+        self._state = np.concatenate([values["state"] for values in loaded])
+        self._flat = {n: np.concatenate([values[n] for values in loaded]) for n in ("action", "reward", "discount")}
+        self._frames = None
+        if pictures:
+            self._frames = np.concatenate(
+                [np.stack([values[name] for name in pictures], axis=1) for values in loaded]
+            )  # (row, view, height, width, 3)
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    def gather(self, steps: np.ndarray) -> dict[str, np.ndarray]:
+        """Steps by their place in the block.
+
+        Returns:
+          "pixels" (step, stack * view * 3, height, width) uint8, "state" (step, state) float32, "action" (step,
+          action) float32, "reward" and "discount" (step,) float32, "episode" and "step" (step,) int64; with
+          `next_step` also "next_pixels" and "next_state".
+        """
+        rows = self._start[steps] + self.step[steps]
+        values = self._observe(rows, self._start[steps], "")
+        values |= {name: array[steps] for name, array in self._flat.items()}
+        values |= {"episode": self.episode[steps], "step": self.step[steps]}
+        if self.next_step:
+            values |= self._observe(rows + 1, self._start[steps], "next_")
+        return values
+
+    def _observe(self, rows, starts, prefix):
+        values = {f"{prefix}state": self._state[rows]}
+        if self._frames is not None:
+            back = np.arange(self.stack - 1, -1, -1)
+            values[f"{prefix}pixels"] = stack_channels(self._frames[np.maximum(rows[:, None] - back, starts[:, None])])
+        return values
+
+
+def share(episodes: np.ndarray, rank: int, world: int, worker: int = 0, workers: int = 1) -> np.ndarray:
+    """The episodes of one rank and worker; ranks get equally many, so that none waits for another.
+
+    Raises:
+      DmcvbError: there are fewer episodes than ranks.
+    """
+    if not 0 <= rank < world:
+        raise DmcvbError(f"rank {rank} is not in 0..{world - 1}; give rank < world")
+    if len(episodes) < world:
+        raise DmcvbError(f"{len(episodes)} episodes cannot be shared by {world} ranks; use fewer ranks")
+    return episodes[: len(episodes) - len(episodes) % world][rank::world][worker::workers]
+
+
+def stream(
+    subset: Subset,
+    *,
+    batch_size: int | None = None,
+    episodes: Sequence[int] | None = None,
+    pictures: Sequence[str] | None = None,
+    stack: int = 3,
+    next_step: bool = False,
+    shuffle: bool = True,
+    seed: int = 0,
+    epoch: int = 0,
+    buffer: int = 32,
+    rank: int = 0,
+    world: int = 1,
+    worker: int = 0,
+    workers: int = 1,
+    drop_last: bool = False,
+) -> Iterator[dict[str, np.ndarray]]:
+    """One pass over the steps of episodes.
+
+    Args:
+      batch_size: steps a batch (see `Block.gather`); None gives single steps, without the leading axis.
+      episodes: indices of committed episodes, all by default.
+      pictures: picture arrays, all visible views by default; () reads states alone.
+      shuffle: mix episodes, and steps among the `buffer` episodes in memory; the same for the same seed, epoch and
+        number of workers.
+      rank, world, worker, workers: this process's share of the episodes.
+      drop_last: leave out a batch that is not full.
+    """
+    from dmcvb_gen.readers.release import picture_names
+
+    chosen = subset.choose(episodes)
+    names = picture_names(subset, pictures)
+    order = np.random.default_rng([seed, epoch, 0]).permutation(chosen) if shuffle else chosen
+    order = share(order, rank, world, worker, workers)
+    mixer = np.random.default_rng([seed, epoch, 1 + rank * workers + worker])
+    rest: list[dict[str, np.ndarray]] = []
+    for first in range(0, len(order), buffer):
+        block = Block(subset, order[first : first + buffer], names, stack, next_step)
+        steps = mixer.permutation(len(block)) if shuffle else np.arange(len(block))
+        if batch_size is None:
+            for step in steps:
+                yield {name: value[0] for name, value in block.gather(np.array([step])).items()}
+            continue
+        held, start = sum(len(part["step"]) for part in rest), 0
+        while start < len(steps):
+            taken = steps[start : start + batch_size - held]
+            rest.append(block.gather(taken))
+            held, start = held + len(taken), start + len(taken)
+            if held == batch_size:
+                yield _join(rest)
+                rest, held = [], 0
+    if rest and not drop_last:
+        yield _join(rest)
+
+
+def _join(parts):
+    return parts[0] if len(parts) == 1 else {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}

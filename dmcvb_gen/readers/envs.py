@@ -1,0 +1,230 @@
+"""The tasks under distractors as Gymnasium environments: actions in; pixels, states and rewards out.
+
+For evaluation: by default they show the `val` videos, which no released picture shows. Many episodes side by side
+(`gymnasium.make_vec`) share one batch of simulations and one call of the renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from dmcvb_gen.distractors import DistractorSetting, Exogenous, ExogenousWalk, load_backgrounds
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.rendering import floor_alpha_for, make_renderer
+from dmcvb_gen.rendering.warp import WarpRenderer
+from dmcvb_gen.rollout.plan import check_renderer
+from dmcvb_gen.rollout.recipe import check_size
+from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+
+PURPOSE = "evaluation"
+"""Names the random streams: no episode here has those of released data."""
+
+
+class _Stage:
+    """`count` episodes with their distractors and pictures; restarted one by one."""
+
+    def __init__(self, count, task, distractor, difficulty, size, renderer, samples, split, backgrounds, threads):
+        self.task, self.count = get_task(task), count
+        self.setting = DistractorSetting.parse(distractor)
+        if difficulty:
+            self.setting = DistractorSetting(self.setting.kind, difficulty)
+        check_size(size)
+        check_renderer(renderer)
+        self.size, self.split = size, split
+        self.backgrounds = None if self.setting.kind == "none" else load_backgrounds(backgrounds, split)
+        self.renderer = make_renderer(
+            renderer,
+            self.task,
+            size,
+            backgrounds=self.backgrounds,
+            floor_alpha=floor_alpha_for(self.task, self.setting),
+            samples=samples,
+        )
+        if isinstance(self.renderer, WarpRenderer):
+            self.renderer.worlds = count  # a launch paints all episodes, and not 256 frames for one
+        self.batch = self.task.batch(count, threads)
+        self._episodes = [(0, 0)] * count  # (seed, number) of each place
+        self.frame, self.started = np.zeros(count, int), np.zeros(count, int)
+        self.state = np.zeros((count, self.task.state_size))
+
+    def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
+        views = len(self.task.views)
+        shape = (self.size, self.size, 3 * views)
+        observation = {
+            "pixels": spaces.Box(0, 255, shape, np.uint8),
+            "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
+        }
+        return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+
+    def start(self, places: Sequence[int], seeds: Sequence[int]) -> None:
+        """Start the next episode of some places, from the streams of their seeds."""
+        for place, seed in zip(places, seeds, strict=True):
+            self._episodes[place] = seed, int(self.started[place])
+            self.started[place] += 1
+            self.frame[place] = 0
+        streams = {
+            name: [episode_stream(seed, (self.task.id, PURPOSE), number, name) for seed, number in self._episodes]
+            for name in STREAMS
+        }
+        self.state = self.batch.reset([streams["initial_state"][place] for place in places], places)
+        # Drawn for all places together (the running ones get the walks that they have): labels then take one call.
+        self.walk = ExogenousWalk(
+            self.task, self.setting, self.task.max_steps + 1, streams, self.backgrounds, self.split
+        )
+
+    def labels(self, physics: np.ndarray) -> Exogenous:
+        """Labels of the frame that each place shows now, leading shape (place,)."""
+        found = {int(frame): self.walk.frame(int(frame), physics) for frame in np.unique(self.frame)}
+        parts = [found[int(frame)][place : place + 1] for place, frame in enumerate(self.frame)]
+        return Exogenous(**{name: np.concatenate([getattr(p, name) for p in parts]) for name, _ in parts[0].items()})
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """ "pixels" (place, size, size, 3 * view) uint8 and "state" (place, state) float32."""
+        physics = self.batch.physics()
+        pictures = self.renderer.render(physics, self.labels(physics))  # (place, view, size, size, 3)
+        pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
+        return {"pixels": pixels, "state": self.state.astype(np.float32)}
+
+    def step(self, actions: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rewards, terminated, truncated of one agent step of the active places."""
+        result = self.batch.step(np.clip(actions, -1, 1), active)
+        self.state = result.state
+        self.frame[active] += 1
+        truncated = active & (self.frame >= self.task.max_steps) & ~result.terminated
+        return result.reward, result.terminated, truncated
+
+
+class DistractedEnv(gymnasium.Env):
+    """One episode at a time.
+
+    Observations are {"pixels": (size, size, 3 * views) uint8, "state": (state,) float32}; an action (action,) in
+    [-1, 1] is held for two control steps, whose rewards are summed (an episode earns at most 1000).
+
+    Args:
+      task: e.g. "walker-walk". distractor: "none", "static", "dynamic", or with a difficulty ("dynamic_hard").
+      difficulty: easy, medium or hard.
+      size: pixels a side. renderer: "warp" or "opengl"; samples: a pixel.
+      split: "val" shows videos that no released data show, "train" those of the data.
+      backgrounds: "builtin" or a folder of videos.
+      seed of `reset`: decides initial states, distractors and all episodes after it.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        task: str,
+        distractor: str = "none",
+        difficulty: str | None = None,
+        size: int = 64,
+        renderer: str = "warp",
+        samples: int | None = None,
+        split: str = "val",
+        backgrounds: str = "builtin",
+        render_mode: str | None = None,
+    ):
+        if render_mode not in (None, "rgb_array"):
+            raise DmcvbError(f"render_mode {render_mode!r} is not offered; give 'rgb_array' or None")
+        self._stage = _Stage(1, task, distractor, difficulty, size, renderer, samples, split, backgrounds, 1)
+        self.task, self.render_mode = self._stage.task, render_mode
+        self.observation_space, self.action_space = self._stage.spaces()
+        self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
+        self._seed, self._pixels = None, None
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        super().reset(seed=seed)
+        if seed is not None or self._seed is None:
+            self._seed, self._stage.started[0] = int(self.np_random.integers(2**63)), 0
+        self._stage.start([0], [self._seed])
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray):
+        if self._seed is None:
+            raise DmcvbError("step before reset; call reset() first")
+        reward, terminated, truncated = self._stage.step(np.asarray(action)[None], np.ones(1, bool))
+        return self._observation(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        observation = {name: value[0] for name, value in self._stage.observe().items()}
+        self._pixels = observation["pixels"]
+        return observation
+
+    def render(self) -> np.ndarray | None:
+        """The picture of the current frame (its first view), (size, size, 3) uint8."""
+        if self.render_mode is None or self._pixels is None:
+            return None
+        return self._pixels[..., :3].copy()
+
+    def close(self) -> None:
+        self._stage.renderer.close()
+
+
+class DistractedVectorEnv(VectorEnv):
+    """`num_envs` episodes side by side; an episode that ended restarts at the next step (Gymnasium's NEXT_STEP).
+
+    Place i behaves, to the last bit of state and reward, as a `DistractedEnv` that was reset with that place's seed.
+
+    Args: see `DistractedEnv`; threads: of the simulation.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 20}
+
+    def __init__(
+        self,
+        num_envs: int,
+        task: str,
+        distractor: str = "none",
+        difficulty: str | None = None,
+        size: int = 64,
+        renderer: str = "warp",
+        samples: int | None = None,
+        split: str = "val",
+        backgrounds: str = "builtin",
+        threads: int = 1,
+    ):
+        if num_envs < 1:
+            raise DmcvbError(f"num_envs is {num_envs}; give at least 1")
+        self.num_envs = num_envs
+        self._stage = _Stage(
+            num_envs, task, distractor, difficulty, size, renderer, samples, split, backgrounds, threads
+        )
+        self.task, self.render_mode = self._stage.task, None
+        self.single_observation_space, self.single_action_space = self._stage.spaces()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._seeds: list[int] | None = None
+        self._ended = np.zeros(num_envs, bool)
+
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
+        """Start all episodes; an int seeds place i with seed + i, as Gymnasium's own vector environments do."""
+        if seed is not None or self._seeds is None:
+            given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+            given = [None] * self.num_envs if given is None else list(given)
+            draws = [gymnasium.utils.seeding.np_random(value)[0] for value in given]
+            self._seeds = [int(rng.integers(2**63)) for rng in draws]
+            self._stage.started[:] = 0
+        self._stage.start(range(self.num_envs), self._seeds)
+        self._ended[:] = False
+        return self._stage.observe(), {}
+
+    def step(self, actions: np.ndarray):
+        if self._seeds is None:
+            raise DmcvbError("step before reset; call reset() first")
+        restarted = self._ended.copy()
+        if restarted.any():
+            places = np.flatnonzero(restarted)
+            self._stage.start(places, [self._seeds[place] for place in places])
+        reward, terminated, truncated = self._stage.step(np.asarray(actions, np.float64), ~restarted)
+        self._ended = terminated | truncated
+        return self._stage.observe(), reward, terminated, truncated, {}
+
+    def close_extras(self, **kwargs) -> None:
+        self._stage.renderer.close()

@@ -1,0 +1,116 @@
+"""`dmcvb_gen.open`: a folder or URL in; subsets that give episodes, xarray, torch and numpy out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.release.remote import file_system, is_url, public, reason
+from dmcvb_gen.store import Release, Subset, open_release
+
+if TYPE_CHECKING:
+    import xarray
+
+KINDS = ("steps", "transitions", "episodes", "stream")
+
+
+class SubsetReader(Subset):
+    """A subset with the forms that training code wants; see `Subset` for the rest."""
+
+    def xarray(self, episodes: Iterable[int] | None = None) -> xarray.Dataset:
+        """All arrays as one lazy xarray data set.
+
+        Args:
+          episodes: indices of committed episodes, all by default.
+
+        Returns:
+          Dimensions episode and step (and height, width, ...), coordinates `episode` and `step`, variables by the
+          store's names with "/" as "_" ("exogenous_camera_position"); read when used.
+        """
+        import xarray
+
+        chosen = self.choose(episodes)
+        options = {"storage_options": self._storage_options} if "://" in self.root else {}
+        path = f"{self.root}/{self.name}.zarr"
+        parts = []
+        for folder in sorted({name.rpartition("/")[0] for name in self.arrays}):
+            part = xarray.open_zarr(path, group=folder or None, consolidated=None, chunks=None, **options)
+            parts.append(part.rename({name: f"{folder}_{name}".replace("/", "_") for name in part} if folder else {}))
+        merged = xarray.merge(parts, combine_attrs="override")
+        merged = merged.isel(episode=chosen).assign_coords(episode=chosen, step=np.arange(merged.sizes["step"]))
+        return merged.assign_attrs(self.attrs)
+
+    def torch(self, kind: str = "steps", **options: Any):
+        """A torch data set.
+
+        Args:
+          kind: "steps" (`StepDataset`: frame stacks with their action), "transitions" (the same, with what comes
+            next), "episodes" (`EpisodeDataset`), "stream" (`StreamDataset`, the quick way through a large subset).
+          options: of that class.
+
+        Raises:
+          UnknownNameError: no such kind.
+        """
+        from dmcvb_gen.readers import torch_data
+
+        if kind == "steps":
+            return torch_data.StepDataset(self, **options)
+        if kind == "transitions":
+            return torch_data.StepDataset(self, next_step=True, **options)
+        if kind == "episodes":
+            return torch_data.EpisodeDataset(self, **options)
+        if kind == "stream":
+            return torch_data.StreamDataset(self, **options)
+        raise UnknownNameError("kind of data set", kind, KINDS)
+
+    def batches(self, batch_size: int, **options: Any) -> Iterator[dict[str, np.ndarray]]:
+        """One pass over the steps in shuffled numpy batches; `options` as for `StreamDataset`."""
+        from dmcvb_gen.readers.blocks import stream
+
+        yield from stream(self, batch_size=batch_size, **options)
+
+    def choose(self, episodes: Iterable[int] | None) -> np.ndarray:
+        """Indices of committed episodes, all by default; raises StoreError for one that is not there."""
+        chosen = self.episodes if episodes is None else np.asarray(list(episodes), int)
+        missing = np.setdiff1d(chosen, self.episodes)
+        if len(missing):
+            raise StoreError(f"{self.name} has no episode {missing[0]}; it has {len(self.episodes)} episodes")
+        return chosen
+
+
+class ReleaseReader(Release):
+    """A release whose subsets are `SubsetReader`s."""
+
+
+def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseReader:
+    """See `dmcvb_gen.open`."""
+    path = str(path)
+    if is_url(path):
+        if path.startswith("file:") and "://" not in path:
+            path = "file://" + path.removeprefix("file:")
+        file_system(path, storage_options)
+    try:
+        release = open_release(path, storage_options)
+    except (OSError, PermissionError) as error:
+        raise StoreError(f"cannot read {public(path)}: {reason(error)}") from None
+    subsets = {
+        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
+        for name, subset in release.subsets.items()
+    }
+    return ReleaseReader(release.root, release.manifest, subsets)
+
+
+def picture_names(subset: Subset, views: Sequence[str] | None) -> list[str]:
+    """Picture arrays of a subset to read: all visible ones by default.
+
+    Raises:
+      UnknownNameError: there is no such picture array.
+    """
+    names = [name for name in subset.pixel_arrays if not name.startswith("pixels_hidden_goal")]
+    for view in views or ():
+        if view not in subset.pixel_arrays:
+            raise UnknownNameError(f"picture array of {subset.name}", view, subset.pixel_arrays)
+    return list(views) if views is not None else names

@@ -1,0 +1,159 @@
+"""Readers: every form gives the stored values, whatever workers, ranks and seeds."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import dmcvb_gen
+from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.store import open_release
+
+NAME = "walker-walk/random/dynamic"
+
+
+@pytest.fixture(scope="module")
+def subset(small_release):
+    return dmcvb_gen.open(small_release)[NAME]
+
+
+def keys(items):
+    """(episode, step) of every step, in the order they came."""
+    columns = [(np.ravel(item["episode"]), np.ravel(item["step"])) for item in items]
+    return [(int(e), int(s)) for episodes, steps in columns for e, s in zip(episodes, steps, strict=True)]
+
+
+EVERY_STEP = {(episode, step) for episode in range(3) for step in range(500)}
+
+
+def test_open_gives_subsets_and_episodes(small_release):
+    release = dmcvb_gen.open(small_release)
+    assert len(release.subsets) == 3 and list(release[NAME].episodes) == [0, 1, 2]
+    plain = open_release(small_release)[NAME].episode(1)
+    np.testing.assert_array_equal(release[NAME].episode(1)["pixels"], plain["pixels"])
+    with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
+        release["walker-walk/expert/none"]
+
+
+def test_xarray_is_lazy_and_holds_every_array(subset):
+    data = subset.xarray([0, 2])
+    assert dict(data.sizes).items() >= {"episode": 2, "step": 501, "height": 16, "state": 24}.items()
+    assert list(data.episode.values) == [0, 2] and data.attrs["task"] == "walker-walk"
+    np.testing.assert_array_equal(data["action"].sel(episode=2), subset.read("action", [2])[0])
+    position = data["exogenous_camera_position"].sel(episode=2, step=7).values
+    np.testing.assert_array_equal(position, subset.read("exogenous/camera_position", [2])[0, 7])
+    with pytest.raises(StoreError, match="no episode 9"):
+        subset.xarray([9])
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_a_frame_stack_holds_the_frames_before_and_repeats_the_first(subset, in_memory):
+    data, episode = subset.torch("steps", in_memory=in_memory), subset.episode(1)
+    assert len(data) == 1500
+    for step in (0, 1, 2, 499):
+        item = data[500 + step]
+        frames = [episode["pixels"][max(step - back, 0)].transpose(2, 0, 1) for back in (2, 1, 0)]
+        np.testing.assert_array_equal(item["pixels"], np.concatenate(frames))
+        np.testing.assert_array_equal(item["state"], episode["state"][step])
+        np.testing.assert_array_equal(item["action"], episode["action"][step])
+        assert item["reward"] == episode["reward"][step] and (item["episode"], item["step"]) == (1, step)
+    with pytest.raises(IndexError):
+        data[1500]
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_a_transition_leads_to_the_next_observation(subset, in_memory):
+    item = subset.torch("transitions", in_memory=in_memory, stack=2)[999]
+    episode = subset.episode(1)
+    np.testing.assert_array_equal(item["next_state"], episode["state"][500])
+    np.testing.assert_array_equal(item["next_pixels"][-3:], episode["pixels"][500].transpose(2, 0, 1))
+    np.testing.assert_array_equal(item["next_pixels"][:3], item["pixels"][-3:])
+    assert item["discount"] == 1
+
+
+def test_whole_episodes_have_one_observation_more_than_actions(subset):
+    item = subset.torch("episodes")[2]
+    assert item["pixels"].shape == (501, 3, 16, 16) and item["action"].shape == (500, 6)
+    np.testing.assert_array_equal(item["pixels"][500], subset.episode(2)["pixels"][500].transpose(2, 0, 1))
+
+
+def test_batches_pass_over_every_step_once_in_an_order_that_the_seed_decides(subset):
+    one = list(subset.batches(64, seed=1, buffer=2))
+    assert [len(batch["step"]) for batch in one] == [64] * 23 + [28]
+    assert set(keys(one)) == EVERY_STEP and len(keys(one)) == 1500
+    assert keys(one) == keys(subset.batches(64, seed=1, buffer=2))
+    assert (
+        keys(one) != keys(subset.batches(64, seed=2, buffer=2)) != keys(subset.batches(64, seed=2, epoch=1, buffer=2))
+    )
+    batch, episodes = one[5], {e: subset.episode(e) for e in range(3)}
+    for row in range(64):
+        episode, step = episodes[int(batch["episode"][row])], int(batch["step"][row])
+        np.testing.assert_array_equal(batch["pixels"][row, -3:], episode["pixels"][step].transpose(2, 0, 1))
+        np.testing.assert_array_equal(batch["action"][row], episode["action"][step])
+    assert [len(batch["step"]) for batch in subset.batches(64, drop_last=True)] == [64] * 23
+
+
+def test_states_alone_are_read_without_pixels(subset):
+    [batch] = subset.batches(10_000, pictures=())
+    assert "pixels" not in batch and batch["state"].shape == (1500, 24)
+
+
+def test_loader_workers_share_the_episodes(subset):
+    data = subset.torch("stream", batch_size=100, pictures=(), seed=3)
+    loaded = keys(DataLoader(data, batch_size=None, num_workers=2))
+    assert len(loaded) == 1500 and set(loaded) == EVERY_STEP
+    again = keys(DataLoader(data, batch_size=None, num_workers=2))
+    assert loaded == again
+    data.set_epoch(1)
+    assert keys(DataLoader(data, batch_size=None, num_workers=2)) != loaded
+
+
+def test_ranks_get_equally_many_episodes_and_share_none(subset):
+    shares = [set(keys(subset.torch("stream", pictures=(), rank=rank, world=3, batch_size=50))) for rank in range(3)]
+    assert [len(share) for share in shares] == [500] * 3 and set.union(*shares) == EVERY_STEP
+    pairs = [keys(subset.batches(50, pictures=(), rank=rank, world=2)) for rank in range(2)]
+    assert [len(share) for share in pairs] == [500, 500]  # 3 episodes, 2 ranks: one episode waits for another epoch
+    with pytest.raises(DmcvbError, match="fewer ranks"):
+        next(subset.batches(5, rank=0, world=4))
+
+
+def test_random_steps_work_in_loader_workers_and_survive_pickling(subset):
+    data = pickle.loads(pickle.dumps(subset.torch("steps")))
+    generator = torch.Generator().manual_seed(0)
+    options = dict(num_workers=2, generator=generator, multiprocessing_context="spawn")
+    loader = DataLoader(data, batch_size=8, shuffle=True, **options)
+    batch = next(iter(loader))
+    assert batch["pixels"].shape == (8, 9, 16, 16) and batch["pixels"].dtype == torch.uint8
+    for row in range(8):
+        episode = subset.episode(int(batch["episode"][row]))
+        np.testing.assert_array_equal(batch["state"][row], episode["state"][int(batch["step"][row])])
+
+
+def test_wrong_names_are_answered_with_the_right_ones(subset, tmp_path):
+    with pytest.raises(UnknownNameError, match="transitions"):
+        subset.torch("rows")
+    with pytest.raises(UnknownNameError, match="pixels"):
+        subset.torch("steps", pictures=["depth"])
+    with pytest.raises(StoreError, match="holds no release"):
+        dmcvb_gen.open(tmp_path)
+    with pytest.raises(StoreError, match="cannot use warez"):
+        dmcvb_gen.open("warez://me:secret@x/y")
+
+
+def test_a_missing_file_system_names_the_extra(monkeypatch):
+    import fsspec
+
+    def missing(url, **options):
+        raise ImportError("Install s3fs to access S3")
+
+    monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
+    with pytest.raises(StoreError, match=r'pip install "dmcvb-gen\[s3\]"'):
+        dmcvb_gen.open("s3://bucket/name")
+    with pytest.raises(StoreError, match=r'pip install "dmcvb-gen\[gs\]"'):
+        dmcvb_gen.open("gs://bucket/name")
+    with pytest.raises(StoreError, match=r'pip install "dmcvb-gen\[hf\]"'):
+        dmcvb_gen.open("hf://datasets/me/name")
