@@ -17,6 +17,7 @@ COMMANDS = {
     "show-maze": ("maze:show_maze", "Picture a maze, its distances to a goal and the path there."),
     "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
     "verify": ("release:verify", "Check that a release is what it says."),
+    "validate": ("validate:validate", "Check a release, run the paper's benchmarks, report both."),
     "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
     "repaint": ("release:repaint", "New pixels from stored physics states: distractor, size, renderer."),
     "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),

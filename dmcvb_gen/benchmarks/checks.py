@@ -1,0 +1,164 @@
+"""Structure checks before any training: a release in, findings and warnings out.
+
+`release.verify` looks at bytes, shapes, values, physics and sampled pixels; here it is asked first, and what only a
+benchmark cares about comes on top: returns as the policies and the paper promise, labels that fit their setting,
+pictures that show something.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.distractors import TRAIN_STYLES, VAL_STYLES
+from dmcvb_gen.release.verify import Finding, verify
+from dmcvb_gen.rollout.recipe import distractor_of, is_maze
+from dmcvb_gen.store import Release, Subset
+from dmcvb_gen.tasks import get_task
+
+STANDARD_ERRORS = 4.0
+"""How far the mean return of a subset may lie from its policies' (chance alone: one release in 10,000)."""
+PAPER_SHARE = 0.15
+"""How far it may lie from the paper's, as a share of the paper's expert, before a warning."""
+PICTURE_EPISODES = 100
+"""Episodes of a subset whose every frame is looked at."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What the checks found.
+
+    Attributes:
+      checked: how many subsets, episodes, steps were looked at.
+      findings: what is wrong with the data.
+      warnings: what is odd, and may be meant: data unlike the paper's.
+    """
+
+    checked: dict[str, int]
+    findings: tuple[Finding, ...]
+    warnings: tuple[Finding, ...]
+    seconds: float
+
+    @property
+    def sound(self) -> bool:
+        return not self.findings
+
+
+def check_policy_returns(subset: Subset) -> Iterator[Finding]:
+    """Each policy's episodes return what its file says it returned when it was evaluated."""
+    behaviour = subset.read("behaviour")
+    for index, policy in enumerate(subset.record.policies):
+        said, returns = policy.header.get("evaluation"), subset.returns[behaviour == index]
+        mode = "deterministic" if subset.record.deterministic else "sampled"
+        if not said or not len(returns) or said["mode"] != mode:
+            continue
+        spread = max(said["std"], float(returns.std()))
+        tolerance = STANDARD_ERRORS * spread * math.sqrt(1 / len(returns) + 1 / said["episodes"])
+        tolerance += 0.01 * abs(said["mean"])
+        if not abs(returns.mean() - said["mean"]) <= tolerance:
+            worst = int(np.abs(returns - said["mean"]).argmax())
+            yield Finding(
+                "returns",
+                subset.name,
+                f"mean return of policy {policy.name} is {returns.mean():.1f}, its file says {said['mean']:.1f} "
+                f"(more than {tolerance:.1f} apart)",
+                int(subset.episodes[behaviour == index][worst]),
+            )
+
+
+def check_paper_returns(subset: Subset) -> Iterator[Finding]:
+    """Warns where the mean return is not near the paper's table."""
+    paper, expert = paper_returns(subset.task, subset.level), paper_returns(subset.task, "expert")
+    if not paper or not len(subset.returns):
+        return
+    if is_maze(subset.task):
+        scale = abs(paper_returns(subset.task, "medium")["mean"] - expert["mean"])
+    else:
+        scale = PAPER_SHARE * expert["mean"]
+    mean = float(subset.returns.mean())
+    tolerance = scale + 2 * float(subset.returns.std()) / math.sqrt(len(subset.returns))
+    if not abs(mean - paper["mean"]) <= tolerance:
+        yield Finding("paper", subset.name, f"mean return is {mean:.1f}, the paper's is {paper['mean']:.1f}")
+
+
+def check_labels(subset: Subset) -> Iterator[Finding]:
+    """The distractors' labels are what the setting's name says."""
+    task, kind = get_task(subset.task), distractor_of(subset.task, subset.setting).kind
+    recorded = subset.record.backgrounds
+    styles: tuple[int, ...] = (-1,)
+    if task.style_geom_matid(TRAIN_STYLES[0]) is not None:
+        styles = (*TRAIN_STYLES, *VAL_STYLES)
+    own = task.model.mat_rgba[:, :3].astype(np.float32)
+    names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
+    for episode in map(int, subset.episodes):
+        video, frame, color, style = subset.episode(episode, names).values()
+        problems = [
+            (~np.isin(style, styles) | (style != style[0]), "the maze's style is not one of its data's"),
+        ]
+        if kind == "none":
+            problems += [
+                ((video != -1) | (frame != -1), "a background is named, the setting has none"),
+                (np.abs(color - own).max(axis=(1, 2)) > 1e-6, "a material has another color, the setting has none"),
+            ]
+        else:
+            problems += [((video < 0) | (video != video[0]), "the background is not one video throughout")]
+            if kind == "static":
+                problems += [
+                    (frame != frame[0], "the background moves in a static setting"),
+                    ((color != color[0]).any(axis=(1, 2)), "colors change in a static setting"),
+                ]
+            else:
+                jumps = np.abs(np.diff(frame.astype(int), prepend=frame[:1])) > 1
+                problems += [(jumps, "the background skips frames")]
+        for bad, message in problems:
+            if bad.any():
+                yield Finding("labels", subset.name, message, episode, int(bad.argmax()))
+    if (kind == "none") != (recorded is None):
+        yield Finding("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
+
+
+def check_pictures(subset: Subset) -> Iterator[Finding]:
+    """No frame is black or of one color, and no episode shows the same frame throughout."""
+    chosen = subset.episodes[:: max(1, -(-len(subset.episodes) // PICTURE_EPISODES))]
+    for episode in map(int, chosen):
+        for name, frames in subset.episode(episode, subset.pixel_arrays).items():
+            flat = frames.reshape(len(frames), -1)
+            low, high = flat.min(axis=1), flat.max(axis=1)
+            for bad, message in ((high == 0, "is black"), ((low == high) & (high > 0), "is of one color")):
+                if bad.any():
+                    yield Finding("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax()))
+            if len(frames) > 1 and (flat == flat[:1]).all() and high[0] > 0:
+                yield Finding("pictures", subset.name, f"{name} shows the same frame throughout", episode)
+
+
+def check_structure(
+    release: Release, backgrounds: str | None = None, tick: Callable[[str], None] = lambda subset: None
+) -> Structure:
+    """All checks of a local release.
+
+    Args:
+      backgrounds: where the manifest's videos are now, if they moved.
+      tick: told the subset that is looked at.
+
+    Raises:
+      DmcvbError: nothing is committed.
+    """
+    started = time.perf_counter()
+    verified = verify(release.path, backgrounds, tick)
+    wanted = {record.name for record in release.manifest.subsets}
+    findings, warnings = [f for f in verified.findings if f.subset in wanted], []
+    unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
+    for name, subset in release.subsets.items():
+        if name in unreadable:
+            continue
+        tick(name)
+        findings += check_policy_returns(subset)
+        findings += check_labels(subset)
+        findings += check_pictures(subset)
+        warnings += check_paper_returns(subset)
+    return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)

@@ -1,0 +1,109 @@
+"""validate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from dmcvb_gen.cli.common import json_option, print_json
+
+
+@click.command()
+@click.argument("path")
+@click.option("--profile", default="smoke", show_default=True, help="smoke (minutes, no scores), quick, paper.")
+@click.option("--scale", type=click.FloatRange(0, min_open=True), default=1.0, help="Times the profile's steps.")
+@click.option("--benchmark", "benchmarks", multiple=True, help="b1, b2, b3, ablations. Repeatable.  [default: b1]")
+@click.option("--agents", default="", metavar="A,B", help="Names such as bc,state-bc,id+bc instead of all.")
+@click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/expert/*'.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder.  [default: reports/NAME]")
+@click.option("--checks-only", is_flag=True, help="Structure checks and report, no training.")
+@click.option("--strict", is_flag=True, help="Exit with 1 on warnings too (data unlike the paper's).")
+@click.option("--train-unsound", is_flag=True, help="Run the benchmarks even where a structure check fails.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Cells side by side.")
+@click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True)
+@click.option("--compile", is_flag=True, help="torch.compile the losses (pays on CUDA and in long runs).")
+@click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Pictures held at most.  [default: half free]")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
+@click.option("--dino-weights", type=click.Path(path_type=Path), help="A safetensors file, for dino+bc.")
+@click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
+@json_option
+@click.pass_context
+def validate(context, path, out, profile, scale, benchmarks, agents, only, checks_only, strict, as_json, **options):
+    """Check a release and run the paper's benchmarks on it, scores set beside the paper's.
+
+    Exit code 0 when sound, 1 when a check fails, 2 on bad usage. The same command goes on where it stopped.
+
+    \b
+    dmcvb-gen validate releases/mini --profile smoke
+    dmcvb-gen validate releases/mini --profile quick --benchmark b1 --agents bc,state-bc,id+bc --out reports/mini
+    """
+    from dmcvb_gen.benchmarks.profiles import get_profile
+    from dmcvb_gen.benchmarks.run import Setup, default_threads
+    from dmcvb_gen.benchmarks.validate import Progress
+    from dmcvb_gen.benchmarks.validate import validate as run
+    from dmcvb_gen.errors import DmcvbError
+
+    if options["device"] == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    workers, memory, weights = options.pop("workers"), options.pop("memory"), options.pop("dino_weights")
+    train_unsound = options.pop("train_unsound")
+    setup = Setup(
+        root=str(path),
+        out=str(out or Path("reports") / Path(path).name),
+        profile=get_profile(profile).scaled(scale),
+        memory=None if memory is None else int(memory * 1e9),
+        dino_weights=weights and str(weights),
+        **options | {"threads": options["threads"] or default_threads(workers)},
+    )
+    with tqdm(unit=" steps", desc="structure", disable=as_json or None) as bar:
+        progress = Progress(
+            checking=lambda name: bar.set_description(f"checking {name}"),
+            total=bar.reset,
+            training=lambda what, steps: (bar.set_description(what, refresh=False), bar.update(steps)),
+        )
+        result = run(
+            path,
+            setup,
+            benchmarks=() if checks_only else benchmarks or ("b1",),
+            agents=[name for name in agents.split(",") if name.strip()],
+            patterns=only,
+            workers=workers,
+            train_unsound=train_unsound,
+            progress=progress,
+        )
+    if as_json:
+        print_json(json.loads(result.facts.read_text()))
+    else:
+        _show(result, setup.profile)
+    context.exit(0 if result.sound and not (strict and result.warnings) else 1)
+
+
+def _show(result, profile) -> None:
+    for finding in result.structure.findings[:50]:
+        click.echo(f"FAIL {finding}")
+    for cell, error in result.failed:
+        click.echo(f"FAIL {cell.id}: {error}")
+    for finding in result.warnings:
+        click.echo(f"warning: {finding}")
+    for cell, facts in result.results:
+        if "error" in facts:
+            continue
+        score, paper = facts["score"], facts["paper"]
+        beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if paper else ""
+        where = f"{cell.task} {cell.policy_label}/{cell.setting}"
+        click.echo(f"{where} {cell.agent.name}: {score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]{beside}")
+    for entry in result.missing:
+        click.echo(
+            f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}; make them with: {entry.command}"
+        )
+    checked = ", ".join(f"{count:,} {name}" for name, count in result.structure.checked.items())
+    found = len(result.structure.findings) + len(result.failed)
+    click.echo(f"{'sound' if result.sound else f'{found} findings'} ({checked}); {profile.note}")
+    click.echo(f"Report: {result.report}")
