@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.policy_file import Evaluation
-from dmcvb_gen.behaviours.selection import MIXED_COUNT, converge, pick_checkpoints
+from dmcvb_gen.behaviours.bundled import level_files
+from dmcvb_gen.behaviours.policy_file import Actor, Evaluation, PolicyHeader, read_header, save_policy
+from dmcvb_gen.behaviours.run_log import COLUMNS
+from dmcvb_gen.behaviours.selection import (
+    MAZE_LEVELS,
+    MIXED_COUNT,
+    converge,
+    pick_checkpoints,
+    read_curve,
+    select_checkpoints,
+)
+from dmcvb_gen.behaviours.thinning import LIMIT, superfluous
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -99,3 +114,127 @@ def test_a_jump_over_the_half_says_what_is_missing():
     found = select(returns)
     assert "expert" in found.picks and "evaluate more often" in found.reasons["medium"]
     assert "evaluate more often" in found.reasons["mixed"]
+
+
+def lucky_curve(seed, count=1000):
+    """A long noisy run: floor, climb, plateau, a collapse and a return."""
+    rng = np.random.default_rng(seed)
+    shape = np.concatenate([np.zeros(150), np.linspace(0, 900, 350), np.full(250, 900.0)])
+    shape = np.concatenate([shape, np.linspace(900, 300, 50), np.linspace(300, 900, count - 800)])
+    return (shape + rng.normal(0, 25, count)).clip(0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_thinning_takes_nothing_that_the_selection_needs(seed):
+    values = lucky_curve(seed)
+    kept: dict[int, float] = {}
+    for step, value in enumerate(values, 1):  # as a run does it: after every evaluation, not knowing the future
+        kept[step] = float(value)
+        for gone in superfluous(kept, (0.0, 1000.0)):
+            del kept[gone]
+        assert len(kept) <= 400
+    points = [(step, float(value), Path(str(step))) for step, value in enumerate(values, 1)]
+    thinned = [(step, value, path if step in kept else None) for step, value, path in points]
+    convergence = converge([p[0] for p in points], [p[1] for p in points])
+
+    def measure(path):
+        return Evaluation(mean=float(values[int(path.name) - 1]), std=0.0, episodes=100, mode="sampled", seed=0)
+
+    whole, after = (pick_checkpoints(curve, 0.0, convergence, measure) for curve in (points, thinned))
+    assert after.picks["expert"] == whole.picks["expert"] and after.reasons == whole.reasons == {}
+    assert after.picks["medium"][0].evaluation.mean == pytest.approx(0.5 * convergence.value, abs=10)
+    for index, pick in enumerate(after.picks["mixed"]):
+        assert pick.evaluation.mean == pytest.approx(0.5 * convergence.value * index / 7, abs=15)
+
+
+def test_short_runs_are_not_thinned_and_records_and_recent_ones_stay():
+    assert superfluous({step: 0.0 for step in range(LIMIT)}, (0, 1000)) == []
+    curve = {step: float(step % 7) for step in range(1000)}
+    gone = superfluous(curve, (0, 1000))
+    assert not {0, 1, 2, 3, 4, 5, 6} & set(gone) and not set(range(980, 1000)) & set(gone) and len(gone) > 900
+
+
+def test_negative_returns_are_thinned_by_level_too():
+    rng = np.random.default_rng(0)
+    curve = {step: -1200 + 1.1 * step + float(rng.normal(0, 5)) for step in range(1000)}
+    left = set(curve) - set(superfluous(curve, (-2400.0, 0.0)))
+    levels = sorted(curve[step] for step in left)
+    assert len(left) < 400 and max(np.diff(levels)) < 30  # 1 % of the range, 3 % of the way
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A run of cheetah-run whose checkpoints are random networks, with a made-up learning curve."""
+    header = PolicyHeader(
+        task="cheetah-run", observation_size=17, action_size=6, algorithm="sac", agent_step=0, hidden=(4,)
+    )
+    for index, value in enumerate(rising(top=6.0, at=20), 1):
+        evaluation = Evaluation(mean=float(value), std=1.0, episodes=20, mode="sampled", seed=0)
+        torch.manual_seed(index)
+        save_policy(
+            tmp_path / "checkpoints" / f"{index * 1000:010d}.safetensors",
+            header.model_copy(update=dict(agent_step=index * 1000, evaluation=evaluation)),
+            Actor(header).state_dict(),
+        )
+    return tmp_path
+
+
+def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_folder):
+    result = CliRunner().invoke(main, ["select-checkpoints", str(run_folder), "--episodes", "3", "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.output)
+    assert found["convergence"]["converged"] and found["convergence"]["value"] == pytest.approx(6)
+    assert json.loads((run_folder / "selection.json").read_text()) == found
+    assert (run_folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+    for level, entry in found["levels"].items():
+        files = level_files(run_folder / "selected", level)
+        assert bool(entry["picks"]) == bool(files) != bool(entry["reason"])
+        for path, pick in zip(files, entry["picks"], strict=True):
+            header = read_header(path)
+            assert header.level == level and header.evaluation.episodes == 3
+            assert header.agent_step == pick["step"] and header.evaluation.mean == pick["evaluation"]["mean"]
+
+
+def test_points_of_thinned_and_half_written_checkpoints(run_folder):
+    files = sorted((run_folder / "checkpoints").iterdir())
+    rows = "\n".join(f"{1000 * i},1.0,{float(i)},0.5,,,0.1,5" for i in range(1, 101))
+    (run_folder / "progress.csv").write_text(f"{','.join(COLUMNS)}\n{rows}\n101000,1.0,3")
+    files[3].unlink()
+    files[4].write_bytes(files[4].read_bytes()[:100])
+    curve = read_curve(run_folder)
+    assert [step for step, _, _ in curve] == [1000 * i for i in range(1, 101)]
+    assert curve[3][1:] == (4.0, None) and curve[4][1:] == (5.0, None) and curve[5][2] == files[5]
+
+
+def test_a_checkpoint_that_is_thinned_away_meanwhile_is_done_without(run_folder, monkeypatch):
+    import dmcvb_gen.behaviours.selection as module
+
+    seen, load = [], module.load_policy
+
+    def vanish(path, task):
+        if not seen:
+            Path(path).unlink()
+        seen.append(path)
+        return load(path, task)
+
+    monkeypatch.setattr(module, "load_policy", vanish)
+    found = module.select_checkpoints(run_folder, episodes=2)
+    assert len(seen) > 1 and str(seen[0]) not in str(found)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(DmcvbError, match="give a run folder"):
+        select_checkpoints(tmp_path)
+
+
+def test_mazes_have_no_mixed_level():
+    curve = [
+        (int(s), float(v), Path(str(i))) for i, (s, v) in enumerate(zip(STEPS, rising(-50, 40, -450), strict=True))
+    ]
+
+    def measure(path):
+        return Evaluation(mean=curve[int(path.name)][1], std=0, episodes=100, mode="sampled", seed=0)
+
+    convergence = converge([p[0] for p in curve], [p[1] for p in curve], -450)
+    found = pick_checkpoints(curve, -450, convergence, measure, levels=MAZE_LEVELS)
+    assert set(found.picks) == {"expert", "medium"} and not found.reasons

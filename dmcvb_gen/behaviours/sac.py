@@ -32,6 +32,8 @@ class SacSettings:
       target_entropy_scale: the target entropy is minus this times the action size.
       reward_scale: multiplies rewards before learning.
       shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
+      progress: mazes: weight of the meters of shortest path covered in a step, added to the training reward (never to
+        an evaluation). DMC-VB's own reward is flat in the whole goal cell.
       standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
         instead of the task's initial states; evaluations always start as the task does.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
@@ -57,6 +59,7 @@ class SacSettings:
     initial_temperature: Positive = 0.1
     reward_scale: Positive = 0.5
     shaping: NonNegative = 0.0
+    progress: NonNegative = 0.0
     standing_starts: Share = 0.0
     train_episode_steps: Natural = 0
     buffer_size: Count = 1_000_000

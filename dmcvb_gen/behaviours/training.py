@@ -76,6 +76,10 @@ class Episodes:
         settings = run.settings
         self.size, self._limit = settings.simulations, settings.train_episode_steps or run.task.max_steps
         self.batch = run.task.batch(self.size)
+        if getattr(settings, "progress", 0):
+            if not hasattr(self.batch, "track_paths"):
+                raise DmcvbError(f"setting progress is for ant-maze tasks; {run.task.id} has no path to a goal")
+            self.batch.track_paths()
         # The first episodes are cut short at different steps, so that ends do not fall together.
         self.elapsed = (np.arange(self.size) * self._limit) // self.size
 
@@ -163,8 +167,11 @@ class SacRun(Run):
                 action = rng.uniform(-1, 1, (settings.simulations, task.action_size)).astype(np.float32)
             else:
                 action = learner.act(observation)
+            before = episodes.batch.path_length() if settings.progress else 0.0
             result = episodes.batch.step(action)
             reward = result.reward
+            if settings.progress:
+                reward = reward + settings.progress * (before - episodes.batch.path_length())
             if settings.shaping:
                 reward = reward + settings.shaping * shaping(result.state)
             buffer.add(
@@ -242,6 +249,8 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         check_same(folder, found, config)
     elif folder.is_file() or (folder.exists() and any(folder.iterdir())):
         raise DmcvbError(f"{folder} is not empty and holds no run; choose another --out")
+    if config.init_from and not Path(config.init_from).is_file() and not read_config(config.init_from):
+        raise DmcvbError(f"--init-from {config.init_from} is neither a run folder nor a policy file")
     run = run_class(config.algorithm)(folder, config)
     if config.steps <= run.warmup():
         raise DmcvbError(
