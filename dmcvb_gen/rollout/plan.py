@@ -31,6 +31,7 @@ from dmcvb_gen.store.writer import (
     start_release,
 )
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import fixed_pairs
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,8 @@ def make_plan(
     for request in requests:
         files = release_policies(request)
         task = get_task(request.task)
+        if request.episodes_per_goal:
+            fixed_pairs(task.layout, request.episodes // request.episodes_per_goal, recipe.seed)
         policy_files[request.name] = tuple(str(path) for path in files)
         policies = [load_policy(path, task) for path in files]
         setting = distractor_of(request.task, request.setting)
@@ -206,7 +209,7 @@ def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, e
             continue
         commits = read_commits(root, record) if (root / "manifest.json").exists() else {}
         done += len(commits)
-        shared = recipe.trajectories == "shared" and request.setting != "fixed"
+        shared = recipe.trajectories == "shared" and not is_maze(record.task)  # every maze subset has both pictures
         names = (record.task, record.level) if shared else (record.task, record.level, record.setting)
         for shard in range(shard_count(record)):
             first, last = shard_episodes(record, shard)

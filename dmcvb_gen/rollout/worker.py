@@ -20,6 +20,7 @@ from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord
 from dmcvb_gen.store.schema import pixel_array_names
 from dmcvb_gen.store.writer import write_shard
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from dmcvb_gen.tasks.base import Task
 
 PAINT_FRAMES = 2004
@@ -46,8 +47,6 @@ def simulate_job(job: Job, threads: int = 1) -> Simulation:
     task = get_task(job.subsets[0].task)
     pairs = None
     if job.fixed_goals:
-        from dmcvb_gen.tasks.ant_maze import fixed_pairs
-
         pairs = fixed_pairs(task.layout, job.fixed_goals, job.seed)
     return simulate(
         task,

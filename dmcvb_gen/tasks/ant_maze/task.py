@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from dmcvb_gen.tasks.ant_maze.arena import CAMERAS, GOAL_HEIGHT, GOAL_RADIUS, PHYSICS_STEP, build_arena, look_numbers
-from dmcvb_gen.tasks.ant_maze.distance import look_up, make_field
+from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import Layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, Task
 
@@ -90,6 +90,7 @@ class AntMazeBatch(EpisodeBatch):
         shape = tuple(10 * cells for cells in task.layout.shape)
         self._fields, self._largest = np.zeros((size, *shape)), np.ones(size)
         self._touched = np.zeros(size, bool)
+        self._paths = None
 
     # -- starting -----------------------------------------------------------------------------
 
@@ -151,6 +152,8 @@ class AntMazeBatch(EpisodeBatch):
         for sim in ids:
             field = make_field(self.task.reward, self.task.layout, self._mocap[sim, 0])
             self._fields[sim], self._largest[sim] = field.values, field.largest
+            if self._paths is not None:
+                self._paths[sim] = geodesic_field(self.task.layout, self._mocap[sim, 0]).values
         self._touched[ids] = self._touching(ids)
 
     # -- stepping -----------------------------------------------------------------------------
@@ -185,6 +188,15 @@ class AntMazeBatch(EpisodeBatch):
         """(size,): distance to the goal over its maximum in the maze, in [0, 1]."""
         position = self._xpos[:, self._torso, :2]
         return look_up(self.task.reward, self.task.layout, self._fields, position) / self._largest
+
+    def track_paths(self) -> None:
+        """Keep fields of the shortest path for `path_length`, from the next reset on."""
+        self._paths = np.zeros_like(self._fields)
+
+    def path_length(self) -> np.ndarray:
+        """(size,): length of the shortest path to the goal's center, meters; 0 once it is touched."""
+        position = self._xpos[:, self._torso, :2]
+        return np.where(self._touched, 0.0, look_up("geodesic", self.task.layout, self._paths, position))
 
     def state(self):
         position, goal = self._xpos[:, self._torso], self.goal()

@@ -1,0 +1,175 @@
+"""Maze releases: views with and without the goal, early ends, fixed pairs, the same bits however made."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.distractors import DistractorSetting, make_exogenous
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rendering import available_renderers, make_renderer
+from dmcvb_gen.rollout.recipe import make_recipe
+from dmcvb_gen.store import open_release
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from tests.conftest import roll_out
+
+TINY = "ant-maze-tiny:****/*..*/****"
+"""Two cells: even random actions find the goal now and then."""
+
+
+def maze_recipe(settings=("visible",), **changes):
+    pattern = {"tasks": TINY, "levels": "random", "settings": list(settings), "episodes": 2, "episodes_per_shard": 1}
+    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "warp", "samples": 1}}
+    return make_recipe(fields | {"subsets": [pattern | changes]})
+
+
+@pytest.fixture(scope="module")
+def maze_release(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("maze") / "release"
+    return folder, roll_out(maze_recipe(), folder)
+
+
+def test_a_maze_release_is_sound_and_the_same_with_two_workers(maze_release, tmp_path):
+    folder, manifest = maze_release
+    result = verify(folder)
+    assert result.sound, result.findings
+    again = roll_out(maze_recipe(), tmp_path / "again", workers=2, jobs=lambda jobs: jobs[::-1])
+    assert [subset.digest for subset in again.subsets] == [subset.digest for subset in manifest.subsets]
+
+
+def test_all_views_with_and_without_the_goal(maze_release):
+    subset = open_release(maze_release[0])["ant-maze-tiny/random/visible"]
+    task, episode = get_task(TINY), subset.episode(0)
+    assert set(subset.pixel_arrays) == {
+        f"{root}/{view}" for root in ("pixels", "pixels_hidden_goal") for view in task.views
+    }
+    length = len(episode["action"])
+    assert episode["pixels/top"].shape == (length + 1, 16, 16, 3)
+    assert (episode["pixels/top"] != episode["pixels_hidden_goal/top"]).any(axis=(1, 2, 3)).all()
+    assert len(np.unique(episode["exogenous/style"])) == 1
+    assert episode["exogenous/style"][0] // 100 in (2, 3, 4, 5)
+    if episode["terminated"]:
+        assert episode["discount"][-1] == 0 and episode["state"][-1, task.state_slices["target_activated"]] == 1
+    assert (episode["reward"] <= 0).all() and (episode["reward"] >= -2).all()
+
+
+def test_an_episode_that_ends_early_costs_nothing_past_its_end(tmp_path):
+    """Bytes follow the length: chunks past the end are not written."""
+    subset = open_release(_fixed_release(tmp_path)).subsets["ant-maze-tiny/random/fixed"]
+    sizes = {
+        shard: sum(file.bytes for file in commit.files if "pixels" in file.path)
+        for shard, commit in subset.commits.items()
+    }
+    lengths = dict(zip(subset.commits, subset.lengths, strict=True))
+    shortest, longest = min(lengths, key=lengths.get), max(lengths, key=lengths.get)
+    assert lengths[shortest] < 1200  # else this test shows nothing: take another seed
+    # Whole chunks of 32 steps and an index a file.
+    share = (lengths[shortest] + 33) / (lengths[longest] + 1)
+    assert sizes[shortest] <= sizes[longest] * share * 1.5 + 20_000
+
+
+def _fixed_release(tmp_path):
+    folder = tmp_path / "fixed"
+    roll_out(maze_recipe(settings=("fixed",), episodes=None, fixed_goals=2, episodes_per_goal=2), folder)
+    return folder
+
+
+def test_fixed_goals(tmp_path):
+    subset = open_release(_fixed_release(tmp_path))["ant-maze-tiny/random/fixed"]
+    np.testing.assert_array_equal(subset.read("goal_pair"), [0, 0, 1, 1])
+    task = get_task(TINY)
+    first = [subset.episode(i, ["state", "length"])["state"][0] for i in range(4)]
+    goals = np.array([state[task.state_slices["target_position"]] for state in first])
+    np.testing.assert_array_equal(goals[[0, 2]], goals[[1, 3]])
+    for (_, goal), position in zip(fixed_pairs(task.layout, 2, 0), goals[::2], strict=True):
+        assert np.abs(position[:2] - task.layout.world(goal)).max() <= 0.5 + 1e-6
+    joints = np.array([state[task.state_slices["joints_pos"]] for state in first])
+    assert (joints[0] != joints[1]).all()
+
+
+@pytest.mark.parametrize("name", ["warp", "opengl"])
+def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
+    reason = available_renderers()[name]
+    if reason:
+        pytest.skip(reason)
+    task = get_task("ant-maze-easy7x7b")
+    batch = task.batch(24)
+    batch.reset([np.random.default_rng([7, i]) for i in range(24)])
+    physics = batch.physics()
+    generators = {"style": [np.random.default_rng(i) for i in range(24)]}
+    labels = make_exogenous(task, DistractorSetting(), physics[:, None], generators)[:, 0]
+    renderer = make_renderer(name, task, 32)
+    visible, hidden = renderer.render(physics, labels), renderer.render(physics, labels, hide_goal=True)
+    renderer.close()
+    seen_anywhere = 0
+    for column, view in enumerate(task.views):
+        differs = (visible[:, column] != hidden[:, column]).any(axis=(1, 2, 3))
+        in_sight = task.goal_in_sight(view, physics, labels)
+        assert not (differs & ~in_sight).any()
+        seen_anywhere += int((~in_sight).sum())
+        if view == "top":
+            assert differs.all()
+    assert seen_anywhere > 10  # pictures that need no second rendering
+
+
+def test_renderers_agree_on_mazes():
+    """warp's pictures are near OpenGL's in every view and style."""
+    reason = available_renderers()["opengl"]
+    if reason:
+        pytest.skip(reason)
+    task = get_task("ant-maze-medium7x7c")
+    batch = task.batch(12)
+    batch.reset([np.random.default_rng([1, i]) for i in range(12)])
+    physics = batch.physics()
+    generators = {"style": [np.random.default_rng(i) for i in range(12)]}
+    labels = make_exogenous(task, DistractorSetting(), physics[:, None], generators)[:, 0]
+    pictures = []
+    for name in ("warp", "opengl"):
+        renderer = make_renderer(name, task, 64)
+        pictures.append(renderer.render(physics, labels).astype(int))
+        renderer.close()
+    difference = np.abs(pictures[0] - pictures[1]).mean(axis=(0, 2, 3, 4))
+    assert (difference < [10, 4, 4, 4]).all(), difference
+
+
+def test_styles_of_data_and_of_evaluation_are_apart():
+    task = get_task("ant-maze-empty7x7")
+    physics = np.repeat(task.batch(1).physics()[None], 200, axis=0)
+    generators = {"style": [np.random.default_rng(i) for i in range(200)]}
+    train = make_exogenous(task, DistractorSetting(), physics, generators, split="train").style
+    val = make_exogenous(task, DistractorSetting(), physics, generators, split="val").style
+    assert set(np.unique(train) // 100) == {2, 3, 4, 5} and set(np.unique(val) // 100) == {1}
+    assert len(np.unique(train)) == 16
+
+
+def test_bad_requests(tmp_path):
+    def run(*arguments):
+        return CliRunner().invoke(main, ["rollout", *arguments, "--out", str(tmp_path / "r")])
+
+    hole = tmp_path / "hole.txt"
+    hole.write_text("****\n*   \n****\n")
+    for arguments, message in [
+        (["--layout", str(hole)], "hole"),
+        (["--layout", "no-such"], "ant-maze-empty7x7"),
+        (["ant-maze-empty7x7", "--distractor", "dynamic"], "--goal"),
+        (["ant-maze-empty7x7", "--goal", "seen"], "visible"),
+        (["walker-walk", "--goal", "hidden"], "ant-maze"),
+        (["ant-maze-empty7x7", "--fixed-goals", "100000"], "fixed-goals"),
+        (["ant-maze-empty7x7", "--steps", "100"], "episodes"),
+    ]:
+        result = run(*arguments)
+        assert result.exit_code == 2 and message in result.output, (arguments, result.output)
+    assert not (tmp_path / "r").exists()
+
+
+def test_show_maze(tmp_path):
+    out = tmp_path / "maze.png"
+    result = CliRunner().invoke(main, ["show-maze", "easy7x7c", "--out", str(out), "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["path_m"] > 10 and out.read_bytes()[:4] == b"\x89PNG"
+    assert CliRunner().invoke(main, ["show-maze", "easy7x7c", "--goal", "0,0"]).exit_code == 2
