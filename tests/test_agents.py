@@ -1,0 +1,381 @@
+"""Agents: sizes as in the paper, gradients where they belong, targets by hand, and each learns what it is shown."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dmcvb_gen.agents.catalog import AGENTS, make_encoder, make_policy, make_pretrainer, parse_agent
+from dmcvb_gen.agents.dino import VisionTransformer, load_dino
+from dmcvb_gen.agents.learners import (
+    TD3BC,
+    Autoencoder,
+    Batch,
+    BehaviorCloning,
+    InverseDynamics,
+    LatentForwardDynamics,
+    ObservationReadout,
+    StatePrediction,
+    StateReadout,
+    move_towards,
+)
+from dmcvb_gen.agents.networks import (
+    MLP,
+    Convolutions,
+    ObservationDecoder,
+    observation_encoder,
+    state_decoder,
+    state_encoder,
+)
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+
+SIZE, CHANNELS, ACTIONS, STATES = 16, 9, 6, 24
+
+
+def make_batch(count=8, seed=0, k=1):
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(shape, generator=generator) - 0.5
+
+    return Batch(
+        observation=uniform(count, CHANNELS, SIZE, SIZE),
+        state=2 * uniform(count, STATES),
+        action=1.8 * uniform(count, ACTIONS),
+        reward=uniform(count) + 0.5,
+        discount=torch.ones(count),
+        next_observation=uniform(count, CHANNELS, SIZE, SIZE),
+        k=torch.full((count,), k),
+    )
+
+
+def small_encoder(seed=0):
+    torch.manual_seed(seed)
+    return observation_encoder(CHANNELS, SIZE)
+
+
+def parameters(module):
+    return sum(p.numel() for p in module.parameters())
+
+
+def moved(learner, updates=1):
+    """Names of the parameters that change in so many updates."""
+    before = {name: value.clone() for name, value in learner.named_parameters()}
+    for index in range(updates):
+        learner.update(make_batch(seed=index))
+    return {name for name, value in learner.named_parameters() if not torch.equal(before[name], value)}
+
+
+def names(learner, *prefixes):
+    return {name for name, _ in learner.named_parameters() if name.startswith(prefixes)}
+
+
+# -- sizes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels, first", [(9, 9 * 32 * 9 + 32), (27, 27 * 32 * 9 + 32)])
+def test_the_encoder_has_the_papers_sizes(channels, first):
+    encoder = observation_encoder(channels)
+    convolutions = first + 32 * 64 * 9 + 64 + 64 * 128 * 9 + 128 + 128 * 256 * 9 + 256
+    assert parameters(encoder.body) == convolutions and encoder.body.features == 65_536
+    assert parameters(encoder.trunk) == 65_536 * 64 + 64 + 2 * 64
+    latent = encoder(torch.rand(2, channels, 64, 64) - 0.5)
+    assert latent.shape == (2, 64) and latent.abs().max() < 1
+
+
+def test_the_decoder_is_the_encoder_in_reverse():
+    decoder = ObservationDecoder(9)
+    kernels = 256 * 128 * 9 + 128 + 128 * 64 * 9 + 64 + 64 * 32 * 9 + 32 + 32 * 9 * 9 + 9
+    assert parameters(decoder) == 64 * 65_536 + 65_536 + kernels
+    assert decoder(torch.zeros(2, 64)).shape == (2, 9, 64, 64)
+
+
+def test_state_networks_and_heads_have_the_papers_sizes():
+    assert parameters(state_encoder(24)) == 24 * 64 + 64 + 2 * 64
+    head = 64 * 256 + 256 + 256 * 256 + 256
+    assert parameters(MLP(64, 6, tanh=True)) == head + 256 * 6 + 6
+    assert parameters(state_decoder(24)) == head + 256 * 24 + 24
+    assert state_decoder(24)(torch.full((1, 64), 1e3)).abs().max() > 1  # states are not bounded
+
+
+def test_weights_start_orthogonal():
+    weight = state_encoder(24).trunk[0].weight
+    torch.testing.assert_close(weight.T @ weight, torch.eye(24), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("sample", [False, True])
+def test_inverse_dynamics_embeds_k_only_where_it_is_sampled(sample):
+    learner = InverseDynamics(small_encoder(), ACTIONS, k_max=4, sample_k=sample)
+    inputs = 64 * (3 if sample else 2)
+    assert learner.f[0].in_features == inputs
+    near, far = make_batch(k=1), make_batch(k=4)
+    same = torch.equal(learner.metrics(near)["loss"], learner.metrics(far)["loss"])
+    assert same is not sample
+
+
+def test_td3_critics_are_not_bounded():
+    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    last = learner.net.critic1[-1]
+    torch.nn.init.constant_(last.bias, 150.0)
+    value, _ = learner.net.values(torch.zeros(3, STATES), torch.zeros(3, ACTIONS))
+    assert value.shape == (3,) and value.min() > 100
+
+
+# -- gradients ------------------------------------------------------------------------------------
+
+
+def td3(alpha=2.5):
+    torch.manual_seed(0)
+    body = Convolutions(CHANNELS, SIZE)
+    return TD3BC(body, body.features, ACTIONS, alpha=alpha)
+
+
+MOVED = {
+    "bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS), ("encoder", "policy")),
+    "frozen bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS, frozen=True), ("policy",)),
+    "id": (lambda: InverseDynamics(small_encoder(), ACTIONS), ("encoder", "f.")),
+    "sampled id": (lambda: InverseDynamics(small_encoder(), ACTIONS, 4, True), ("encoder", "f.", "embed_k")),
+    "lfd": (lambda: LatentForwardDynamics(small_encoder(), ACTIONS), ("encoder", "embed_action", "g.", "target_")),
+    "ae": (lambda: Autoencoder(small_encoder(), CHANNELS, SIZE), ("encoder", "decoder")),
+    "state": (lambda: StatePrediction(small_encoder(), STATES), ("encoder", "h.")),
+    "observation readout": (lambda: ObservationReadout(small_encoder(), CHANNELS, SIZE), ("decoder",)),
+    "state readout": (lambda: StateReadout(small_encoder(), STATES), ("h.",)),
+    "td3-bc, critics first": (td3, ("net.critic1", "net.critic2")),
+}
+
+
+@pytest.mark.parametrize("kind", MOVED)
+def test_one_update_moves_exactly_the_parameters_that_the_paper_says(kind):
+    make, prefixes = MOVED[kind]
+    learner = make()
+    assert moved(learner) == names(learner, *prefixes)
+
+
+def test_td3_bc_moves_convolutions_and_both_trunks_by_the_actors_loss_alone():
+    learner = td3()
+    by_critic = {id(p) for group in learner.optimizers["critic"].param_groups for p in group["params"]}
+    heads = [*learner.net.critic1.parameters(), *learner.net.critic2.parameters()]
+    assert by_critic == {id(p) for p in heads}
+    critic = learner.critic_loss(make_batch())
+    critic.backward()
+    reached = {name for name, p in learner.net.named_parameters() if p.grad is not None}
+    assert {name.split(".")[0] for name in reached} == {"critic1", "critic2"}
+    learner.zero_grad(set_to_none=True)
+    learner.actor_loss(make_batch())[0].backward()
+    reached = {name.split(".")[0] for name, p in learner.net.named_parameters() if p.grad is not None}
+    assert {"body", "actor_trunk", "critic_trunk", "actor"} <= reached
+    before = [p.clone() for p in heads]
+    learner._descend("actor", learner.actor_loss(make_batch())[0])
+    assert all(torch.equal(old, new) for old, new in zip(before, heads, strict=True))
+    second = moved(learner, 2)  # the second update is the actor's turn
+    assert names(learner, "net.body", "net.actor_trunk", "net.critic_trunk", "net.actor") <= second
+    assert {name for name in second if name.startswith("target")}, "targets follow"
+
+
+def test_td3_bc_on_a_frozen_encoder_leaves_it_alone():
+    encoder = small_encoder()
+    learner = TD3BC(encoder, encoder.features, ACTIONS, frozen=True)
+    assert learner.target.body is learner.net.body
+    assert not any("body" in name for name in moved(learner, 4))
+    assert "net.actor.0.weight" in moved(learner, 2)
+
+
+# -- targets by hand ------------------------------------------------------------------------------
+
+
+def test_a_target_moves_a_hundredth_of_the_way():
+    old, new = torch.nn.Linear(1, 1, bias=False), torch.nn.Linear(1, 1, bias=False)
+    old.weight.data.fill_(1.0)
+    new.weight.data.fill_(3.0)
+    move_towards(old, new)
+    assert old.weight.item() == pytest.approx(0.99 * 1 + 0.01 * 3)
+    move_towards(old, new)
+    assert old.weight.item() == pytest.approx(0.99 * 1.02 + 0.01 * 3)
+
+
+def test_lfds_target_is_an_average_of_the_encoders():
+    learner = LatentForwardDynamics(small_encoder(), ACTIONS)
+    first = learner.target_encoder.trunk[0].weight.clone()
+    learner.update(make_batch(seed=0))
+    after_one = learner.encoder.trunk[0].weight.detach().clone()
+    learner.update(make_batch(seed=1))
+    after_two = learner.encoder.trunk[0].weight.detach()
+    by_hand = 0.99 * (0.99 * first + 0.01 * after_one) + 0.01 * after_two
+    torch.testing.assert_close(learner.target_encoder.trunk[0].weight, by_hand, atol=1e-7, rtol=1e-6)
+
+
+def constant(mlp, value):
+    torch.nn.init.zeros_(mlp[-1 if isinstance(mlp[-1], torch.nn.Linear) else -2].weight)
+    torch.nn.init.constant_(mlp[-1 if isinstance(mlp[-1], torch.nn.Linear) else -2].bias, value)
+
+
+def test_td3s_target_value_by_hand():
+    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    constant(learner.target.critic1, 5.0)
+    constant(learner.target.critic2, 3.0)
+    batch = Batch(
+        observation=torch.zeros(2, STATES),
+        state=torch.zeros(2, STATES),
+        action=torch.zeros(2, ACTIONS),
+        reward=torch.tensor([1.0, 2.0]),
+        discount=torch.tensor([1.0, 0.0]),
+        next_observation=torch.zeros(2, STATES),
+    )
+    torch.testing.assert_close(learner.target_value(batch), torch.tensor([1.0 + 0.99 * 3.0, 2.0]))
+    loss = learner.critic_loss(batch)
+    constant(learner.net.critic1, 0.0)
+    constant(learner.net.critic2, 0.0)
+    assert learner.critic_loss(batch).item() == pytest.approx(2 * ((1 + 2.97) ** 2 + 2**2) / 2) and loss.isfinite()
+
+
+def test_td3s_policy_noise_and_the_noisy_action_are_clipped(monkeypatch):
+    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    constant(learner.target.actor, math.atanh(0.8))
+    seen = []
+    values = learner.target.values
+    monkeypatch.setattr(learner.target, "values", lambda body, action: seen.append(action) or values(body, action))
+    batch = Batch(*[torch.zeros(2, n) for n in (STATES, STATES, ACTIONS)], torch.zeros(2), torch.ones(2))
+    batch = Batch(**{**batch.__dict__, "next_observation": torch.zeros(2, STATES)})
+    learner.target_value(batch, noise=torch.full((2, ACTIONS), -9.0))
+    learner.target_value(batch, noise=torch.full((2, ACTIONS), 9.0))
+    torch.testing.assert_close(seen[0], torch.full((2, ACTIONS), 0.3))
+    torch.testing.assert_close(seen[1], torch.ones(2, ACTIONS))
+
+
+def test_without_alpha_td3_bc_is_bc():
+    actor_critic = td3(alpha=0.0)
+    bc = BehaviorCloning(small_encoder(1), ACTIONS)
+    bc.encoder.body.load_state_dict(actor_critic.net.body.state_dict())
+    bc.encoder.trunk.load_state_dict(actor_critic.net.actor_trunk.state_dict())
+    bc.policy.load_state_dict(actor_critic.net.actor.state_dict())
+    for index in range(4):
+        actor_critic.update(make_batch(seed=index))
+        if index % 2:  # the actor's turn
+            bc.update(make_batch(seed=index))
+    observation = make_batch(seed=9).observation
+    torch.testing.assert_close(actor_critic.act(observation), bc.act(observation), atol=1e-6, rtol=1e-5)
+
+
+# -- learning -------------------------------------------------------------------------------------
+
+OVERFIT = {
+    "bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS), 40, 0.05),
+    "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), ACTIONS), 60, 0.05),
+    "frozen bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS, frozen=True), 60, 0.05),
+    "td3-bc": (lambda: td3(alpha=0.01), 80, 0.1),
+    "td3-bc on states": (lambda: TD3BC(torch.nn.Identity(), STATES, ACTIONS, alpha=0.01), 150, 0.1),
+    "id": (lambda: InverseDynamics(small_encoder(), ACTIONS), 40, 0.05),
+    "sampled id": (lambda: InverseDynamics(small_encoder(), ACTIONS, 4, True), 40, 0.05),
+    "lfd": (lambda: LatentForwardDynamics(small_encoder(), ACTIONS), 40, 0.3),
+    "ae": (lambda: Autoencoder(small_encoder(), CHANNELS, SIZE), 60, 0.7),
+    "state": (lambda: StatePrediction(small_encoder(), STATES), 60, 0.3),
+    "observation readout": (lambda: ObservationReadout(small_encoder(), CHANNELS, SIZE), 60, 0.7),
+    "state readout": (lambda: StateReadout(small_encoder(), STATES), 80, 0.05),
+}
+
+
+@pytest.mark.parametrize("kind", OVERFIT)
+def test_each_learner_overfits_eight_transitions(kind):
+    make, updates, share = OVERFIT[kind]
+    torch.manual_seed(0)
+    learner, batch = make(), make_batch()
+    if "on states" in kind:
+        batch = Batch(**{**batch.__dict__, "observation": batch.state, "next_observation": batch.state})
+    before = learner.metrics(batch)["loss"].item()
+    for _ in range(updates):
+        learner.update(batch)
+    assert learner.metrics(batch)["loss"].item() < share * before
+
+
+def test_bfloat16_changes_the_precision_and_not_the_meaning():
+    learner, batch = BehaviorCloning(small_encoder(), ACTIONS), make_batch()
+    exact = learner.metrics(batch)["loss"]
+    learner.half = True
+    rough = learner.metrics(batch)["loss"]
+    assert rough.dtype == torch.float32 and rough.item() == pytest.approx(exact.item(), rel=0.05)
+    assert rough.item() != exact.item()
+    learner.update(batch)
+    assert all(p.dtype == torch.float32 for p in learner.parameters())
+
+
+# -- names ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_agents_name_is_read_back(name):
+    assert parse_agent(name).name == name
+
+
+def test_names_of_the_paper_and_options_are_understood():
+    assert parse_agent("null+bc") == parse_agent("bc") and parse_agent("BC(state)").sees_state
+    assert parse_agent("bc").paper_name == "null+bc" and parse_agent("state-bc").paper_name == "bc(state)"
+    agent = parse_agent("id+bc:frames=1,k=5,sample")
+    assert (agent.stack, agent.k, agent.sample_k, agent.paper_name) == (1, 5, True, None)
+    assert parse_agent(agent.name) == agent
+
+
+@pytest.mark.parametrize("name", ["idd+bc", "id+", "bc+id", ""])
+def test_an_unknown_agent_is_refused_with_the_known_ones(name):
+    with pytest.raises(UnknownNameError, match="id\\+bc"):
+        parse_agent(name)
+
+
+@pytest.mark.parametrize("name", ["bc:frames=0", "bc:depth=3", "id+bc:k=x"])
+def test_an_unknown_option_is_refused_with_the_known_ones(name):
+    with pytest.raises(DmcvbError, match="frames=1"):
+        parse_agent(name)
+
+
+# -- DINO -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def dino_file(tmp_path):
+    torch.manual_seed(0)
+    weights = VisionTransformer(64, 2, 16, 128).state_dict()
+    save_file(weights | {"head.weight": torch.zeros(3, 64)}, str(tmp_path / "dino.safetensors"))
+    return tmp_path / "dino.safetensors"
+
+
+def test_dino_gives_every_picture_of_a_stack_its_token_and_never_learns(dino_file):
+    encoder = load_dino(dino_file, channels=9)
+    observation = torch.rand(2, 9, 64, 64) - 0.5
+    features = encoder(observation)
+    assert features.shape == (2, 3 * 64) and encoder.features == 3 * 64
+    alone = load_dino(dino_file, channels=3)(observation[:, 3:6])
+    torch.testing.assert_close(features[:, 64:128], alone, atol=1e-5, rtol=1e-5)
+    learner = BehaviorCloning(encoder, ACTIONS, frozen=True)
+    assert not any(p.requires_grad for p in encoder.parameters())
+    assert learner.act(observation).shape == (2, ACTIONS)
+
+
+def test_dino_without_weights_says_what_to_give():
+    with pytest.raises(DmcvbError, match="--dino-weights"):
+        load_dino(None, channels=9)
+
+
+def test_a_file_that_is_no_dino_is_refused(tmp_path):
+    save_file({"x": torch.zeros(1)}, str(tmp_path / "x.safetensors"))
+    with pytest.raises(DmcvbError, match="does not hold"):
+        load_dino(tmp_path / "x.safetensors", channels=9)
+    (tmp_path / "y.safetensors").write_bytes(b"not one")
+    with pytest.raises(DmcvbError, match="cannot read"):
+        load_dino(tmp_path / "y.safetensors", channels=9)
+
+
+@pytest.mark.parametrize("name", [name for name in AGENTS if not name.startswith("dino")])
+def test_every_agent_can_be_made_and_acts(name):
+    from tests.test_agents_data import make_data
+
+    agent, data = parse_agent(name), make_data()
+    data = data.states_only() if agent.sees_state else data
+    encoder = make_encoder(agent, data)
+    if agent.pretrain:
+        make_pretrainer(agent, encoder, data)
+    policy = make_policy(agent, encoder, data)
+    action = policy.act(data.observe(data.train_rows[:3], *data._no_shift(3)))
+    assert action.shape == (3, 2) and action.abs().max() <= 1
+    assert policy.encoder.features == (64 if not agent.sees_state else policy.encoder.features)

@@ -1,0 +1,239 @@
+"""Training data and the trainer: the right frames, shifts and split, and the same bits after a stop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from dmcvb_gen.agents import trainer
+from dmcvb_gen.agents.data import PAD, HeldFrames, Source, TrainingData, batches, load_data
+from dmcvb_gen.agents.learners import BehaviorCloning
+from dmcvb_gen.agents.networks import observation_encoder, state_encoder
+from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.store import open_release
+
+LENGTHS = np.array([4, 7, 2])
+SIZE = 16
+
+
+def make_data(stack=3, held=(False, True, False), size=SIZE):
+    """Three short episodes of random pictures; action (row, row), reward row."""
+    generator = torch.Generator().manual_seed(0)
+    rows = int((LENGTHS + 1).sum())
+    count = torch.arange(rows, dtype=torch.float32)
+    return TrainingData(
+        state=torch.rand((rows, 5), generator=generator),
+        action=torch.stack([count, count], dim=1) / rows,
+        reward=count,
+        discount=torch.ones(rows),
+        lengths=LENGTHS,
+        held_out=np.array(held),
+        frames=HeldFrames(torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8)),
+        stack=stack,
+    )
+
+
+def by_hand(pictures, rows, down, right):
+    """A stack padded by numpy and cut out."""
+    stack = np.concatenate([pictures[row] for row in rows])
+    size = stack.shape[-1]
+    padded = np.pad(stack, ((0, 0), (PAD, PAD), (PAD, PAD)), mode="symmetric")
+    return padded[:, down : down + size, right : right + size].astype(np.float32) / 255 - 0.5
+
+
+def test_a_stack_is_the_last_frames_with_the_first_one_repeated_under_one_shift():
+    data = make_data()
+    pictures = data.frames.pictures.numpy()
+    stacks = {0: (0, 0, 0), 1: (0, 0, 1), 2: (0, 1, 2), 5: (5, 5, 5), 6: (5, 5, 6), 12: (10, 11, 12), 14: (13, 13, 14)}
+    rows = torch.tensor(list(stacks))
+    generator = np.random.default_rng(0)
+    down, right = generator.integers(2 * PAD + 1, size=(2, len(rows)))
+    down[0], right[0], down[1], right[1] = 0, 8, 8, 0
+    seen = data.observe(rows, torch.from_numpy(down), torch.from_numpy(right)).numpy()
+    for index, stack in enumerate(stacks.values()):
+        np.testing.assert_allclose(seen[index], by_hand(pictures, stack, down[index], right[index]), atol=1e-6)
+
+
+def test_transitions_are_those_of_training_episodes_and_never_leave_theirs():
+    data = make_data()
+    batch = data.batch(400, np.random.default_rng(0), next_observation=True, k=3, sample_k=True)
+    row = batch.reward.long()
+    assert set(row.tolist()) == {0, 1}  # rows 0..3 are transitions; three steps on must still be the episode
+    assert set(batch.k.tolist()) == {1, 2, 3}
+    alone = data.batch(400, np.random.default_rng(0))
+    assert set(alone.reward.long().tolist()) == {0, 1, 2, 3, 13, 14} and alone.next_observation is None
+    held = data.batch(100, np.random.default_rng(0), hold_out=True)
+    assert set(held.reward.long().tolist()) == set(range(5, 12))
+
+
+def test_the_next_observation_is_k_steps_on_under_the_same_shift():
+    data, pictures = make_data(), make_data().frames.pictures.numpy()
+    batch = data.batch(64, np.random.default_rng(1), next_observation=True, k=2)
+    for index, row in enumerate(batch.reward.long().tolist()):
+        shifts = [
+            (down, right)
+            for down in range(2 * PAD + 1)
+            for right in range(2 * PAD + 1)
+            if np.allclose(batch.observation[index], by_hand(pictures, _stack(row), down, right), atol=1e-6)
+        ]
+        assert len(shifts) == 1
+        np.testing.assert_allclose(
+            batch.next_observation[index], by_hand(pictures, _stack(row + 2), *shifts[0]), atol=1e-6
+        )
+
+
+def _stack(row):
+    first = {True: 0}.get(row <= 4, 13)
+    return [max(row - 2, first), max(row - 1, first), row]
+
+
+def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
+    data = make_data()
+    one = data.batch(32, np.random.default_rng(0), hold_out=True)
+    rows = one.reward.long()
+    torch.testing.assert_close(one.observation, data.observe(rows, *data._no_shift(32)))
+    two = data.batch(32, np.random.default_rng(0))
+    plain = data.observe(two.reward.long(), *data._no_shift(32))
+    same = (two.observation == plain).flatten(1).all(dim=1)
+    assert same.sum() < 8
+
+
+def test_states_are_normalized_by_the_training_episodes_with_a_floor():
+    data = make_data()
+    raw = torch.rand((16, 5), generator=torch.Generator().manual_seed(0))
+    train_rows = np.r_[0:5, 13:16]
+    expected = (raw - raw[train_rows].mean(0)) / raw[train_rows].std(0, correction=0)
+    torch.testing.assert_close(data.state, expected, atol=1e-5, rtol=1e-5)
+    flat = TrainingData(
+        state=torch.full((4, 2), 7.0),
+        action=torch.zeros(4, 1),
+        reward=torch.zeros(4),
+        discount=torch.ones(4),
+        lengths=np.array([3]),
+        held_out=np.array([False]),
+    )
+    assert flat.normalization.std.tolist() == pytest.approx([1e-3, 1e-3]) and flat.state.abs().max() == 0
+
+
+def test_it_is_a_torch_data_set_that_a_loader_reads_batch_by_batch():
+    data = make_data()
+    observations, actions = next(iter(DataLoader(data, batch_size=6)))
+    assert observations.shape == (6, 9, SIZE, SIZE) and len(data) == 6
+    torch.testing.assert_close(observations[3], data[3][0])
+    torch.testing.assert_close(actions, data.action[data.train_rows])
+
+
+def test_a_subset_is_held_as_it_is_stored(small_release):
+    subset = open_release(small_release)["walker-walk/random/dynamic"]
+    data = load_data([Source(subset)])
+    assert isinstance(data.frames, HeldFrames) and data.channels == 9
+    assert (data.held_out.sum(), len(data), len(data.hold_out_rows)) == (1, 1000, 500)
+    episode = subset.episode(2)
+    last = data.observe(torch.tensor([2 * 501 + 400]), *data._no_shift(1))[0, -3:]
+    np.testing.assert_allclose(last, episode["pixels"][400].transpose(2, 0, 1) / 255 - 0.5, atol=1e-6)
+    np.testing.assert_array_equal(data.action[2 * 501 : 2 * 501 + 500], episode["action"])
+    raw = data.state * data.normalization.std + data.normalization.mean
+    np.testing.assert_allclose(raw[2 * 501 + 7], episode["state"][7], atol=1e-4)
+
+
+def test_pictures_that_do_not_fit_are_read_from_the_shards_and_are_the_same(small_release):
+    sources = [Source(open_release(small_release)[f"walker-walk/random/{name}"]) for name in ("none", "dynamic")]
+    held, stored = load_data(sources), load_data(sources, memory=0)
+    for hold_out in (False, True):
+        one, two = (
+            data.batch(12, np.random.default_rng(3), next_observation=True, k=5, hold_out=hold_out)
+            for data in (held, stored)
+        )
+        torch.testing.assert_close(one.observation, two.observation)
+        torch.testing.assert_close(one.next_observation, two.next_observation)
+    assert len(held) == 2000
+
+
+def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):
+    subset = open_release(small_release)["walker-walk/random/none"]
+    half, two = load_data([Source(subset, share=0.34)]), load_data([Source(subset, episodes=2)])
+    assert (len(half.lengths), len(half), len(half.hold_out_rows)) == (1, 500, 0)
+    assert (len(two.lengths), len(two), len(two.hold_out_rows)) == (2, 500, 500)
+    again = load_data([Source(subset, episodes=2)])
+    torch.testing.assert_close(again.action, two.action)
+    assert not torch.equal(load_data([Source(subset, episodes=2)], seed=5).action, two.action)
+
+
+def test_states_alone_need_no_pictures(small_release):
+    data = load_data([Source(open_release(small_release)["walker-walk/random/none"])], pixels=False)
+    batch = data.batch(4, np.random.default_rng(0), next_observation=True)
+    assert batch.observation.shape == (4, 24) and torch.equal(batch.observation, batch.state)
+
+
+def test_batches_drawn_ahead_come_in_order_and_are_the_same():
+    data, learner = make_data(), BehaviorCloning(observation_encoder(9, SIZE), 2)
+    plain, ahead = (list(batches(lambda step: draw(learner, data, 4, 0, step), 2, 9, workers)) for workers in (0, 2))
+    assert [step for step, _ in ahead] == list(range(2, 9))
+    for (_, one), (_, two) in zip(plain, ahead, strict=True):
+        torch.testing.assert_close(one.observation, two.observation)
+
+
+# -- the trainer ----------------------------------------------------------------------------------
+
+
+def state_learner(data):
+    torch.manual_seed(0)
+    return BehaviorCloning(state_encoder(data.state.shape[1]), 2)
+
+
+SETTINGS = TrainSettings(steps=12, batch_size=8, evaluate_every=4, points=3, half=False)
+
+
+def test_the_curve_has_losses_hold_out_and_scores():
+    data = make_data().states_only()
+    curve = train(state_learner(data), data, SETTINGS, evaluate=lambda learner: {"score": 1.0})
+    assert [point["step"] for point in curve] == [4, 8, 12]
+    assert all({"loss", "test_loss", "score", "seconds"} <= set(point) for point in curve)
+    assert curve[-1]["loss"] < curve[0]["loss"]
+
+
+def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch):
+    data = make_data().states_only()
+    whole = state_learner(data)
+    wanted = train(whole, data, SETTINGS)
+    monkeypatch.setattr(trainer, "SAVE_SECONDS", 0.0)
+    made = []
+
+    def stop(steps):
+        made.append(steps)
+        if sum(made) == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(state_learner(data), data, SETTINGS, folder=tmp_path, tick=stop)
+    resumed = state_learner(data)
+    made.clear()
+    curve = train(resumed, data, SETTINGS, folder=tmp_path, tick=made.append)
+    assert made[0] == 6 and sum(made) == 12  # the state of step 6 was on disk
+    for one, two in zip(whole.parameters(), resumed.parameters(), strict=True):
+        torch.testing.assert_close(one, two, atol=0, rtol=0)
+    assert [point["step"] for point in curve] == [point["step"] for point in wanted]
+
+
+def test_a_damaged_state_is_refused_with_what_to_do(tmp_path):
+    data = make_data().states_only()
+    (tmp_path / trainer.RESUME_FILE).write_bytes(b"cut short")
+    with pytest.raises(DmcvbError, match="delete it"):
+        train(state_learner(data), data, SETTINGS, folder=tmp_path)
+
+
+def test_a_loss_that_is_no_longer_finite_stops_the_run():
+    data = make_data().states_only()
+    data.action[data.train_rows] = float("nan")
+    with pytest.raises(DmcvbError, match="finite"):
+        train(state_learner(data), data, SETTINGS)
+
+
+def test_without_held_out_episodes_there_is_no_test_loss():
+    data = make_data(held=(False, False, False)).states_only()
+    assert hold_out_losses(state_learner(data), data, 4) == {}
+    with pytest.raises(DmcvbError, match="held-out"):
+        data.batch(4, np.random.default_rng(0), hold_out=True)
