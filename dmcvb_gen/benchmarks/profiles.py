@@ -44,7 +44,7 @@ class Profile:
             return self
         steps = {
             name: max(1, round(getattr(self, name) * factor))
-            for name in ("pixel_steps", "pretrain_steps", "frozen_steps", "state_steps")
+            for name in ("pixel_steps", "pretrain_steps", "frozen_steps", "state_steps", "readout_steps")
         }
         name = f"{self.name} x{factor:g}"
         return replace(self, name=name, note=f"{name}: {factor:g} times the steps of {self.note}", **steps)
