@@ -27,7 +27,11 @@ def _suite_model(domain: str) -> mujoco.MjModel:
     """
     suite = Path(importlib.util.find_spec("dm_control").submodule_search_locations[0]) / "suite"
     assets = {f"./common/{path.name}": path.read_bytes() for path in (suite / "common").glob("*.xml")}
-    return mujoco.MjModel.from_xml_string((suite / f"{domain}.xml").read_text(), assets)
+    mujoco.set_mju_user_warning(lambda message: None)  # an attribute of the cheetah's file is deprecated
+    try:
+        return mujoco.MjModel.from_xml_string((suite / f"{domain}.xml").read_text(), assets)
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 class LocomotionTask(Task):
