@@ -1,4 +1,4 @@
-"""verify, regenerate, repaint."""
+"""verify, regenerate, repaint, publish, fetch, card."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import click
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import json_option, print_json
+from dmcvb_gen.cli.common import format_bytes, json_option, print_json
 
 
 @click.command()
@@ -149,3 +149,111 @@ def repaint(path, out, as_json, backgrounds, **options):
     for subset in manifest.subsets:
         click.echo(f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}")
     click.echo(f"{out}: repainted; look at it: dmcvb-gen preview {out}")
+
+
+SECRETS = ("key", "secret", "token", "password", "credential")
+
+
+def parse_options(context, parameter, pairs):
+    """("endpoint_url=http://...",) -> {"endpoint_url": "http://..."}; a click callback that takes no secrets."""
+    options = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise click.UsageError(f"--option {name!r} is not NAME=VALUE, e.g. endpoint_url=http://localhost:9000")
+        if any(word in name.lower() for word in SECRETS):
+            raise click.UsageError(f"Give {name} in the environment: others can read the command line.")
+        options[name] = {"true": True, "false": False}.get(value.lower(), value)
+    return options
+
+
+option_option = click.option(
+    "--option",
+    "options",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=parse_options,
+    help="Of the file system (fsspec), e.g. endpoint_url=http://localhost:9000. Repeatable.",
+)
+transfers_option = click.option(
+    "--workers", type=click.IntRange(1), default=8, show_default=True, help="Files at once."
+)
+
+
+@click.command()
+@click.argument("path", metavar="RELEASE")
+@click.argument("url")
+@option_option
+@click.option("--take-over", is_flag=True, help="Go on although another publisher's claim is there.")
+@transfers_option
+@json_option
+def publish(path, url, options, take_over, workers, as_json):
+    """Put a complete release at a URL: every file checked, the manifest last, a published version never changed.
+
+    Run again after an interruption, it goes on. Credentials come from the environment.
+
+    \b
+    dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
+    """
+    from dmcvb_gen.release.publish import publish as run
+    from dmcvb_gen.release.remote import public
+
+    with tqdm(unit=" files", disable=as_json or None) as bar:
+        moved = run(path, url, options=options, take_over=take_over, workers=workers, tick=bar.update)
+    if as_json:
+        return print_json(dataclasses.asdict(moved))
+    click.echo(f"{public(url)}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
+
+
+@click.command()
+@click.argument("url")
+@only_option
+@episodes_option
+@click.option("--out", type=click.Path(), required=True, help="Folder of the release here.")
+@option_option
+@transfers_option
+@json_option
+def fetch(url, only, episodes, out, options, workers, as_json):
+    """Bring a published release, or only the shards that hold some episodes; run again, it goes on or adds.
+
+    \b
+    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
+    """
+    from dmcvb_gen.release.publish import fetch as run
+
+    with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
+        moved = run(url, out, only, episodes, options=options, workers=workers, tick=bar.update)
+    if as_json:
+        return print_json(dataclasses.asdict(moved))
+    click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
+
+
+@click.command()
+@click.argument("path", metavar="RELEASE")
+@click.option("--check", is_flag=True, help="Only compare the card with the release; write nothing.")
+@click.option("--out", type=click.Path(), help="Folder of the card.  [default: the release]")
+@json_option
+@click.pass_context
+def card(context, path, check, out, as_json):
+    """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, CHANGELOG.md.
+
+    With --check, exit code 1 when the card does not fit the data.
+
+    \b
+    dmcvb-gen card releases/mini
+    """
+    from dmcvb_gen.release.card import check_card, write_card
+
+    if check:
+        if out:
+            raise click.UsageError("Give --check or --out, not both.")
+        findings = check_card(path)
+        if as_json:
+            print_json(findings)
+        else:
+            click.echo("\n".join(findings) or f"{path}: the card fits the release")
+        context.exit(1 if findings else 0)
+    files = write_card(path, out)
+    if as_json:
+        return print_json([str(file) for file in files])
+    click.echo("\n".join(str(file) for file in files))

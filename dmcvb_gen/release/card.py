@@ -1,0 +1,328 @@
+"""A release's card: README.md, croissant.json and pictures at its root, all filled from the manifest and the data.
+
+`check_card` fills them again and compares, so a card cannot come to disagree with its data unnoticed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.distractors import background, camera, color
+from dmcvb_gen.distractors.base import DistractorSetting
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.croissant import croissant
+from dmcvb_gen.release.publish import CARD_FOLDER
+from dmcvb_gen.rollout.info import describe_release
+from dmcvb_gen.rollout.preview import contact_sheet
+from dmcvb_gen.rollout.recipe import distractor_of, is_maze
+from dmcvb_gen.store import Release, open_release
+from dmcvb_gen.store.manifest import Manifest
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+
+README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
+PLOT, SHEET = f"{CARD_FOLDER}/returns.png", f"{CARD_FOLDER}/contact_sheet.png"
+SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
+"""Hugging Face's size categories; a row is a step."""
+CITATION = """@inproceedings{ortiz2024dmcvb,
+  title     = {{DMC-VB}: A Benchmark for Representation Learning for Control with Visual Distractors},
+  author    = {Ortiz, Joseph and Dedieu, Antoine and Lehrach, Wolfgang and Guntupalli, J. Swaroop and
+               Wendelken, Carter and Humayun, Ahmad and Zhou, Guangyao and Swaminathan, Sivaramakrishnan and
+               L{\\'a}zaro-Gredilla, Miguel and Murphy, Kevin},
+  booktitle = {Advances in Neural Information Processing Systems, Datasets and Benchmarks Track},
+  year      = {2024}
+}"""
+
+
+def write_card(root: str | Path, out: str | Path | None = None) -> list[Path]:
+    """Write README.md, croissant.json, the pictures, and a CHANGELOG.md if there is none.
+
+    Args:
+      out: another folder for them, instead of the release.
+
+    Raises:
+      StoreError: there is no release, it has no episodes, or the folder cannot be written.
+    """
+    release = _open(root)
+    folder = Path(out) if out else release.path
+    texts = _texts(release)
+    if not (folder / CHANGELOG).exists():
+        manifest = release.manifest
+        texts[CHANGELOG] = f"# Changelog of {manifest.name}\n\n## {manifest.version}\n\n- First release.\n"
+    try:
+        (folder / CARD_FOLDER).mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        plot_returns(release, folder / PLOT)
+        Image.fromarray(_sheet(release)).save(folder / SHEET)
+    except OSError as error:
+        raise StoreError(f"cannot write the card to {folder}: {error.strerror or error}; give --out") from None
+    return [folder / name for name in (*texts, PLOT, SHEET)]
+
+
+def check_card(root: str | Path) -> list[str]:
+    """What of a release's card is missing or does not fit its data, in words; empty when all is well.
+
+    Raises:
+      StoreError: there is no release, or it has no episodes.
+    """
+    release, findings = _open(root), []
+    for name, text in _texts(release).items():
+        path = release.path / name
+        if not path.is_file():
+            findings.append(f"{name} is missing")
+        elif path.read_text() != text:
+            line = _first_difference(path.read_text(), text)
+            findings.append(f"{name} does not fit the release at line {line}")
+    sheet = release.path / SHEET
+    if not sheet.is_file() or not (release.path / PLOT).is_file():
+        findings.append(f"a picture in {CARD_FOLDER}/ is missing")
+    elif not np.array_equal(np.asarray(Image.open(sheet)), _sheet(release)):
+        findings.append(f"{SHEET} does not show the release's episodes")
+    changelog = release.path / CHANGELOG
+    if not changelog.is_file() or f"## {release.manifest.version}\n" not in changelog.read_text():
+        findings.append(f"{CHANGELOG} does not speak of version {release.manifest.version}")
+    return findings
+
+
+def _first_difference(one: str, other: str) -> int:
+    pairs = zip(one.splitlines(), other.splitlines(), strict=False)
+    same = next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(one.splitlines()), len(other.splitlines())))
+    return same + 1
+
+
+def _open(root) -> Release:
+    release = open_release(root)
+    if not release.subsets:
+        raise StoreError(f"{root} has no committed episodes yet; run the rollout first")
+    return release
+
+
+def _texts(release: Release) -> dict[str, str]:
+    facts = describe_release(release.path)
+    summary = _summary(release.manifest, facts)
+    metadata = croissant(release, facts, summary, CITATION)
+    return {README: card_text(release, facts, summary), CROISSANT: json.dumps(metadata, indent=1) + "\n"}
+
+
+def _sheet(release: Release) -> np.ndarray:
+    return contact_sheet([s for s in release.subsets.values() if s.pixel_arrays], episodes=1, scale=1)
+
+
+# -- text -----------------------------------------------------------------------------------------
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    return lines + ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+
+
+def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
+    tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
+    text = (
+        f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with pixels, states, full physics "
+        f"states and the labels of every visual distractor: {len(facts['subsets'])} subsets, "
+        f"{sum(subset['episodes'] for subset in facts['subsets']):,} episodes, {facts['steps']:,} steps."
+    )
+    return text.strip()
+
+
+def header(manifest: Manifest, steps: int) -> str:
+    """The YAML header that the Hugging Face Hub reads."""
+    category = next((name for limit, name in SIZES if steps < limit), "n>10M")
+    tags = ["offline-rl", "visual-distractors", "mujoco", "dm-control", "zarr", "croissant"]
+    lines = ["---", f"pretty_name: {manifest.name} {manifest.version}", f"license: {manifest.license.lower()}"]
+    lines += ["task_categories:", "- reinforcement-learning", "- robotics", "tags:"] + [f"- {tag}" for tag in tags]
+    lines += ["size_categories:", f"- {category}", "---"]
+    return "\n".join(lines)
+
+
+def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
+    """The text of README.md."""
+    manifest = release.manifest
+    first = next(iter(release.subsets.values()))
+    lines = [header(manifest, facts["steps"]), "", f"# {manifest.name} {manifest.version}", "", summary, ""]
+    lines += [f"![First episode of every subset]({SHEET})", "", "## Composition", ""]
+    rows = [
+        (
+            f"`{s['name']}`",
+            f"{s['episodes']:,}" + ("" if s["complete"] else f" of {s['episodes_planned']:,}"),
+            f"{s['steps']:,}",
+            f"{s['size']} x {s['size']}",
+            f"{s['bytes'] / 1e6:.1f} MB",
+            f"`{(s['digest'] or 'not complete')[:12]}`",
+        )
+        for s in facts["subsets"]
+    ]
+    lines += _table(("subset", "episodes", "steps", "pixels", "size", "digest"), rows)
+    lines += ["", "Names are task/level/distractor. A step is two control steps with the same action.", ""]
+    lines += ["## Arrays", ""]
+    rows = [
+        (f"`{name}`", str(first.group[name].dtype), " x ".join(map(str, first.group[name].metadata.dimension_names)))
+        for name in first.arrays
+    ]
+    lines += _table(("array", "type", "dimensions"), rows)
+    lines += [
+        "",
+        "Row t of an episode holds observation t, the action taken there and the reward it earned; row `length` holds "
+        "the last observation alone. `exogenous/` are the distractors' labels: every picture is a function of "
+        "`physics` and these.",
+        "",
+        "## Returns",
+        "",
+        "Episode returns, with those of the DMC-VB paper's data where it has the same task and level.",
+        "",
+        f"![Returns]({PLOT})",
+        "",
+    ]
+    rows = []
+    for subset in facts["subsets"]:
+        rows.append((f"`{subset['name']}`", *(f"{subset['returns'][key]:.1f}" for key in STATISTICS)))
+        if subset["paper"]:
+            rows.append(("DMC-VB paper", *(f"{subset['paper'][key]:.1f}" for key in STATISTICS)))
+    lines += _table(("subset", *STATISTICS), rows)
+    lines += ["", "## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
+    lines += ["## Known limits", "", *(f"- {limit}" for limit in _limits(release)), ""]
+    lines += ["## Load it", "", "```python", "import dmcvb_gen", ""]
+    lines += [
+        f'subset = dmcvb_gen.open("{manifest.name}")["{first.name}"]  # a folder or URL',
+        "episode = subset.episode(0)                    # numpy arrays by name",
+        "data = subset.xarray()                         # lazy xarray.Dataset",
+        'stacks = subset.torch("steps", stack=3)        # torch Dataset of 3-frame stacks',
+        "for batch in subset.batches(256): ...          # shuffled numpy batches",
+        "```",
+        "",
+        "or with plain zarr or xarray: "
+        f'`xarray.open_zarr("{manifest.name}/{first.name}.zarr")` (Zarr format 3, consolidated metadata).',
+        "",
+        "## Check it, make it again",
+        "",
+        "```bash",
+        f"dmcvb-gen verify {manifest.name}",
+        f"dmcvb-gen regenerate {manifest.name} --check      # simulates and paints everything again, compares digests",
+        "```",
+        "",
+        "## License and citation",
+        "",
+        f"Data: {manifest.license}. Authors: {', '.join(manifest.authors) or 'not named'}. "
+        "The benchmark that this data follows:",
+        "",
+        "```bibtex",
+        CITATION,
+        "```",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
+
+
+def _distractors(manifest: Manifest) -> list[str]:
+    settings: dict[str, DistractorSetting] = {}
+    for record in manifest.subsets:
+        if not is_maze(record.task):
+            settings.setdefault(record.setting, distractor_of(record.task, record.setting))
+    rows = []
+    for name, setting in settings.items():
+        if setting.kind == "none":
+            rows.append((name, "the model's own camera, colors and sky", "", "", ""))
+            continue
+        s, moving = setting.scale, setting.kind == "dynamic"
+        low, high = 1 - camera.RADIUS_RANGE[0] * s, 1 + camera.RADIUS_RANGE[1] * s
+        place = (
+            f"angles and roll +-{np.degrees(camera.ANGLE_RANGE * s):.0f} degrees, distance x {low:.2f} to {high:.2f}"
+        )
+        if moving:
+            place += f"; speed walk std {camera.VELOCITY_STD * s:.3g}, at most {camera.MAX_SPEED * s:.3g} a tick"
+        paint = f"+-{s:g} a channel" + (f"; walk std {color.STEP_STD * s:.3g} a tick" if moving else "")
+        videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
+        sky = f"{videos}; " + (f"a frame every {background.TICKS_A_FRAME} ticks" if moving else "one frame an episode")
+        rows.append((name, f"s = {s:g}", place, paint, sky))
+    lines = _table(("setting", "scale", "camera", "colors", "background"), rows) if rows else []
+    if any(is_maze(record.task) for record in manifest.subsets):
+        lines += ["", "Mazes vary in the style of walls and floor, drawn for each episode (label `exogenous/style`)."]
+    return lines + ["", "A tick is a control step, two in a step. Distractors never touch physics or rewards."]
+
+
+def _making(manifest: Manifest) -> list[str]:
+    records = manifest.subsets
+    lines = [f"Made by {manifest.generator} from the recipe in `manifest.json` (seed {manifest.recipe.get('seed')})."]
+    renderers = sorted({f"{r.renderer.get('name')} ({r.renderer.get('samples')} samples a pixel)" for r in records})
+    lines.append(f"Renderer: {', '.join(renderers)}.")
+    videos = sorted({f"`{r.backgrounds['digest'][:12]}` ({r.backgrounds['split']})" for r in records if r.backgrounds})
+    if videos:
+        lines.append(f"Background videos: digest {', '.join(videos)}.")
+    for number, made in enumerate(manifest.environments):
+        names = ("system", "cpu", "python", "mujoco", "mujoco-warp", "torch", "zarr")
+        where = ", ".join(f"{name} {made[name]}" for name in names if name in made)
+        lines.append(f"Environment {number + 1}: {where}.")
+    for entry in manifest.lineage:
+        lines.append(f"Derived: {entry.get('kind')} from {entry.get('from')}.")
+    rows = []
+    for record in {(r.task, r.level): r for r in records}.values():
+        policies = ", ".join(f"{policy.name} `{policy.digest[:12]}`" for policy in record.policies)
+        rows.append((record.task, record.level, policies or "uniform random actions"))
+    return [*lines, "", *_table(("task", "level", "behaviour policies"), rows)]
+
+
+def _limits(release: Release) -> list[str]:
+    manifest, limits = release.manifest, []
+    if not manifest.complete:
+        limits.append("Not complete: only a part of the recipe's shards is here.")
+    if any(record.renderer.get("name") == "warp" for record in manifest.subsets):
+        limits.append(
+            "Pictures come from a ray tracer, which has no floor reflections and no mip-mapped textures: they differ "
+            "from dm_control's OpenGL pictures by a few grey levels on average."
+        )
+    if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
+        limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
+    if any(record.policies for record in manifest.subsets):
+        limits.append("Behaviour policies were trained with SAC; the paper's with MPO. Compare the returns above.")
+    steps = {name: subset.steps for name, subset in release.subsets.items()}
+    small = [name for name, count in steps.items() if count < 1_000_000]
+    if small:
+        limits.append(f"{len(small)} of {len(steps)} subsets have fewer steps than the paper's million.")
+    seconds = {ACTION_REPEAT * get_task(record.task).control_timestep for record in manifest.subsets}
+    limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
+    limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")
+    return limits
+
+
+# -- pictures -------------------------------------------------------------------------------------
+
+
+def plot_returns(release: Release, path: Path) -> None:
+    """Box plots of episode returns, a row a task and level, the paper's five numbers beneath each."""
+    from matplotlib.figure import Figure
+
+    groups: dict[tuple[str, str], list[np.ndarray]] = {}
+    for subset in release.subsets.values():
+        groups.setdefault((subset.task, subset.level), []).append(subset.returns)
+    boxes, labels, shades = [], [], []
+    for (task, level), values in groups.items():
+        low, p25, median, p75, high = np.quantile(np.concatenate(values), (0, 0.25, 0.5, 0.75, 1))
+        boxes.append(dict(whislo=low, q1=p25, med=median, q3=p75, whishi=high, fliers=[]))
+        labels.append(f"{task} {level}")
+        shades.append("tab:blue")
+        paper = paper_returns(task, level)
+        if paper:
+            keys = dict(whislo="min", q1="p25", med="median", q3="p75", whishi="max")
+            boxes.append({name: paper[key] for name, key in keys.items()} | {"fliers": []})
+            labels.append("DMC-VB paper")
+            shades.append("lightgray")
+    figure = Figure(figsize=(8, 0.6 + 0.3 * len(boxes)), layout="constrained")
+    axes = figure.subplots()
+    places = np.arange(len(boxes))[::-1]
+    drawn = axes.bxp(boxes, positions=places, orientation="horizontal", patch_artist=True, widths=0.6)
+    for patch, shade in zip(drawn["boxes"], shades, strict=True):
+        patch.set_facecolor(shade)
+    axes.set_yticks(places, labels)
+    axes.set_xlabel("episode return (minimum, quartiles, maximum)")
+    figure.savefig(path, dpi=100, metadata={"Software": None})

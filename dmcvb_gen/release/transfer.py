@@ -1,0 +1,200 @@
+"""Moving single files to and from a file system of fsspec, checked by digest, retried, and gone on with when cut."""
+
+from __future__ import annotations
+
+import base64
+import errno
+import hashlib
+import logging
+import time
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import fsspec
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.remote import reason
+from dmcvb_gen.store.manifest import FileRecord
+from dmcvb_gen.store.writer import sha256_file
+
+ATTEMPTS = 4
+"""Tries of a file before giving up."""
+PAUSE = 0.5
+"""Seconds before the second try; doubled for each further one."""
+PIECE = 16 * 2**20
+"""Bytes of one read; a download that is cut goes on after the last whole piece."""
+PART = 50 * 2**20
+"""Bytes of a part of an S3 multipart upload (decides its ETag)."""
+OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "hf", "az", "abfs"}
+"""Protocols without folders."""
+
+log = logging.getLogger(__name__)
+
+
+class WrongBytes(Exception):
+    """A file arrived with other bytes than its digest says."""
+
+
+def protocol(filesystem: fsspec.AbstractFileSystem) -> str:
+    return filesystem.protocol if isinstance(filesystem.protocol, str) else filesystem.protocol[0]
+
+
+def is_refusal(error: BaseException) -> bool:
+    """Whether an error is about who is asking, so that trying again is of no use."""
+    words = f"{type(error).__name__} {error}"
+    return isinstance(error, PermissionError) or any(
+        word in words for word in ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "Unauthorized")
+    )
+
+
+def refused(place: str, error: BaseException) -> StoreError:
+    """The error for missing or wrong credentials."""
+    return StoreError(
+        f"{place} refuses access ({reason(error)}); set valid credentials in the environment or the provider's own "
+        "configuration (e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, gcloud, HF_TOKEN)"
+    )
+
+
+def retry(place: str, path: str, attempt):
+    """Call `attempt` until it succeeds, at most ATTEMPTS times.
+
+    Raises:
+      StoreError: access is refused, the disk is full, or it never succeeded.
+    """
+    for number in range(1, ATTEMPTS + 1):
+        try:
+            return attempt()
+        except StoreError:
+            raise
+        except Exception as error:  # file systems raise their clients' own kinds
+            if is_refusal(error):
+                raise refused(place, error) from None
+            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise StoreError(
+                    f"no room for {path} ({error.strerror}); what was moved stays, make room and run the same "
+                    "command again"
+                ) from None
+            if number == ATTEMPTS:
+                raise StoreError(
+                    f"cannot move {path} after {ATTEMPTS} tries ({reason(error)}); what was moved stays, run the same "
+                    "command again"
+                ) from None
+            log.info("try %d of %s failed: %s", number, path, reason(error))
+            time.sleep(PAUSE * 2 ** (number - 1))
+
+
+def _etags(path: Path) -> set[str]:
+    """ETags that S3 may give a file: its MD5, or the MD5 of its parts' MD5s."""
+    whole, parts = hashlib.md5(usedforsecurity=False), []
+    with path.open("rb") as file:
+        while piece := file.read(PART):
+            whole.update(piece)
+            parts.append(hashlib.md5(piece, usedforsecurity=False).digest())
+    joined = hashlib.md5(b"".join(parts), usedforsecurity=False).hexdigest()
+    return {whole.hexdigest(), f"{joined}-{len(parts)}"}
+
+
+def has_bytes(filesystem: fsspec.AbstractFileSystem, remote: str, local: Path, record: FileRecord) -> bool:
+    """Whether the remote file is the recorded one: by size, then by the store's own MD5, else by reading it back."""
+    try:
+        filesystem.invalidate_cache(remote.rsplit("/", 1)[0])
+        facts = filesystem.info(remote)
+    except FileNotFoundError:
+        return False
+    if facts.get("size") != record.bytes:
+        return False
+    etag = str(facts.get("ETag", "")).strip('"')
+    if etag and etag in _etags(local):
+        return True
+    if "md5Hash" in facts:
+        return base64.b64decode(facts["md5Hash"]).hex() in _etags(local)
+    return _remote_sha256(filesystem, remote, record.bytes) == record.sha256
+
+
+def _remote_sha256(filesystem, remote, size) -> str:
+    digest = hashlib.sha256()
+    for start in range(0, size, PIECE):
+        digest.update(filesystem.cat_file(remote, start=start, end=min(start + PIECE, size)))
+    return digest.hexdigest()
+
+
+def upload(
+    filesystem: fsspec.AbstractFileSystem, place: str, local: Path, remote: str, record: FileRecord, fresh: bool = False
+) -> bool:
+    """Put one file there and check that it arrived; False if it was there already.
+
+    Args:
+      fresh: nothing is known to be there, so do not look first.
+
+    Raises:
+      StoreError: the local file is not the recorded one, or it cannot be put there.
+    """
+    if not local.is_file() or local.stat().st_size != record.bytes or sha256_file(local) != record.sha256:
+        raise StoreError(f"{local} does not have its digest; run `dmcvb-gen regenerate` on the release first")
+    options: dict[str, Any] = {"chunksize": PART} if protocol(filesystem) in ("s3", "s3a") else {}
+
+    looked = not fresh
+
+    def attempt():
+        nonlocal looked
+        if looked and has_bytes(filesystem, remote, local, record):
+            return False
+        looked = True  # after a failure it may be there all the same
+        if protocol(filesystem) not in OBJECT_STORES:
+            filesystem.makedirs(remote.rsplit("/", 1)[0], exist_ok=True)
+        filesystem.put_file(str(local), remote, **options)
+        if not has_bytes(filesystem, remote, local, record):
+            raise WrongBytes("it arrived with other bytes")
+        return True
+
+    return retry(place, record.path, attempt)
+
+
+def download(filesystem: fsspec.AbstractFileSystem, place: str, remote: str, local: Path, record: FileRecord) -> int:
+    """Bring one file here and check it; gives the bytes that were moved (0 if it was here already).
+
+    Raises:
+      StoreError: it has other bytes than recorded, is not there, or there is no room.
+    """
+    if local.is_file() and local.stat().st_size == record.bytes and sha256_file(local) == record.sha256:
+        return 0
+    local.parent.mkdir(parents=True, exist_ok=True)
+    partial, moved = local.with_name(local.name + ".partial"), 0
+
+    def attempt():
+        nonlocal moved
+        have = partial.stat().st_size if partial.exists() else 0
+        if have > record.bytes:
+            partial.unlink()
+            have = 0
+        with partial.open("ab") as file:
+            while have < record.bytes:
+                piece = filesystem.cat_file(remote, start=have, end=min(have + PIECE, record.bytes))
+                if not piece:
+                    raise WrongBytes(f"it ends after {have} of {record.bytes} bytes")
+                file.write(piece)
+                file.flush()
+                have, moved = have + len(piece), moved + len(piece)
+        if have != record.bytes or sha256_file(partial) != record.sha256:
+            partial.unlink()
+            raise WrongBytes("it does not have its digest")
+        partial.replace(local)
+        return moved
+
+    return retry(place, record.path, attempt)
+
+
+def in_parallel(work, items, workers: int, tick) -> list:
+    """Results of `work(item)` for all items, `workers` at a time; the first error stops what has not begun."""
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        futures = [pool.submit(work, item) for item in items]
+        waiting = set(futures)
+        while waiting:
+            done, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
+            for future in done:
+                if future.exception():
+                    pool.shutdown(wait=True, cancel_futures=True)
+                    raise future.exception()
+                tick(future.result())
+    return [future.result() for future in futures]

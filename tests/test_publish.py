@@ -1,0 +1,458 @@
+"""Publishing and fetching, against a real S3-protocol server on loopback, with faults in between."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import http.server
+import json
+import logging
+import re
+import resource
+import shutil
+import signal
+import threading
+import urllib.parse
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.release import transfer
+from dmcvb_gen.release.publish import CLAIM, INDEX, fetch, publish
+from dmcvb_gen.release.regenerate import check
+from dmcvb_gen.release.remote import public, reason
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.store import open_release
+from tests.conftest import roll_out, small_recipe
+
+pytest.importorskip("s3fs")
+ThreadedMotoServer = pytest.importorskip("moto.server").ThreadedMotoServer
+SECRET = "shh-very-secret"
+NAME = "walker-walk/random/dynamic"
+CREDENTIALS = {
+    "AWS_ACCESS_KEY_ID": "someone",
+    "AWS_SECRET_ACCESS_KEY": SECRET,
+    "AWS_DEFAULT_REGION": "us-east-1",
+}
+
+
+class Proxy:
+    """Passes requests on to the server, and spoils those that `fault(method, path)` names.
+
+    Faults: "500", "403", "cut" (half of the answer), "corrupt" (a flipped byte), "drop" (no answer at all).
+    """
+
+    def __init__(self, host, port):
+        self.fault, self.requests = lambda method, path: None, []
+        proxy = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def log_message(self, *args):
+                pass
+
+            def answer(self):
+                length = int(self.headers.get("Content-Length") or 0)
+                body = self.rfile.read(length)
+                path = urllib.parse.unquote(self.path)
+                kind = proxy.fault(self.command, path)
+                proxy.requests.append((self.command, path, self.headers.get("Range")))
+                self.close_connection = True
+                if kind == "drop":
+                    return
+                if kind in ("500", "403"):
+                    code, word = {"500": (500, "InternalError"), "403": (403, "AccessDenied")}[kind]
+                    self.reply(code, f"<Error><Code>{word}</Code><Message>{word}</Message></Error>".encode(), {})
+                    return
+                inner = http.client.HTTPConnection(host, port, timeout=30)
+                headers = {k: v for k, v in self.headers.items() if k.lower() != "connection"}
+                inner.request(self.command, self.path, body, headers)
+                answer = inner.getresponse()
+                data = answer.read()
+                inner.close()
+                if kind == "corrupt" and data:
+                    data = data[:-1] + bytes([data[-1] ^ 1])
+                self.reply(answer.status, data, dict(answer.getheaders()), cut=kind == "cut")
+
+            def reply(self, status, data, headers, cut=False):
+                self.send_response(status)
+                for name, value in headers.items():
+                    if name.lower() not in ("connection", "content-length", "transfer-encoding", "date", "server"):
+                        self.send_header(name, value)
+                length = headers.get("Content-Length", len(data)) if self.command == "HEAD" else len(data)
+                self.send_header("Content-Length", str(length))
+                self.send_header("Connection", "close")
+                self.end_headers()
+                if self.command != "HEAD":
+                    self.wfile.write(data[: len(data) // 2] if cut else data)
+
+            do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = answer
+
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
+
+
+@pytest.fixture(scope="module")
+def server():
+    moto = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    moto.start()
+    yield moto.get_host_and_port()
+    moto.stop()
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """A release of one subset in two shards."""
+    pattern = {
+        "tasks": "walker-walk",
+        "levels": "random",
+        "settings": "dynamic",
+        "episodes": 2,
+        "episodes_per_shard": 1,
+    }
+    folder = tmp_path_factory.mktemp("tiny") / "tiny"
+    roll_out(small_recipe(name="tiny", subsets=[pattern]), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bucket(server, small_release):
+    """The server's own file system, with the small release published in "bucket/small" for those who only read."""
+    import s3fs
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in CREDENTIALS.items():
+            patch.setenv(name, value)
+        options = {"endpoint_url": "http://{}:{}".format(*server)}
+        direct = s3fs.S3FileSystem(**options)
+        direct.mkdir("bucket")
+        publish(small_release, "s3://bucket/small", options=options)
+        yield direct
+
+
+@pytest.fixture
+def s3(server, bucket, monkeypatch):
+    """A proxy before the server; credentials in the environment; nothing in "bucket/x"."""
+    for name, value in CREDENTIALS.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(transfer, "PAUSE", 0.01)
+    bucket.invalidate_cache()
+    if bucket.exists("bucket/x"):
+        bucket.rm("bucket/x", recursive=True)
+    proxy = Proxy(*server)
+    proxy.direct, proxy.options = bucket, {"endpoint_url": proxy.url}
+    yield proxy
+    proxy.server.shutdown()
+
+
+@pytest.fixture
+def copy(tiny, tmp_path):
+    shutil.copytree(tiny, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def new_version(folder):
+    data = json.loads((folder / "manifest.json").read_text())
+    data["version"] = "1.0.1"
+    (folder / "manifest.json").write_text(json.dumps(data))
+
+
+def test_a_round_trip_gives_the_same_release(s3, small_release, tmp_path):
+    moved = fetch("s3://bucket/small", tmp_path / "back", options=s3.options)
+    assert moved.files == moved.moved > 60
+    back = open_release(tmp_path / "back")
+    assert back.manifest == open_release(small_release).manifest and verify(tmp_path / "back").sound
+    assert fetch("s3://bucket/small", tmp_path / "back", options=s3.options).moved == 0
+    assert not s3.direct.exists(f"bucket/small/{CLAIM}")
+    assert publish(small_release, "s3://bucket/small", options=s3.options).moved == 0
+
+
+def test_the_manifest_comes_last(s3, tiny):
+    publish(tiny, "s3://bucket/x", options=s3.options, workers=4)
+    written = [path.removeprefix("/bucket/x/") for method, path, _ in s3.requests if method == "PUT"]
+    assert written[0] == CLAIM and written[-2:] == [INDEX, "manifest.json"] and len(written) > 50
+
+
+def test_a_part_moves_only_its_shards_verifies_and_can_be_completed(s3, small_release, tmp_path):
+    part = tmp_path / "part"
+    fetch("s3://bucket/small", part, ["*/*/dynamic"], (2, 3), options=s3.options)
+    moved = {path.removeprefix("/bucket/small/") for method, path, _ in s3.requests if method == "GET"}
+    shards = {path for path in moved if "/c/" in path}
+    wanted = {file.path for file in open_release(small_release)[NAME].commits[1].files}
+    assert shards == wanted and not any("static" in path or "none" in path for path in moved)
+    release = dmcvb_gen.open(part)
+    assert list(release.subsets) == [NAME] and list(release[NAME].episodes) == [2]
+    assert verify(part).sound and check(part, [NAME], (2, 3)).sound
+    assert not release.manifest.complete and release.manifest.lineage[0]["from"] == "s3://bucket/small"
+    batch = next(release[NAME].batches(32))
+    assert batch["pixels"].shape == (32, 9, 16, 16)
+    fetch("s3://bucket/small", part, options=s3.options)
+    assert open_release(part).manifest == open_release(small_release).manifest and verify(part).sound
+
+
+def test_an_agent_can_be_trained_from_a_fetched_part(s3, tmp_path):
+    import torch
+
+    fetch("s3://bucket/small", tmp_path / "part", ["*/*/static"], options=s3.options)
+    data = dmcvb_gen.open(tmp_path / "part")["walker-walk/random/static"].torch("stream", batch_size=64, stack=1)
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 16 * 16, 64), torch.nn.ReLU())
+    network.append(torch.nn.Linear(64, 6))
+    optimizer, losses, batch = torch.optim.Adam(network.parameters(), 1e-3), [], next(iter(data))
+    for _ in range(30):  # random actions cannot be learned but by heart
+        loss = (network(batch["pixels"] / 255 - 0.5) - batch["action"]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_a_remote_release_is_read_in_place(s3, small_release):
+    release = dmcvb_gen.open("s3://bucket/small", s3.options)
+    here = open_release(small_release)[NAME].episode(1)
+    np.testing.assert_array_equal(release[NAME].episode(1, ["pixels", "action"])["pixels"], here["pixels"])
+    np.testing.assert_array_equal(release[NAME].torch("steps")[500]["action"], here["action"][0])
+    np.testing.assert_array_equal(release[NAME].xarray()["reward"].sel(episode=1).values[:500], here["reward"])
+
+
+def test_an_interrupted_publication_is_no_release_and_goes_on(s3, tiny, tmp_path):
+    count = iter(range(1000))
+    s3.fault = lambda method, path: "403" if method == "PUT" and next(count) > 30 else None
+    with pytest.raises(StoreError, match="refuses access"):
+        publish(tiny, "s3://bucket/x", options=s3.options, workers=2)
+    with pytest.raises(StoreError, match="holds no release"):
+        fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
+    with pytest.raises(StoreError, match="holds no release"):
+        dmcvb_gen.open("s3://bucket/x", s3.options)
+    s3.fault, s3.requests[:] = (lambda method, path: None), []
+    moved = publish(tiny, "s3://bucket/x", options=s3.options)
+    assert 0 < moved.moved < moved.files - 20
+    fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
+    assert verify(tmp_path / "r").sound
+
+
+@pytest.mark.parametrize("kind", ["cut", "corrupt", "drop", "500"])
+def test_a_fault_on_the_way_here_is_noticed_and_mended(s3, small_release, tmp_path, kind):
+    pixels = next(file.path for file in open_release(small_release)[NAME].commits[0].files if "/pixels/" in file.path)
+    seen = []
+
+    def fault(method, path):
+        if method == "GET" and path.endswith(pixels) and len(seen) < 2:
+            seen.append(path)
+            return kind
+        return None
+
+    s3.fault = fault
+    fetch("s3://bucket/small", tmp_path / "r", [NAME], (0, 1), options=s3.options)
+    assert len(seen) == 2 and verify(tmp_path / "r").sound
+
+
+def test_wrong_bytes_at_the_source_are_refused(s3, tiny, tmp_path):
+    publish(tiny, "s3://bucket/x", options=s3.options)
+    pixels = next(file.path for file in open_release(tiny)[NAME].commits[0].files if "/pixels/" in file.path)
+    data = s3.direct.cat_file(f"bucket/x/{pixels}")
+    s3.direct.pipe_file(f"bucket/x/{pixels}", data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(StoreError, match="does not have its digest"):
+        fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
+    assert not (tmp_path / "r" / pixels).exists() and not list((tmp_path / "r").rglob("commits/**/*.json"))
+    s3.direct.pipe_file(f"bucket/x/{pixels}", data)
+    fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
+    assert verify(tmp_path / "r").sound
+
+
+def test_a_download_goes_on_after_its_last_whole_piece(s3, tmp_path, small_release, monkeypatch):
+    monkeypatch.setattr(transfer, "PIECE", 20_000)
+    record = max(open_release(small_release)[NAME].commits[0].files, key=lambda file: file.bytes)
+    assert record.bytes > 60_000
+    asked = []
+
+    def fault(method, path):
+        if method == "GET" and path.endswith(record.path):
+            asked.append(path)
+            return "403" if len(asked) == 3 else None
+        return None
+
+    s3.fault = fault
+    with pytest.raises(StoreError, match="refuses access"):
+        fetch("s3://bucket/small", tmp_path / "r", [NAME], (0, 1), options=s3.options)
+    s3.requests.clear()
+    fetch("s3://bucket/small", tmp_path / "r", [NAME], (0, 1), options=s3.options)
+    ranges = [r for method, path, r in s3.requests if method == "GET" and path.endswith(record.path)]
+    assert ranges[0].startswith("bytes=40000-") and verify(tmp_path / "r").sound
+
+
+def test_wrong_credentials_are_said_without_the_secret(s3, tiny, caplog):
+    caplog.set_level(logging.DEBUG)
+    s3.fault = lambda method, path: "403"
+    arguments = ["publish", str(tiny), "s3://bucket/x", "--option", f"endpoint_url={s3.url}"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2 and "credentials" in result.output
+    ours = [record.getMessage() for record in caplog.records if record.name.startswith("dmcvb_gen")]
+    assert SECRET not in result.output and not any(SECRET in message for message in ours)
+
+
+def test_no_secret_is_written_anywhere(s3, tmp_path):
+    fetch("s3://bucket/small", tmp_path / "r", [NAME], options=s3.options)
+    for path in ["manifest.json", INDEX]:
+        assert SECRET.encode() not in s3.direct.cat_file(f"bucket/small/{path}")
+    assert SECRET not in (tmp_path / "r/manifest.json").read_text()
+    assert public(f"https://me:{SECRET}@host/x?sig={SECRET}") == "https://host/x"
+    assert SECRET not in reason(ValueError(f"denied: secret_key={SECRET}, url s3://me:{SECRET}@bucket"))
+    result = CliRunner().invoke(main, ["fetch", "s3://bucket/small", "--out", "x", "--option", f"secret={SECRET}"])
+    assert result.exit_code == 2 and "environment" in result.output and SECRET not in result.output
+
+
+def test_a_published_version_is_never_overwritten(s3, copy):
+    new_version(copy)
+    before = s3.direct.cat_file("bucket/small/manifest.json")
+    with pytest.raises(StoreError, match=r"already holds small 1\.0\.0.*publish tiny 1\.0\.1 to another URL"):
+        publish(copy, "s3://bucket/small", options=s3.options)
+    assert s3.direct.cat_file("bucket/small/manifest.json") == before
+
+
+def test_of_two_publishers_one_is_told(s3, tiny, copy):
+    new_version(copy)
+    s3.fault = lambda method, path: "403" if method == "PUT" and "/state/" in path else None
+    with pytest.raises(StoreError, match="refuses access"):
+        publish(tiny, "s3://bucket/x", options=s3.options)
+    s3.fault = lambda method, path: None
+    with pytest.raises(StoreError, match=r"tiny 1\.0\.0 is being published.*--take-over"):
+        publish(copy, "s3://bucket/x", options=s3.options)
+    publish(copy, "s3://bucket/x", options=s3.options, take_over=True)
+    assert json.loads(s3.direct.cat_file("bucket/x/manifest.json"))["version"] == "1.0.1"
+
+
+def test_two_publishers_at_once_leave_one_whole_release(s3, tiny, copy, tmp_path):
+    new_version(copy)
+    results = {}
+
+    def run(name, folder):
+        try:
+            results[name] = publish(folder, "s3://bucket/x", options=s3.options, workers=2)
+        except StoreError as error:
+            results[name] = error
+
+    threads = [threading.Thread(target=run, args=item) for item in (("a", tiny), ("b", copy))]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert sorted(type(result).__name__ for result in results.values()) == ["Moved", "StoreError"]
+    fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
+    assert verify(tmp_path / "r").sound
+
+
+def test_a_plain_folder_is_a_target_too(tiny, tmp_path):
+    url = f"file://{tmp_path}/there"
+    assert publish(tiny, url).moved > 50 and publish(tiny, url).moved == 0
+    (tmp_path / "there/manifest.json").unlink()
+    pixels = next(file.path for file in open_release(tiny)[NAME].commits[0].files if "/pixels/" in file.path)
+    (tmp_path / "there" / pixels).write_bytes(b"half")
+    assert publish(tiny, url).moved == 1
+    assert verify(tmp_path / "there").sound
+    fetch(url, tmp_path / "back", [NAME])
+    assert verify(tmp_path / "back").sound
+
+
+def test_a_damaged_or_unfinished_release_is_not_s3(copy, tmp_path):
+    url = f"file://{tmp_path}/there"
+    pixels = next(file.path for file in open_release(copy)[NAME].commits[0].files if "/pixels/" in file.path)
+    data = bytearray((copy / pixels).read_bytes())
+    data[50] ^= 1
+    (copy / pixels).write_bytes(data)
+    with pytest.raises(StoreError, match="dmcvb-gen regenerate"):
+        publish(copy, url)
+    (copy / "commits" / NAME / "00000.json").unlink()
+    with pytest.raises(StoreError, match="damaged or missing shards"):
+        publish(copy, url)
+    manifest = json.loads((copy / "manifest.json").read_text()) | {"complete": False}
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match="not complete"):
+        publish(copy, url)
+    assert not (tmp_path / "there/manifest.json").exists()
+
+
+def rewrite(folder, change):
+    """Change a published folder as a hostile hand would: digests of the index and manifest fit again."""
+    index = json.loads((folder / INDEX).read_text())
+    change(index, folder)
+    for file in index["files"]:
+        path = folder / file["path"]
+        if path.is_file():
+            file |= {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    index["manifest_sha256"] = hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
+    (folder / INDEX).write_text(json.dumps(index))
+
+
+def leave_the_folder(index, folder):
+    index["files"].append({"path": "../../evil", "bytes": 1, "sha256": "0" * 64})
+
+
+def name_the_manifest(index, folder):
+    path = folder / "commits" / NAME / "00000.json"
+    commit = json.loads(path.read_text())
+    commit["files"][0]["path"] = "manifest.json"
+    path.write_text(json.dumps(commit))
+
+
+def climb_in_the_manifest(index, folder):
+    text = (folder / "manifest.json").read_text().replace(NAME, "../../../evil", 1)
+    (folder / "manifest.json").write_text(text)
+
+
+def be_from_the_future(index, folder):
+    data = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
+    (folder / "manifest.json").write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (leave_the_folder, "not a plain relative path"),
+        (name_the_manifest, "names files outside"),
+        (climb_in_the_manifest, "not a plain relative path"),
+        (be_from_the_future, "install a newer dmcvb-gen"),
+    ],
+)
+def test_hostile_or_newer_releases_are_refused_and_write_nothing_outside(tiny, tmp_path, change, words):
+    publish(tiny, f"file://{tmp_path}/there")
+    rewrite(tmp_path / "there", change)
+    with pytest.raises(StoreError, match=words):
+        fetch(f"file://{tmp_path}/there", tmp_path / "deep/down/r")
+    outside = {p.name for p in tmp_path.rglob("*") if p.is_file() and "there" not in p.parts}
+    assert not outside - {"manifest.json"} and not list((tmp_path / "deep").rglob("commits/**/*.json"))
+
+
+def test_bad_requests_say_what_to_do(s3, tmp_path, small_release):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/thesis.tex").write_text("years of work")
+    with pytest.raises(StoreError, match="not empty"):
+        fetch("s3://bucket/small", tmp_path / "thesis", options=s3.options)
+    with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
+        fetch("s3://bucket/small", tmp_path / "r", ["walker-fly"], options=s3.options)
+    with pytest.raises(StoreError, match="no subset has episodes"):
+        fetch("s3://bucket/small", tmp_path / "r", episodes=(100, 150), options=s3.options)
+    with pytest.raises(StoreError, match="create the bucket"):
+        publish(small_release, "s3://no-such-bucket/x", options=s3.options)
+    result = CliRunner().invoke(main, ["fetch", "s3://bucket/small", "--episodes", "5:2", "--out", "x"])
+    assert result.exit_code == 2 and "--episodes" in result.output
+    assert not (tmp_path / "r").exists() or not re.search("json", str(list((tmp_path / "r").iterdir())))
+
+
+def test_a_full_disk_is_said_and_what_came_stays(s3, tmp_path, small_release):
+    largest = max(file.bytes for file in open_release(small_release)[NAME].commits[0].files)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest - 1000, limit[1]))
+        with pytest.raises(StoreError, match="make room and run the same command again"):
+            fetch("s3://bucket/small", tmp_path / "r", [NAME], options=s3.options, workers=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+    fetch("s3://bucket/small", tmp_path / "r", [NAME], options=s3.options)
+    assert verify(tmp_path / "r").sound
