@@ -1,15 +1,24 @@
-"""The command in a policy's header trains that run again."""
+"""The behaviour commands: a policy's header says how to train it again; returns stand beside the paper's."""
 
 from __future__ import annotations
 
+import json
 import shlex
+from types import SimpleNamespace
 
 import click
+import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from dmcvb_gen.behaviours.bundled import bundled_folder, bundled_levels
 from dmcvb_gen.behaviours.defaults import parse_settings
+from dmcvb_gen.behaviours.evaluation import maze_scores
+from dmcvb_gen.behaviours.paper import paper_returns
 from dmcvb_gen.behaviours.training import RunConfig, command_of
+from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import train_behaviour
+from dmcvb_gen.tasks import get_task, task_ids
 
 
 @pytest.mark.parametrize("init_from", [None, "runs/my stand run"])
@@ -24,3 +33,54 @@ def test_the_command_of_a_run_parses_back_to_its_configuration(init_from):
     assert (given["task"], given["algo"], given["steps"], given["seed"]) == ("humanoid-walk", "sac", 1000, 3)
     assert (given["evaluate_every"], given["init_from"]) == (700, init_from)
     assert parse_settings(given["pairs"], None, "sac") == settings
+
+
+def simulation(lengths, terminated, distance):
+    """A simulation of two-step ant-maze agents as far as maze_scores looks at it."""
+    task = get_task("ant-maze-empty7x7")
+    state = np.zeros((len(lengths), 3, task.state_size), np.float32)
+    state[:, 0, task.state_slices["distance_to_target"]] = np.array(distance, np.float32)[:, None]
+    return task, SimpleNamespace(length=np.array(lengths), terminated=np.array(terminated), state=state)
+
+
+def test_speed_is_meters_a_second_of_the_ants_that_got_there():
+    # An agent step lasts 0.05 s: 5 m in 100 steps are 1 m/s, 2 m in 80 steps 0.5 m/s; the third never arrives.
+    assert maze_scores(*simulation([100, 80, 1200], [True, True, False], [5, 2, 9])) == pytest.approx((2 / 3, 0.75))
+    assert maze_scores(*simulation([1200], [False], [3])) == (0.0, None)
+    assert maze_scores(get_task("walker-walk"), None) == (None, None)
+
+
+def evaluated(*arguments):
+    result = CliRunner().invoke(main, ["evaluate-behaviour", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_one_command_sets_every_bundled_level_beside_the_paper():
+    rows = json.loads(evaluated("--episodes", 2, "--json"))
+    asked = [
+        (task, level) for task in task_ids() for level in [*bundled_levels(task), "random"] if bundled_levels(task)
+    ]
+    assert [(row["task"], row["level"]) for row in rows] == asked
+    for row in rows:
+        assert set(row["returns"]) == {"mean", "std", "min", "p25", "median", "p75", "max"}
+        assert row["returns"]["min"] <= row["returns"]["median"] <= row["returns"]["max"]
+        if not row["task"].startswith("ant"):
+            assert row["paper"] == paper_returns(row["task"], row["level"])
+
+
+def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
+    file = bundled_folder() / "walker-walk" / "medium.safetensors"
+    (row,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--json"))
+    assert (row["task"], row["level"], row["mode"]) == ("walker-walk", "medium", "sampled")
+    folder = json.loads(
+        evaluated("walker-walk", "--behaviour", file.parent, "--level", "medium", "--episodes", 2, "--json")
+    )
+    assert folder[0]["returns"] == row["returns"]
+    table = evaluated("--behaviour", file, "--episodes", 2, "--deterministic")
+    assert "DMC-VB paper" in table and "deterministic actions" in table
+
+
+def test_a_folder_without_picks_says_what_to_run(tmp_path):
+    result = CliRunner().invoke(main, ["evaluate-behaviour", "--behaviour", str(tmp_path)])
+    assert result.exit_code == 2 and "select-checkpoints" in result.output

@@ -13,7 +13,7 @@ from dmcvb_gen.behaviours.vec_env import TaskEnv, TaskVecEnv
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 
-TASKS = ("walker-walk", "cheetah-run", "humanoid-walk")
+TASKS = ("walker-walk", "cheetah-run", "humanoid-walk", "ant-maze-easy7x7a")
 
 
 @pytest.mark.parametrize("task_id", TASKS)

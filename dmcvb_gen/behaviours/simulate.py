@@ -8,11 +8,13 @@ another batch size).
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 
 from dmcvb_gen.behaviours.policy_file import Policy
 from dmcvb_gen.seeding import episode_seed, episode_stream
@@ -102,6 +104,18 @@ class TiledActor:
         return actions
 
 
+@contextlib.contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """More threads gain nothing on a tile, wait for each other on a busy machine, and may round differently."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@one_torch_thread()
 def simulate(
     task: Task,
     policies: Sequence[Policy],

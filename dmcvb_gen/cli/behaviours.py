@@ -144,9 +144,7 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, 
                 policies = [random_policy(task)]
             else:
                 policies = [load_policy(path, task) for path in resolve_policies(task_id, level, behaviour)]
-            out = simulate(
-                task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=deterministic, threads=2
-            )
+            out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=deterministic)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
             row |= dict(mode="deterministic" if deterministic else "sampled", returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
