@@ -1,4 +1,4 @@
-"""verify, regenerate, repaint, publish, fetch, card."""
+"""verify, regenerate, repaint, publish, fetch, card, export."""
 
 from __future__ import annotations
 
@@ -257,3 +257,26 @@ def card(context, path, check, out, as_json):
     if as_json:
         return print_json([str(file) for file in files])
     click.echo("\n".join(str(file) for file in files))
+
+
+@click.command()
+@click.argument("path", metavar="RELEASE|URL")
+@click.option("--to", required=True, help="hdf5, npz, replay-buffer, minari, lerobot or rlds.")
+@only_option
+@click.option("--episodes", metavar="A:B", callback=parse_episodes, help="Only the episodes A to B - 1.")
+@click.option("--out", type=click.Path(), required=True, help="Folder of the exports, a folder a subset.")
+@option_option
+@json_option
+def export(path, to, only, episodes, out, options, as_json):
+    """Write subsets in another format: a folder a subset, nothing is written over.
+
+    \b
+    dmcvb-gen export releases/mini --to hdf5 --only 'walker-walk/*/none' --out exports/mini
+    """
+    from dmcvb_gen.release.export import export as run
+
+    with tqdm(unit=" episodes", disable=as_json or None) as bar:
+        folders = run(path, to, out, only, episodes, storage_options=options, tick=bar.update)
+    if as_json:
+        return print_json([str(folder) for folder in folders])
+    click.echo("\n".join(str(folder) for folder in folders))

@@ -1,0 +1,92 @@
+"""What the exporters write from: the chosen episodes of a subset, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmcvb_gen.readers.release import SubsetReader, picture_names
+from dmcvb_gen.store import Manifest
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+
+
+@dataclass(frozen=True)
+class ExportEpisode:
+    """An episode of L transitions.
+
+    Attributes:
+      index: in the subset. seed: label of its random streams.
+      pixels: view -> (L + 1, height, width, 3) uint8.
+      state: (L + 1, state) float32.
+      action, reward, discount: (L, action), (L,), (L,) float32.
+      terminated: the task ended it; else the time limit did.
+    """
+
+    index: int
+    seed: int
+    pixels: dict[str, np.ndarray]
+    state: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    discount: np.ndarray
+    terminated: bool
+
+    @property
+    def length(self) -> int:
+        return len(self.action)
+
+    def stacked(self) -> np.ndarray:
+        """(L + 1, height, width, 3 * view) uint8: the views side by side in the channels."""
+        return np.concatenate(list(self.pixels.values()), axis=-1)
+
+    def arrived(self) -> dict[str, np.ndarray]:
+        """Actions, rewards, discounts in the alignment of dm_env: row t holds the action that led to observation t.
+
+        (L + 1, ...) float32; the first row has no action (zeros), reward 0 and discount 1.
+        """
+        zero = np.zeros((1, self.action.shape[1]), np.float32)
+        return {
+            "action": np.concatenate([zero, self.action]),
+            "reward": np.concatenate([np.zeros(1, np.float32), self.reward]),
+            "discount": np.concatenate([np.ones(1, np.float32), self.discount]),
+        }
+
+
+@dataclass(frozen=True)
+class Source:
+    """The chosen episodes of a subset, and what is known of them."""
+
+    manifest: Manifest
+    subset: SubsetReader
+    episodes: list[int]
+    tick: Callable[[int], None]
+
+    @property
+    def steps_per_second(self) -> float:
+        return 1 / (ACTION_REPEAT * get_task(self.subset.task).control_timestep)
+
+    @property
+    def views(self) -> list[str]:
+        """Names of the views, without the arrays' folder: "pixels", or "top", ..."""
+        return [name.split("/")[-1] for name in picture_names(self.subset, None)]
+
+    @property
+    def description(self) -> str:
+        manifest = self.manifest
+        return f"{self.subset.name} of {manifest.name} {manifest.version} ({manifest.license}), {manifest.generator}"
+
+    def __iter__(self) -> Iterator[ExportEpisode]:
+        names = picture_names(self.subset, None)
+        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *names]
+        for index in self.episodes:
+            values = self.subset.episode(index, arrays)
+            yield ExportEpisode(
+                index=index,
+                seed=int(values["seed"]),
+                pixels={name.split("/")[-1]: values[name] for name in names},
+                terminated=bool(values["terminated"]),
+                **{name: values[name] for name in ("state", "action", "reward", "discount")},
+            )
+            self.tick(1)

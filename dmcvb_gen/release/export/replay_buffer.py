@@ -1,0 +1,43 @@
+"""Diffusion policy's replay buffer (github.com/real-stanford/diffusion_policy): Zarr 2, time first, episode ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import zarr
+from numcodecs import Blosc
+
+from dmcvb_gen.release.export.episodes import Source
+
+CHUNK = 161
+"""Steps a chunk."""
+
+
+def write(source: Source, folder: Path) -> None:
+    """Write `replay_buffer.zarr`: `data/img` (step, height, width, 3) uint8 (`data/img_<view>` for several views),
+    `data/state`, `data/action`, `data/reward` float32, and `meta/episode_ends` int64."""
+    root = zarr.open_group(str(folder / "replay_buffer.zarr"), mode="w", zarr_format=2)
+    root.attrs["description"] = source.description
+    data, meta = root.create_group("data"), root.create_group("meta")
+    ends: list[int] = []
+    for episode in source:
+        length = episode.length
+        single = len(episode.pixels) == 1
+        values = {"img" if single else f"img_{view}": frames[:length] for view, frames in episode.pixels.items()}
+        values |= {"state": episode.state[:length], "action": episode.action, "reward": episode.reward}
+        before = ends[-1] if ends else 0
+        for name, value in values.items():
+            if name not in data:
+                data.create_array(
+                    name,
+                    shape=(0, *value.shape[1:]),
+                    chunks=(CHUNK, *value.shape[1:]),
+                    dtype=value.dtype,
+                    compressors=Blosc(cname="zstd", clevel=5, shuffle=Blosc.BITSHUFFLE),
+                )
+            data[name].resize((before + length, *value.shape[1:]))
+            data[name][before:] = value
+        ends.append(before + length)
+    stored = meta.create_array("episode_ends", shape=(len(ends),), chunks=(max(len(ends), 1),), dtype="int64")
+    stored[:] = np.array(ends)

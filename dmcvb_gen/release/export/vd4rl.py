@@ -1,0 +1,76 @@
+"""V-D4RL's two layouts (github.com/conglu1997/v-d4rl): HDF5 for DrQ+BC and CQL, one npz an episode for DreamerV2.
+
+Both align as dm_env does: row t holds observation t and the action, reward and discount that came with it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+
+FIRST, MID, LAST = 0, 1, 2
+"""dm_env's step types."""
+EPISODES_PER_FILE = 50
+
+
+def _step_types(rows: int) -> np.ndarray:
+    types = np.full(rows, MID, np.int64)
+    types[0], types[-1] = FIRST, LAST
+    return types
+
+
+def write_hdf5(source: Source, folder: Path) -> None:
+    """Write `data_000.hdf5`, ...: `observation` (row, 3 * view, height, width) uint8, `action`, `reward`, `discount`,
+    `state` float32 and `step_type`, episodes one after the other."""
+    import h5py
+
+    file, written = None, 0
+    for episode in source:
+        if written % EPISODES_PER_FILE == 0:
+            if file:
+                file.close()
+            file = h5py.File(folder / f"data_{written // EPISODES_PER_FILE:03d}.hdf5", "w")
+            file.attrs["description"] = source.description
+        values = {
+            "observation": episode.stacked().transpose(0, 3, 1, 2),
+            **episode.arrived(),
+            "state": episode.state,
+            "step_type": _step_types(episode.length + 1),
+        }
+        for name, value in values.items():
+            _append(file, name, value)
+        written += 1
+    if file:
+        file.close()
+
+
+def _append(file, name: str, value: np.ndarray) -> None:
+    if name not in file:
+        chunks = (min(len(value), 32), *value.shape[1:])
+        shape = (None, *value.shape[1:])
+        file.create_dataset(name, data=value, maxshape=shape, chunks=chunks, compression="gzip", compression_opts=1)
+        return
+    before = len(file[name])
+    file[name].resize(before + len(value), axis=0)
+    file[name][before:] = value
+
+
+def write_npz(source: Source, folder: Path) -> None:
+    """Write `<episode>-<rows>.npz`: `image` (row, height, width, 3 * view) uint8, `action`, `reward`, `discount`,
+    `state` float32, `is_first`, `is_last`, `is_terminal` bool."""
+    for episode in source:
+        rows = episode.length + 1
+        np.savez_compressed(folder / f"{episode.index:06d}-{rows}.npz", **_flags(episode), **_arrays(episode))
+
+
+def _arrays(episode: ExportEpisode) -> dict[str, np.ndarray]:
+    return {"image": episode.stacked(), "state": episode.state, **episode.arrived()}
+
+
+def _flags(episode: ExportEpisode) -> dict[str, np.ndarray]:
+    types = _step_types(episode.length + 1)
+    last = types == LAST
+    return {"is_first": types == FIRST, "is_last": last, "is_terminal": last & episode.terminated}

@@ -1,0 +1,231 @@
+"""Exports, read back as the programs that they are for read them."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+
+import google_crc32c
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+from PIL import Image
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.release import export as package
+from dmcvb_gen.release.export import FORMATS, export, format_table
+from dmcvb_gen.store import open_release
+
+NAME = "walker-walk/random/static"
+
+
+@pytest.fixture(scope="module")
+def episodes(small_release):
+    subset = open_release(small_release)[NAME]
+    return [subset.episode(index) for index in range(3)]
+
+
+@pytest.fixture(scope="module")
+def exported(small_release, tmp_path_factory):
+    """format -> its folder of the static subset's episodes 0 and 1, made once."""
+    made = {}
+
+    def get(to, **options):
+        if to not in made:
+            out = tmp_path_factory.mktemp(to)
+            [made[to]] = export(small_release, to, out, [NAME], (0, 2), **options)
+        return made[to]
+
+    return get
+
+
+def test_hdf5_reads_as_v_d4rls_loader_reads_it(exported, episodes):
+    h5py = pytest.importorskip("h5py")
+    [path] = sorted(exported("hdf5").glob("*.hdf5"))
+    with h5py.File(path) as file:
+        data = {name: file[name][:] for name in file}
+    assert {"observation", "action", "reward", "discount", "step_type"} <= set(data)
+    assert all(len(value) == 1002 for value in data.values())  # the loader's own check: all of one length
+    assert data["observation"].shape == (1002, 3, 16, 16) and data["observation"].dtype == np.uint8
+    number, step = -1, 0
+    for row in range(1002):  # one time step after another, as dm_env gives them
+        first = {0: True, 1: False, 2: False}[data["step_type"][row]]
+        number, step = (number + 1, 0) if first else (number, step + 1)
+        np.testing.assert_array_equal(data["observation"][row], episodes[number]["pixels"][step].transpose(2, 0, 1))
+        if first:
+            assert not data["action"][row].any() and data["reward"][row] == 0
+        else:
+            np.testing.assert_array_equal(data["action"][row], episodes[number]["action"][step - 1])
+            assert data["reward"][row] == episodes[number]["reward"][step - 1]
+    assert number == 1 and list(np.flatnonzero(data["step_type"] == 2)) == [500, 1001]
+
+
+def test_npz_reads_as_v_d4rls_dreamer_reads_it(exported, episodes):
+    files = sorted(exported("npz").glob("*.npz"))
+    assert [int(str(path).split("-")[-1][:-4]) for path in files] == [501, 501]  # how the loader finds the length
+    with files[1].open("rb") as file:
+        data = dict(np.load(file))
+    np.testing.assert_array_equal(data["image"], episodes[1]["pixels"])
+    np.testing.assert_array_equal(data["action"][1:], episodes[1]["action"])
+    np.testing.assert_array_equal(data["reward"][1:], episodes[1]["reward"])
+    assert data["is_first"][0] and data["is_first"].sum() == 1 and data["is_last"][500] and data["is_last"].sum() == 1
+    assert not data["is_terminal"].any() and (data["discount"] == 1).all() and not data["action"][0].any()
+
+
+def test_the_replay_buffer_has_diffusion_policys_layout(exported, episodes):
+    folder = exported("replay-buffer") / "replay_buffer.zarr"
+    assert (folder / "data/img/.zarray").is_file()  # Zarr 2, which that code reads
+    root = zarr.open_group(str(folder), mode="r")
+    ends = root["meta/episode_ends"][:]
+    assert list(ends) == [500, 1000] and ends.dtype == np.int64
+    for name in root["data"]:
+        assert root["data"][name].shape[0] == ends[-1]
+    np.testing.assert_array_equal(root["data/img"][500:1000], episodes[1]["pixels"][:500])
+    np.testing.assert_array_equal(root["data/action"][500:1000], episodes[1]["action"])
+    np.testing.assert_array_equal(root["data/state"][:500], episodes[0]["state"][:500])
+
+
+def test_minari_opens_its_dataset_and_the_environment(exported, episodes):
+    minari = pytest.importorskip("minari")
+    dataset = minari.MinariDataset(exported("minari") / "data")
+    assert dataset.total_episodes == 2 and dataset.total_steps == 1000
+    assert dataset.id == "dmcvb_gen/walker-walk/random-static-v0"
+    for episode, ours in zip(dataset.iterate_episodes(), episodes, strict=False):
+        np.testing.assert_array_equal(episode.observations["pixels"], ours["pixels"])
+        np.testing.assert_array_equal(episode.observations["state"], ours["state"])
+        np.testing.assert_array_equal(episode.actions, ours["action"])
+        np.testing.assert_array_equal(episode.rewards, ours["reward"])
+        assert episode.truncations[-1] and episode.truncations.sum() == 1 and not episode.terminations.any()
+    env = dataset.recover_environment()
+    assert env.observation_space == dataset.observation_space and env.action_space == dataset.action_space
+    assert env.spec.id == "dmcvb_gen/walker-walk-static-v0"
+    env.close()
+
+
+def test_lerobot_tables_are_complete_and_its_pictures_lossless(exported, episodes):
+    pq = pytest.importorskip("pyarrow.parquet")
+    pandas = pytest.importorskip("pandas")
+    folder = exported("lerobot")
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0" and info["total_frames"] == 1000 and info["fps"] == 20
+    path = folder / info["data_path"].format(chunk_index=0, file_index=0)
+    table = pq.read_table(path)
+    assert set(table.column_names) == set(info["features"]) and table.num_rows == 1000
+    row = table.slice(750, 1).to_pylist()[0]
+    picture = np.asarray(Image.open(io.BytesIO(row["observation.image"]["bytes"])))
+    np.testing.assert_array_equal(picture, episodes[1]["pixels"][250])
+    np.testing.assert_array_equal(np.float32(row["action"]), episodes[1]["action"][250])
+    assert (row["episode_index"], row["frame_index"], row["index"]) == (1, 250, 750)
+    assert row["timestamp"] == pytest.approx(250 / 20)
+    assert table["next.done"].to_pylist().index(True) == 499
+    tasks = pandas.read_parquet(folder / "meta/tasks.parquet")
+    assert tasks.loc["walker-walk (random)"].task_index == 0
+    rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [(r["dataset_from_index"], r["dataset_to_index"]) for r in rows] == [(0, 500), (500, 1000)]
+    statistics = json.loads((folder / "meta/stats.json").read_text())
+    actions = np.concatenate([episodes[0]["action"], episodes[1]["action"]])
+    np.testing.assert_allclose(statistics["action"]["std"], actions.std(axis=0), rtol=1e-4)
+    assert np.shape(statistics["observation.image"]["mean"]) == (3, 1, 1)
+
+
+def example_class():
+    """tf.train.Example, built from its published definition with Google's protocol buffer library."""
+    descriptor_pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
+    from google.protobuf import descriptor_pool, message_factory
+
+    file = descriptor_pb2.FileDescriptorProto(name="example_test.proto", package="t", syntax="proto3")
+
+    def message(name, *fields):
+        made = file.message_type.add(name=name)
+        for field in fields:
+            made.field.add(**field)
+        return made
+
+    def field(name, number, kind, label=1, **more):
+        return dict(name=name, number=number, type=kind, label=label, **more)
+
+    message("BytesList", field("value", 1, 12, 3))
+    message("FloatList", field("value", 1, 2, 3))
+    message("Int64List", field("value", 1, 3, 3))
+    kinds = (("bytes_list", "BytesList"), ("float_list", "FloatList"), ("int64_list", "Int64List"))
+    message("Feature", *(field(n, i, 11, type_name=f".t.{t}") for i, (n, t) in enumerate(kinds, 1)))
+    features = message("Features", field("feature", 1, 11, 3, type_name=".t.Features.FeatureEntry"))
+    entry = features.nested_type.add(name="FeatureEntry")
+    entry.field.add(**field("key", 1, 9))
+    entry.field.add(**field("value", 2, 11, type_name=".t.Feature"))
+    entry.options.map_entry = True
+    message("Example", field("features", 1, 11, type_name=".t.Features"))
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Example"))
+
+
+def read_tfrecords(path):
+    data, offset = path.read_bytes(), 0
+    while offset < len(data):
+        [length] = struct.unpack_from("<Q", data, offset)
+        for start, size in ((offset, 8), (offset + 12, length)):
+            crc = google_crc32c.value(data[start : start + size])
+            masked = (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
+            assert struct.unpack_from("<I", data, start + size) == (masked,)
+        yield data[offset + 12 : offset + 12 + length]
+        offset += 16 + length
+
+
+def test_rlds_records_are_examples_of_the_features_that_the_folder_names(exported, episodes):
+    [folder] = exported("rlds").iterdir()
+    info = json.loads((folder / "dataset_info.json").read_text())
+    [split] = info["splits"]
+    assert folder.name == info["version"] == "1.0.0" and split["shardLengths"] == ["2"]
+    [path] = folder.glob(f"{info['name']}-train.tfrecord-00000-of-00001")
+    examples = [example_class().FromString(data) for data in read_tfrecords(path)]
+    assert len(examples) == 2
+    values = examples[1].features.feature
+    step = json.loads((folder / "features.json").read_text())["featuresDict"]["features"]["steps"]["sequence"][
+        "feature"
+    ]
+    named = {f"steps/{name}" for name in step["featuresDict"]["features"] if name != "observation"}
+    observation = step["featuresDict"]["features"]["observation"]["featuresDict"]["features"]
+    named |= {f"steps/observation/{name}" for name in observation} | {"episode_index"}
+    assert set(values) == named
+    pictures = values["steps/observation/pixels"].bytes_list.value
+    assert len(pictures) == 501
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(pictures[500]))), episodes[1]["pixels"][500])
+    actions = np.array(values["steps/action"].float_list.value, np.float32).reshape(501, 6)
+    np.testing.assert_array_equal(actions[:500], episodes[1]["action"])
+    rewards = np.array(values["steps/reward"].float_list.value, np.float32)
+    np.testing.assert_array_equal(rewards[:500], episodes[1]["reward"])
+    last = list(values["steps/is_last"].int64_list.value)
+    assert last.index(1) == 500 and sum(last) == 1 and sum(values["steps/is_terminal"].int64_list.value) == 0
+
+
+def test_the_command_exports_and_never_writes_over(small_release, tmp_path):
+    command = ["export", str(small_release), "--to", "npz", "--only", NAME, "--episodes", "2:3", "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0 and len(list((tmp_path / NAME).glob("*.npz"))) == 1
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2 and "is there already" in result.output
+
+
+def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):
+    with pytest.raises(UnknownNameError, match="lerobot"):
+        export(small_release, "csv", tmp_path)
+    with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
+        export(small_release, "npz", tmp_path, ["cheetah-run"])
+    with pytest.raises(StoreError, match="none of the episodes 50:60"):
+        export(small_release, "npz", tmp_path, episodes=(50, 60))
+
+    def missing(name):
+        raise ImportError("No module named 'h5py'", name="h5py")
+
+    monkeypatch.setattr(package.importlib, "import_module", missing)
+    with pytest.raises(DmcvbError, match=r"h5py.*pip install \"dmcvb-gen\[hdf5\]\""):
+        export(small_release, "hdf5", tmp_path)
+
+
+def test_the_table_of_formats_names_them_all():
+    table = format_table()
+    assert all(f"| `{name}` |" in table for name in FORMATS) and len(table.splitlines()) == len(FORMATS) + 2
