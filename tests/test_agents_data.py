@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from dmcvb_gen.agents import trainer
-from dmcvb_gen.agents.data import PAD, HeldFrames, Source, TrainingData, batches, load_data
+from dmcvb_gen.agents.data import PAD, HeldFrames, Source, TrainingData, batches, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import BehaviorCloning
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
@@ -24,14 +24,17 @@ def make_data(stack=3, held=(False, True, False), size=SIZE):
     generator = torch.Generator().manual_seed(0)
     rows = int((LENGTHS + 1).sum())
     count = torch.arange(rows, dtype=torch.float32)
+    frames = HeldFrames(rows, 3, size)
+    state = torch.rand((rows, 5), generator=generator)
+    frames.put(0, torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8))
     return TrainingData(
-        state=torch.rand((rows, 5), generator=generator),
+        state=state,
         action=torch.stack([count, count], dim=1) / rows,
         reward=count,
         discount=torch.ones(rows),
         lengths=LENGTHS,
         held_out=np.array(held),
-        frames=HeldFrames(torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8)),
+        frames=frames,
         stack=stack,
     )
 
@@ -174,6 +177,16 @@ def test_batches_drawn_ahead_come_in_order_and_are_the_same():
     assert [step for step, _ in ahead] == list(range(2, 9))
     for (_, one), (_, two) in zip(plain, ahead, strict=True):
         torch.testing.assert_close(one.observation, two.observation)
+
+
+def test_bfloat16_pictures_are_the_float32_ones_rounded_once():
+    data = make_data()
+    one = data.batch(16, np.random.default_rng(0)).observation
+    two = data.batch(16, np.random.default_rng(0), dtype=torch.bfloat16).observation
+    assert two.dtype == torch.bfloat16
+    assert (two.float() - one).abs().max() <= 2**-9 * 0.5 + 1e-6
+    levels = torch.arange(256, dtype=torch.uint8)
+    assert len(normalize_pixels(levels, torch.bfloat16).unique()) == 256
 
 
 # -- the trainer ----------------------------------------------------------------------------------

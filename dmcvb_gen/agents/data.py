@@ -90,33 +90,40 @@ def mirror(size: int) -> torch.Tensor:
     return torch.where(index >= size, 2 * size - 1 - index, index)
 
 
-def shift_columns(pictures: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """(batch, channel, size, size) moved sideways, an offset a stack."""
-    size = pictures.shape[-1]
-    columns = mirror(size).to(right.device)[right[:, None] + torch.arange(size, device=right.device)]
-    return torch.gather(pictures, 3, columns[:, None, None].expand(pictures.shape))
-
-
 class HeldFrames:
-    """Pictures in memory.
+    """Pictures in memory, each line with its mirrored border at both ends (an eighth more bytes).
+
+    A shifted line of pixels then is `size` bytes that stand together, so that picking frames, stacking them and moving
+    them is one gather of lines, for any number of stacks.
 
     Args:
-      pictures: (row, channel, size, size) uint8, contiguous, on any device.
+      rows: pictures it has room for; `put` fills it.
     """
 
-    def __init__(self, pictures: torch.Tensor):
-        self.pictures = pictures
-        self.channels, self.size = pictures.shape[1], pictures.shape[2]
+    def __init__(self, rows: int, channels: int, size: int, device: str | torch.device = "cpu"):
+        self.channels, self.size = channels, size
+        self.table = torch.empty((rows, channels, size, size + 2 * PAD), dtype=torch.uint8, device=device)
+        self._mirror = mirror(size).to(device)
+
+    @property
+    def pictures(self) -> torch.Tensor:
+        """(row, channel, size, size) uint8, a view."""
+        return self.table[..., PAD:-PAD]
+
+    def put(self, first: int, pictures: torch.Tensor, channel: int = 0) -> None:
+        """Fill rows from `first` on, channels from `channel` on, with (n, c, size, size) uint8 pictures."""
+        rows, channels = slice(first, first + len(pictures)), slice(channel, channel + pictures.shape[1])
+        self.table[rows, channels] = pictures.to(self.table.device)[..., self._mirror]
 
     def shifted(self, rows, down, right):
-        # Lines of pixels are what is gathered, so that picking the frames and moving them up or down is one copy.
         batch, frames = rows.shape
-        device, size = rows.device, self.size
-        line = mirror(size).to(device)[down[:, None] + torch.arange(size, device=device)]  # (batch, size)
-        plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=device)
-        index = plane.reshape(batch, -1, 1) * size + line[:, None]
-        lines = self.pictures.view(-1, size).index_select(0, index.reshape(-1))
-        return shift_columns(lines.view(batch, frames * self.channels, size, size), right)
+        line = self._mirror[down[:, None] + torch.arange(self.size, device=rows.device)]  # (batch, size)
+        plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=rows.device)
+        index = plane.reshape(batch, -1, 1) * self.size + line[:, None]  # (batch, frames x channels, size)
+        index = index * (self.size + 2 * PAD) + right[:, None, None]
+        flat = self.table.view(-1)
+        lines = flat.as_strided((len(flat) - self.size + 1, self.size), (1, 1)).index_select(0, index.reshape(-1))
+        return lines.view(batch, frames * self.channels, self.size, self.size)
 
 
 class StoredFrames:
@@ -139,14 +146,15 @@ class StoredFrames:
             steps = self._where[row][:, 2] - first
             views = [array[int(episode), int(first) : int(last) + 1][steps] for array in self._arrays[source]]
             out[sample] = np.concatenate(views, axis=-1).transpose(0, 3, 1, 2)
-        stacks = torch.from_numpy(out).flatten(1, 2).to(rows.device)
-        held = HeldFrames(stacks.contiguous())  # each sample a "frame" of its own: only the shift is left to do
+        stacks = torch.from_numpy(out).flatten(1, 2)
+        held = HeldFrames(len(stacks), stacks.shape[1], self.size, rows.device)
+        held.put(0, stacks)  # each sample a "frame" of its own: only the shift is left to do
         return held.shifted(torch.arange(len(stacks), device=rows.device)[:, None], down, right)
 
 
-def normalize_pixels(pictures: torch.Tensor) -> torch.Tensor:
-    """uint8 -> float32 in [-0.5, 0.5]."""
-    return pictures.to(torch.float32).mul_(1 / 255).sub_(0.5)
+def normalize_pixels(pictures: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """uint8 -> [-0.5, 0.5]. In this order bfloat16 rounds once, as autocast would: 127.5 less is exact in 8 bits."""
+    return pictures.to(dtype).sub_(127.5).mul_(1 / 255)
 
 
 def stack_rows(row: torch.Tensor, start: torch.Tensor, frames: int) -> torch.Tensor:
@@ -231,12 +239,14 @@ class TrainingData(Dataset):
         middle = torch.full((count,), PAD, device=self.device)
         return middle, middle
 
-    def observe(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    def observe(
+        self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor, dtype: torch.dtype = torch.float32
+    ) -> torch.Tensor:
         """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures."""
         if self.frames is None:
             return self.state[rows]
         stacks = stack_rows(rows, self.start[rows], self.stack)
-        return normalize_pixels(self.frames.shifted(stacks, down, right))
+        return normalize_pixels(self.frames.shifted(stacks, down, right), dtype)
 
     def batch(
         self,
@@ -247,6 +257,7 @@ class TrainingData(Dataset):
         k: int = 1,
         sample_k: bool = False,
         hold_out: bool = False,
+        dtype: torch.dtype = torch.float32,
     ) -> Batch:
         """Transitions drawn uniformly, with replacement.
 
@@ -254,6 +265,7 @@ class TrainingData(Dataset):
           next_observation: give the observation k steps later too, under the same shift.
           k: steps between the two; with `sample_k` drawn from 1..k for each.
           hold_out: draw from the held-out episodes, without shifts.
+          dtype: of pictures. Half the bytes are half the time to write them.
         """
         rows = self.hold_out_rows if hold_out else self.train_rows
         if next_observation and k > 1:
@@ -271,9 +283,9 @@ class TrainingData(Dataset):
         later = steps = None
         if next_observation:
             steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-            later = self.observe(chosen + steps, down, right)
+            later = self.observe(chosen + steps, down, right, dtype)
         return Batch(
-            observation=self.observe(chosen, down, right),
+            observation=self.observe(chosen, down, right, dtype),
             state=self.state[chosen],
             action=self.action[chosen],
             reward=self.reward[chosen],
@@ -371,9 +383,9 @@ def load_data(
     ]
     size = subsets[0].record.size
     rows = int(sum((length + 1).sum() for length in lengths))
-    needed = rows * 3 * len(names[0]) * size**2 if pixels else 0
+    needed = rows * 3 * len(names[0]) * size * (size + 2 * PAD) if pixels else 0
     hold = pixels and needed <= (default_memory() if memory is None else memory)
-    held = torch.empty((rows, 3 * len(names[0]), size, size), dtype=torch.uint8) if hold else None
+    held = HeldFrames(rows, 3 * len(names[0]), size, device) if hold else None
     tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
     where, first, returns = [], 0, []
     for index, (subset, (episodes, _), length) in enumerate(zip(subsets, chosen, lengths, strict=True)):
@@ -389,13 +401,9 @@ def load_data(
             if hold:
                 for view, name in enumerate(names[index]):
                     pictures = torch.from_numpy(subset.read(name, few)[e, t])
-                    held[first : first + len(e), 3 * view : 3 * view + 3] = pictures.permute(0, 3, 1, 2)
+                    held.put(first, pictures.permute(0, 3, 1, 2), channel=3 * view)
             first += len(e)
-    frames = None
-    if hold:
-        frames = HeldFrames(held.to(device))
-    elif pixels:
-        frames = StoredFrames(subsets, names, np.concatenate(where), size)
+    frames = StoredFrames(subsets, names, np.concatenate(where), size) if pixels and not hold else held
     columns = {name: torch.from_numpy(np.concatenate(parts)).float().to(device) for name, parts in tables.items()}
     return TrainingData(
         **columns,

@@ -65,6 +65,7 @@ def draw(learner: Learner, data: TrainingData, size: int, seed: int, step: int, 
         k=learner.k_max,
         sample_k=learner.sample_k,
         hold_out=hold_out,
+        dtype=torch.bfloat16 if learner.half else torch.float32,
     )
 
 

@@ -1,0 +1,240 @@
+"""Benchmarks: the right cells for a release, the paper's numbers, online episodes as the task gives them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dmcvb_gen.agents.data import Normalization, training_views
+from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.paper import paper_score
+from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
+from dmcvb_gen.benchmarks.run import Setup, pretraining_of, run_cells
+from dmcvb_gen.benchmarks.tables import BENCHMARKS, plan_benchmark
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import Manifest, SubsetRecord
+from dmcvb_gen.store.reader import Release, Subset
+from dmcvb_gen.tasks import get_task
+
+
+def release_of(*names, episodes=100):
+    """A release of subsets without data, enough to plan with."""
+    records = []
+    for name in names:
+        task, level, setting = name.split("/")
+        records.append(
+            SubsetRecord(
+                name=name, task=task, level=level, setting=setting, episodes=episodes, episodes_per_shard=50, size=64
+            )
+        )
+    manifest = Manifest(name="x", version="1", license="x", recipe={"seed": 0}, subsets=tuple(records))
+    return Release("nowhere", manifest, {record.name: Subset("nowhere", record, {}, {}) for record in records})
+
+
+WALKER = [f"walker-walk/{level}/{s}" for level in ("expert", "medium", "mixed", "random") for s in ("none", "dynamic")]
+
+
+def test_b1_has_every_agent_on_every_set_and_states_once():
+    cells, missing = plan_benchmark("b1", release_of(*WALKER))
+    sets = {(cell.policy_label, cell.setting) for cell in cells}
+    levels = {"expert", "medium", "mixed", "random", "expert+medium"}
+    assert sets == {(level, setting) for level in levels for setting in ("none", "dynamic")}
+    assert len(cells) == 5 * (2 * 6 + 1)
+    by_state = [cell for cell in cells if cell.agent.sees_state]
+    assert len(by_state) == 5 and {cell.setting for cell in by_state} == {"none"}
+    [lacking] = missing
+    assert set(lacking.subsets) == {f"walker-walk/{level}/static" for level in ("expert", "medium", "mixed", "random")}
+    assert "--distractor static" in lacking.command and "--level medium" in lacking.command
+    assert len({cell.id for cell in cells}) == len(cells)
+
+
+def test_b1_takes_the_agents_asked_for_and_shares_encoders():
+    cells, _ = plan_benchmark("b1", release_of(*WALKER), ["id+bc", "id+td3-bc", "bc"])
+    assert {cell.agent.name for cell in cells} == {"id+bc", "id+td3-bc", "bc"}
+    encoders = {pretraining_of(cell) for cell in cells} - {None}
+    assert len(encoders) == 10  # five sets x two distractors, one for both policies
+
+
+def test_b2_learns_encoders_from_mixed_and_policies_from_twenty_expert_episodes():
+    cells, missing = plan_benchmark("b2", release_of(*WALKER))
+    assert not missing
+    few = [cell for cell in cells if cell.agent.pretrain == "id" and cell.setting == "dynamic"]
+    assert [(part.subset, part.episodes) for part in few[0].policy] == [("walker-walk/expert/dynamic", 20)]
+    assert [part.subset for part in few[0].pretrain] == ["walker-walk/mixed/dynamic"]
+    labels = {(cell.agent.name, cell.policy_label, cell.setting) for cell in cells if not cell.agent.pretrain}
+    assert labels == {("bc", "expert", "none")} | {
+        ("bc", label, setting) for label in ("20 expert", "20 expert+mixed") for setting in ("none", "dynamic")
+    }
+
+
+def test_b2_without_mixed_says_how_to_make_it():
+    cells, [missing] = plan_benchmark("b2", release_of("walker-walk/expert/none"))
+    assert {cell.policy_label for cell in cells} == {"expert", "20 expert"}
+    assert missing.subsets == ("walker-walk/mixed/none",)
+    assert missing.command.startswith("dmcvb-gen rollout walker-walk --level expert --level mixed --distractor none")
+
+
+def test_b3_has_a_policy_for_each_fixed_goal_and_names_what_is_missing():
+    maze = "ant-maze-empty7x7"
+    cells, _ = plan_benchmark("b3", release_of(f"{maze}/expert/hidden", f"{maze}/expert/fixed", episodes=50))
+    assert {cell.policy[0].goal_pair for cell in cells} == set(range(5))
+    assert {(cell.agent.name, bool(cell.pretrain)) for cell in cells} == {
+        ("bc", False), ("bc+bc", True), ("id+bc", True)
+    }  # fmt: skip
+    none, [missing] = plan_benchmark("b3", release_of("walker-walk/expert/none"))
+    assert not none and "--fixed-goals 5" in missing.command and "--goal hidden" in missing.command
+
+
+def test_ablations_vary_frames_k_and_the_share_of_the_data():
+    cells, _ = plan_benchmark("ablations", release_of("walker-walk/expert/none"))
+    names = {cell.agent.name for cell in cells}
+    assert {"bc:frames=1", "bc", "id+bc:k=5", "id+bc:k=10,sample"} <= names
+    assert {part.share for cell in cells for part in cell.policy} == {0.01, 0.05, 0.1, 0.25, 0.5, 1.0}
+
+
+def test_unknown_benchmarks_and_profiles_list_the_known_ones():
+    with pytest.raises(UnknownNameError, match=", ".join(sorted(BENCHMARKS))):
+        plan_benchmark("b4", release_of(*WALKER))
+    with pytest.raises(UnknownNameError, match="paper, quick, smoke"):
+        get_profile("slow")
+
+
+def test_the_papers_scores_are_those_of_its_table():
+    assert paper_score("walker-walk", "expert", "dynamic", "null+bc") == (913, 10)
+    assert paper_score("humanoid-walk", "expert+medium", "static", "bc(state)") == (585, 21)
+    assert paper_score("walker-walk", "expert", "dynamic_hard", "null+bc") is None
+    assert paper_score("walker-walk", "expert", "none", None) is None
+
+
+def test_the_paper_profile_is_the_papers_and_a_scaled_one_says_so():
+    paper = PROFILES["paper"]
+    assert (paper.pixel_steps, paper.batch_size, paper.episodes) == (400_000, 256, 30)
+    assert paper.pixel_steps // paper.evaluations == 20_000
+    half = PROFILES["quick"].scaled(0.5)
+    assert half.pixel_steps == PROFILES["quick"].pixel_steps / 2 and "x0.5" in half.name and "0.5 times" in half.note
+    assert not PROFILES["smoke"].scores
+
+
+# -- online evaluation ----------------------------------------------------------------------------
+
+
+class Recorder:
+    """A policy that moves a little, the same way every time, and remembers what it saw."""
+
+    def __init__(self, size):
+        self.size, self.seen = size, []
+
+    def precision(self):
+        return torch.autocast("cpu", enabled=False)
+
+    def act(self, observation):
+        self.seen.append(observation.clone())
+        return torch.full((len(observation), self.size), 0.1)
+
+
+def rewards_by_hand(evaluator, actions, steps):
+    batch = evaluator.task.batch(evaluator.episodes)
+    state = batch.reset(evaluator.streams("initial_state"))
+    total, states = 0, [state]
+    for _ in range(steps):
+        result = batch.step(np.full((evaluator.episodes, actions), 0.1))
+        total = total + result.reward
+        states.append(result.state)
+    return total, states
+
+
+def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
+    subset = open_release(small_release)["walker-walk/random/none"]
+    normalization = Normalization(torch.full((24,), 0.5), torch.full((24,), 2.0))
+    evaluator = Evaluator(subset, pixels=False, normalization=normalization, episodes=3, max_steps=6)
+    policy = Recorder(6)
+    score = evaluator(policy)
+    returns, states = rewards_by_hand(evaluator, 6, 6)
+    np.testing.assert_allclose(score.returns, returns, rtol=1e-6)
+    assert score.mean == pytest.approx(returns.mean())
+    assert score.stderr == pytest.approx(returns.std(ddof=1) / np.sqrt(3))
+    np.testing.assert_allclose(policy.seen[4], (states[4] - 0.5) / 2, rtol=1e-5, atol=1e-5)
+    assert score.success is None and score.pictures is None
+
+
+def test_pictures_are_of_unseen_videos_newest_frame_last(small_release):
+    subset = open_release(small_release)["walker-walk/random/dynamic"]
+    evaluator = Evaluator(subset, episodes=2, max_steps=4, shots=2)
+    policy = Recorder(6)
+    score = evaluator(policy)
+    evaluator.close()
+    assert evaluator._videos.split == "val"
+    stacks = [seen.unflatten(1, (3, 3)) for seen in policy.seen]
+    assert stacks[0].shape == (2, 3, 3, 16, 16) and stacks[0].abs().max() <= 0.5
+    assert torch.equal(stacks[0][:, 0], stacks[0][:, 2])  # the first frame is repeated
+    assert torch.equal(stacks[3][:, 0], stacks[2][:, 1]) and torch.equal(stacks[3][:, 1], stacks[2][:, 2])
+    assert not torch.equal(stacks[3][:, 2], stacks[2][:, 2])
+    assert score.pictures.shape == (2, 16, 16, 3) and score.pictures.std() > 5
+
+
+def test_evaluation_episodes_are_no_releases_episodes(small_release):
+    subset = open_release(small_release)["walker-walk/random/none"]
+    evaluator = Evaluator(subset, pixels=False, episodes=8)
+    first = evaluator.task.batch(8).reset(evaluator.streams("initial_state"))
+    stored = subset.read("state")[:, 0]
+    assert np.abs(first[:, None] - stored[None]).max(axis=2).min() > 1e-3
+
+
+def test_mazes_are_scored_by_success_and_start_where_the_pair_says():
+    subset = release_of("ant-maze-empty7x7/expert/fixed").subsets["ant-maze-empty7x7/expert/fixed"]
+    task = get_task("ant-maze-empty7x7")
+    normalization = Normalization(torch.zeros(task.state_size), torch.ones(task.state_size))
+    evaluator = Evaluator(
+        subset, pixels=False, normalization=normalization, episodes=2, max_steps=3, pair=((1, 1), (5, 5))
+    )
+    policy = Recorder(8)
+    score = evaluator(policy)
+    assert score.success == 0.0 and score.speed is None and score.mean < 0
+    place = policy.seen[0][:, task.state_slices["walker_position"]]
+    torch.testing.assert_close(place[0, :2], place[1, :2])
+
+
+def test_agents_see_three_of_a_mazes_views_with_the_goal_hidden_where_the_setting_hides_it(monkeypatch):
+    task = get_task("ant-maze-empty7x7")
+    everything = tuple(f"{root}/{view}" for root in ("pixels", "pixels_hidden_goal") for view in task.views)
+    monkeypatch.setattr(Subset, "pixel_arrays", property(lambda self: everything))
+    for setting, root in (("visible", "pixels"), ("hidden", "pixels_hidden_goal"), ("fixed", "pixels_hidden_goal")):
+        subset = release_of(f"ant-maze-empty7x7/expert/{setting}").subsets[f"ant-maze-empty7x7/expert/{setting}"]
+        assert training_views(subset) == tuple(f"{root}/{view}" for view in ("top", "egocentric", "follow"))
+
+
+# -- running cells --------------------------------------------------------------------------------
+
+
+def test_cells_in_processes_give_what_cells_in_this_one_give(small_release, tmp_path):
+    release = open_release(small_release)
+    cells = [cell for cell in plan_benchmark("b1", release, ["state-bc"])[0]][:1]
+    scores = []
+    for workers in (1, 2):
+        setup = Setup(str(small_release), str(tmp_path / str(workers)), PROFILES["smoke"])
+        [(cell, result)] = list(run_cells(setup, cells, workers))
+        scores.append((cell.id, result["score"]["returns"], result["curve"][-1]["loss"]))
+    assert scores[0][1] == pytest.approx(scores[1][1]) and scores[0][2] == pytest.approx(scores[1][2])
+
+
+def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path):
+    release = open_release(small_release)
+    cells = [c for c in plan_benchmark("b1", release, ["dino+bc", "state-bc"])[0] if c.setting == "none"]
+    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+    results = {cell.agent.name: result for cell, result in run_cells(setup, cells)}
+    assert "--dino-weights" in results["dino+bc"]["error"] and results["state-bc"]["score"]["mean"] >= 0
+
+
+def test_a_result_of_another_seed_or_profile_is_not_taken_for_this_one(small_release, tmp_path):
+    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    made = []
+    for seed, profile in ((0, "smoke"), (0, "smoke"), (1, "smoke")):
+        steps = []
+        setup = Setup(str(small_release), str(tmp_path), PROFILES[profile], seed=seed)
+        list(run_cells(setup, cells, tick=lambda what, count, steps=steps: steps.append(count)))
+        made.append(sum(steps))
+    assert made == [20, 0, 20]
+    with pytest.raises(DmcvbError, match="committed|release"):
+        open_release(tmp_path)

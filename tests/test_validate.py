@@ -1,0 +1,230 @@
+"""validate: a sound release gives a page and exit code 0; each kind of damage fails by the check meant for it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+
+from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
+from dmcvb_gen.cli import main
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
+from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
+from tests.conftest import roll_out, small_recipe
+
+NAME = "walker-walk/expert/dynamic"
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    """Two expert episodes with distractors, a shard each."""
+    folder = tmp_path_factory.mktemp("validate") / "tiny"
+    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": ["dynamic"], "episodes": 2}
+    roll_out(small_recipe(name="tiny", subsets=[pattern | {"episodes_per_shard": 1}]), folder)
+    return folder
+
+
+@pytest.fixture
+def copy(release, tmp_path):
+    shutil.copytree(release, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def rewrite(folder, change):
+    """Change arrays and make all digests again, so that only what the data say can give it away."""
+    change(zarr.open_group(str(folder / f"{NAME}.zarr"), mode="r+", use_consolidated=False))
+    for shard in range(2):
+        path = folder / commit_path(NAME, shard)
+        commit = parse_commit(path.read_text())
+        files = [
+            file.model_copy(update={"bytes": at.stat().st_size, "sha256": sha256_file(at)})
+            for file in commit.files
+            if (at := folder / file.path).exists()
+        ]
+        write_json_atomically(path, commit.model_copy(update={"files": tuple(files)}))
+    finish_release(folder, open_release(folder).manifest)
+
+
+def set_rows(array, episode, step, value):
+    def change(group):
+        rows = group[array][episode]
+        rows[step] = value
+        group[array][episode] = rows
+
+    return change
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def found(folder):
+    return {
+        (finding.check, finding.episode, finding.step) for finding in check_structure(open_release(folder)).findings
+    }
+
+
+# -- the command ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def report(release, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report")
+    arguments = (
+        "validate",
+        release,
+        "--profile",
+        "smoke",
+        "--agents",
+        "bc,state-bc,id+bc",
+        "--threads",
+        1,
+        "--out",
+        out,
+    )
+    return arguments, out, run(*arguments)
+
+
+def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
+    _, out, result = report
+    assert result.exit_code == 0, result.output
+    scores = [line for line in result.output.splitlines() if "paper 9" in line]
+    assert len(scores) == 3 and all("[smoke]" in line for line in scores)
+    assert "walker-walk/expert/none" in result.output and "dmcvb-gen rollout walker-walk" in result.output
+    page = (out / "report.html").read_text()
+    assert page.index("Sound") < page.index("Structure") < page.index("Episode returns") < page.index("Scores")
+    assert "paper 913 &plusmn; 10" in page and "claims no score" in page
+    assert page.count("<span class=tag>smoke</span>") == 3
+    assert page.count("data:image/png;base64") >= 6 and "src='http" not in page and "href=" not in page
+    facts = json.loads((out / "report.json").read_text())
+    by_agent = {entry["cell"]["agent_name"]: entry for entry in facts["results"]}
+    assert facts["sound"] and set(by_agent) == {"bc", "state-bc", "id+bc"}
+    assert by_agent["bc"]["paper"] == {"mean": 913, "stderr": 10} and by_agent["state-bc"]["share"] == 1
+    assert by_agent["bc"]["paper_share"] == pytest.approx(913 / 960)
+    assert by_agent["id+bc"]["pretraining"]["curve"] and by_agent["id+bc"]["inspection"]["state_mse"] > 0
+    assert (out / "cells" / "b1_walker-walk_dynamic_bc_expert.decoder.png").exists()
+
+
+def test_the_same_command_goes_on_where_it_stopped(report):
+    arguments, out, _ = report
+    files = sorted((out / "cells").glob("*.json"))
+    before = [file.stat().st_mtime_ns for file in files]
+    files[0].unlink()
+    facts = json.loads(run(*arguments, "--json").stdout)
+    after = [file.stat().st_mtime_ns for file in files]
+    assert len(facts["results"]) == 3
+    assert after[0] != before[0] and after[1:] == before[1:]
+
+
+def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
+    for arguments, message in (
+        ((release, "--profile", "fast"), "paper, quick, smoke"),
+        ((release, "--agents", "bcc"), "state-bc"),
+        ((release, "--benchmark", "b9"), "ablations"),
+        ((release, "--benchmark", "b3"), "--fixed-goals"),
+        ((release, "--only", "cheetah-run/*"), NAME),
+        ((tmp_path,), "no release"),
+    ):
+        result = run("validate", *arguments, "--out", tmp_path / "out")
+        assert result.exit_code == 2 and message in result.output, result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_release_ends_with_1_names_the_place_and_is_not_trained_on(copy, tmp_path):
+    rewrite(copy, set_rows("state", 1, (123, 4), np.nan))
+    result = run("validate", copy, "--agents", "state-bc", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert f"FAIL finite: {NAME}, episode 1, step 123" in result.output
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Not sound" in page and "0 of 1 benchmark cells run" in page
+
+
+# -- damage ---------------------------------------------------------------------------------------
+
+
+def test_the_release_of_these_tests_is_sound(release):
+    structure = check_structure(open_release(release))
+    assert structure.sound and structure.checked == {"subsets": 1, "episodes": 2, "steps": 1000}
+
+
+def test_a_flipped_byte_fails_by_its_digest(copy):
+    file = next(file for file in open_release(copy)[NAME].commits[1].files if "/pixels/" in file.path)
+    data = bytearray((copy / file.path).read_bytes())
+    data[len(data) // 2] ^= 1
+    (copy / file.path).write_bytes(data)
+    assert found(copy) == {("files", None, None)}
+
+
+def test_a_truncated_shard_fails_by_its_size(copy):
+    file = next(file for file in open_release(copy)[NAME].commits[0].files if "/state/" in file.path)
+    (copy / file.path).write_bytes((copy / file.path).read_bytes()[:100])
+    assert ("files", None, None) in found(copy)
+
+
+def test_a_swapped_reward_fails_by_simulating_again(copy):
+    rewards = open_release(copy)[NAME].read("reward", [0])[0]
+    rewrite(copy, set_rows("reward", 0, slice(0, 500), np.roll(rewards[:500], 50)))
+    assert {("rewards", 0)} == {(check, episode) for check, episode, _ in found(copy)}
+
+
+def test_pixels_of_another_episode_fail_by_painting_again(copy):
+    other = open_release(copy)[NAME].read("pixels", [0])[0]
+    rewrite(copy, set_rows("pixels", 1, slice(None), other))
+    assert {("pixels", 1)} == {(check, episode) for check, episode, _ in found(copy)}
+
+
+def test_returns_that_are_not_the_sum_of_the_rewards_fail(copy):
+    total = open_release(copy)[NAME].returns[1]
+    rewrite(copy, lambda group: group["return"].__setitem__(1, total - 3))
+    assert found(copy) == {("returns", 1, None)}
+
+
+def test_black_and_frozen_pictures_fail_with_their_step(copy):
+    rewrite(copy, set_rows("pixels", 1, 77, 0))
+    assert ("pictures", 1, 77) in found(copy)
+    rewrite(copy, lambda group: group["pixels"].__setitem__(1, np.repeat(group["pixels"][1][:1], 501, axis=0)))
+    assert ("pictures", 1, None) in found(copy)
+
+
+@pytest.mark.parametrize(
+    "array, step, value",
+    [("background_video", slice(40, 60), 1000), ("background_frame", 40, 1000), ("style", slice(0, 501), 3)],
+)
+def test_labels_that_do_not_fit_the_setting_fail(copy, array, step, value):
+    rewrite(copy, set_rows(f"exogenous/{array}", 1, step, value))
+    [first] = list(check_labels(open_release(copy)[NAME]))[:1]
+    assert (first.check, first.episode, first.step) == ("labels", 1, step if isinstance(step, int) else step.start)
+
+
+def test_labels_of_every_setting_fit(small_release):
+    for subset in open_release(small_release).subsets.values():
+        assert not list(check_labels(subset))
+
+
+def with_policy(subset, **evaluation):
+    policy = subset.record.policies[0]
+    header = policy.header | {"evaluation": policy.header["evaluation"] | evaluation}
+    policies = (policy.model_copy(update={"header": header}),)
+    subset.record = subset.record.model_copy(update={"policies": policies})
+    return subset
+
+
+def test_returns_unlike_the_policys_own_fail(release):
+    subset = open_release(release)[NAME]
+    assert not list(check_policy_returns(subset))
+    [finding] = check_policy_returns(with_policy(subset, mean=300.0, std=5.0))
+    assert finding.check == "returns" and "its file says 300.0" in finding.message
+    assert not list(check_policy_returns(with_policy(subset, mode="deterministic")))  # not comparable
+
+
+def test_returns_unlike_the_papers_are_a_warning(release, small_release):
+    assert not list(check_paper_returns(open_release(small_release)["walker-walk/random/none"]))
+    subset = open_release(release)[NAME]
+    subset.__dict__["returns"] = np.array([400.0, 402.0])
+    [finding] = check_paper_returns(subset)
+    assert finding.check == "paper" and "the paper's is 957.8" in finding.message
