@@ -35,6 +35,7 @@ LAYOUTS = (
     "width-delta-zstd-9",
     "width-delta-blosc",
     "channel-delta-zstd",
+    "color-delta-zstd",
 )
 CHUNKS = (8, 32, 128, 501)
 

@@ -31,6 +31,7 @@ NAME = "walker-walk/random/dynamic"
         "time-delta-zstd",
         "width-delta-zstd",
         "channel-delta-zstd",
+    "color-delta-zstd",
         "width-delta-blosc",
     ],
 )
