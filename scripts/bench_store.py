@@ -35,7 +35,6 @@ LAYOUTS = (
     "width-delta-zstd-9",
     "width-delta-blosc",
     "channel-delta-zstd",
-    "color-delta-zstd",
 )
 CHUNKS = (8, 32, 128, 501)
 

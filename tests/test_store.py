@@ -31,7 +31,6 @@ NAME = "walker-walk/random/dynamic"
         "time-delta-zstd",
         "width-delta-zstd",
         "channel-delta-zstd",
-    "color-delta-zstd",
         "width-delta-blosc",
     ],
 )

@@ -138,8 +138,6 @@ def picture_codecs(layout: str) -> dict[str, Any]:
         "time-delta-zstd": dict(filters=(time_last, delta), compressors=(ZstdCodec(level=3),)),
         "width-delta-zstd": dict(filters=(width_last, delta), compressors=(ZstdCodec(level=3),)),
         "channel-delta-zstd": dict(filters=(channel_first, delta), compressors=(ZstdCodec(level=1),)),
-        # Differences of neighboring values (colors of a pixel), then of neighboring pixels, a color at a time.
-        "color-delta-zstd": dict(filters=(delta, channel_first, delta), compressors=(ZstdCodec(level=1),)),
         "width-delta-blosc": dict(
             filters=(width_last, delta),
             compressors=(BloscCodec(cname="zstd", clevel=3, shuffle="noshuffle", typesize=1),),
@@ -153,11 +151,11 @@ def picture_codecs(layout: str) -> dict[str, Any]:
 def picture_layout_for(setting: str) -> str:
     """The codec layout of a setting's pictures, as measured with scripts/bench_store.py.
 
-    Moving pictures are smaller as differences of colors and of neighboring pixels; where the camera stands still,
-    zstd finds the repeated rows by itself, and is faster to read.
+    Moving pictures are smaller as differences of neighboring pixels, a color channel at a time; where the camera
+    stands still, zstd finds the repeated rows by itself, and is faster to read.
     """
     moving = setting.startswith("dynamic") or setting in ("visible", "hidden", "fixed")
-    return "color-delta-zstd" if moving else "zstd"
+    return "channel-delta-zstd" if moving else "zstd"
 
 
 def create_arrays(
