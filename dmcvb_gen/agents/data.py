@@ -344,8 +344,10 @@ def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return names[chosen][by_name], held[by_name]
 
 
-def default_memory() -> int:
-    """Bytes of pictures that are held: half of what the machine has free."""
+def default_memory(device: str = "cpu") -> int:
+    """Bytes of pictures that are held: half of what the machine (or its accelerator) has free."""
+    if device.startswith("cuda"):
+        return torch.cuda.mem_get_info(device)[0] // 2
     pages = os.sysconf("SC_AVPHYS_PAGES") if "SC_AVPHYS_PAGES" in os.sysconf_names else 2**20
     return pages * os.sysconf("SC_PAGE_SIZE") // 2
 
@@ -384,7 +386,7 @@ def load_data(
     size = subsets[0].record.size
     rows = int(sum((length + 1).sum() for length in lengths))
     needed = rows * 3 * len(names[0]) * size * (size + 2 * PAD) if pixels else 0
-    hold = pixels and needed <= (default_memory() if memory is None else memory)
+    hold = pixels and needed <= (default_memory(device) if memory is None else memory)
     held = HeldFrames(rows, 3 * len(names[0]), size, device) if hold else None
     tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
     where, first, returns = [], 0, []

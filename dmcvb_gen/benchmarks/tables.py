@@ -198,7 +198,7 @@ def _b1(shelf: _Shelf, agents: list[Agent]):
 
 
 def _b2(shelf: _Shelf, agents: list[Agent]):
-    encoders = [agent for agent in agents if agent.pretrain] or [parse_agent(name) for name in B2_AGENTS]
+    encoders = [agent for agent in agents or map(parse_agent, B2_AGENTS) if agent.pretrain]
     bc, reference = parse_agent("bc"), parse_agent("bc")
     for task in [task for task in shelf.tasks if not is_maze(task)]:
         full = shelf.parts(task, ["expert"], "none")
@@ -217,7 +217,7 @@ def _b2(shelf: _Shelf, agents: list[Agent]):
 
 
 def _b3(shelf: _Shelf, agents: list[Agent]):
-    encoders = [agent for agent in agents if agent.pretrain] or [parse_agent(name) for name in B3_AGENTS]
+    encoders = [agent for agent in agents or map(parse_agent, B3_AGENTS) if agent.pretrain]
     mazes = [task for task in shelf.tasks if is_maze(task)]
     if not mazes:
         shelf.find("ant-maze-empty7x7", ["expert"], "hidden")
