@@ -1,10 +1,12 @@
 """Wall-clock until 90 % of the paper's expert return on walker-walk: ours against plain SB3 SAC, in the same run.
 
     python scripts/bench_training.py --limit 3600
+    python scripts/bench_training.py --limit 3 --every 400 --episodes 2     # does it run?
 
 The peer is Stable-Baselines3's SAC with its own settings on one dm_control environment at action repeat 2. One
 thread each, one after the other. Both are evaluated on 20 fresh episodes with sampled actions every 2,000 steps;
 evaluations are not counted, compilation is. A side that does not get there within the limit is reported as such.
+Measure on a machine that does nothing else.
 """
 
 from __future__ import annotations
@@ -23,13 +25,15 @@ import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
+from dmcvb_gen.behaviours import runs
 from dmcvb_gen.behaviours.defaults import default_run
 from dmcvb_gen.behaviours.paper import paper_returns
-from dmcvb_gen.behaviours.training import RunConfig, open_run
+from dmcvb_gen.behaviours.runs import RunConfig
+from dmcvb_gen.behaviours.training import open_run
 from dmcvb_gen.behaviours.vec_env import TaskVecEnv
 from dmcvb_gen.tasks import get_task
 
-TASK, EVERY, EPISODES = "walker-walk", 2_000, 20
+TASK = "walker-walk"
 
 
 class SuiteEnv(gymnasium.Env):
@@ -61,20 +65,21 @@ class SuiteEnv(gymnasium.Env):
 
 
 class UntilReturn(BaseCallback):
-    """Evaluates every `EVERY` steps and stops at the goal or the limit; its clock stands still meanwhile."""
+    """Evaluates every `every` steps and stops at the goal or the limit; its clock stands still meanwhile."""
 
-    def __init__(self, goal: float, limit: float):
+    def __init__(self, goal: float, limit: float, every: int, episodes: int):
         super().__init__()
         self.goal, self.limit, self.spent, self.reached = goal, limit, 0.0, False
+        self.every, self.episodes = every, episodes
 
     def _on_training_start(self) -> None:
         self.started = time.perf_counter()
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % EVERY:
+        if self.num_timesteps % self.every:
             return True
         self.spent += time.perf_counter() - self.started
-        env, total = TaskVecEnv(get_task(TASK), EPISODES, seed=1_000), 0.0
+        env, total = TaskVecEnv(get_task(TASK), self.episodes, seed=1_000), 0.0
         observation = env.reset()
         for _ in range(env.task.max_steps):
             observation, reward, _, _ = env.step(self.model.predict(observation, deterministic=False)[0])
@@ -89,7 +94,7 @@ class Enough(Exception):
     """Ours got there, or ran out of time."""
 
 
-def ours(goal: float, limit: float, seed: int) -> tuple[float, bool]:
+def ours(goal: float, limit: float, seed: int, every: int, episodes: int) -> tuple[float, bool]:
     """Training seconds, and whether the goal was reached."""
     last = []
 
@@ -100,8 +105,9 @@ def ours(goal: float, limit: float, seed: int) -> tuple[float, bool]:
             raise Enough
 
     with tempfile.TemporaryDirectory() as folder:
+        runs.EVALUATION_EPISODES = episodes
         settings = default_run(TASK)["settings"]
-        config = RunConfig(TASK, "sac", 2_000_000, seed, settings, evaluate_every=EVERY, evaluate_sparse=EVERY)
+        config = RunConfig(TASK, "sac", 2_000_000, seed, settings, evaluate_every=every, evaluate_sparse=every)
         try:
             open_run(Path(folder) / "run", config, resume=False).train(report)
         except Enough:
@@ -112,13 +118,15 @@ def ours(goal: float, limit: float, seed: int) -> tuple[float, bool]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--limit", type=float, default=3600.0, help="training seconds a side")
+    parser.add_argument("--every", type=int, default=2_000, help="agent steps between evaluations")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of an evaluation")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     goal = 0.9 * paper_returns(TASK, "expert")["mean"]
     print(f"{TASK}: seconds of training to a return of {goal:.0f}, one thread")
-    mine, reached = ours(goal, arguments.limit, arguments.seed)
-    callback = UntilReturn(goal, arguments.limit)
+    mine, reached = ours(goal, arguments.limit, arguments.seed, arguments.every, arguments.episodes)
+    callback = UntilReturn(goal, arguments.limit, arguments.every, arguments.episodes)
     SAC("MlpPolicy", SuiteEnv(arguments.seed), seed=arguments.seed, device="cpu").learn(2_000_000, callback=callback)
     for name, seconds, done in (("ours", mine, reached), ("SB3 SAC", callback.spent, callback.reached)):
         print(f"{name}: {seconds:.0f} s" + ("" if done else " (not reached)"))
