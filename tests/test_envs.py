@@ -16,15 +16,16 @@ from gymnasium.utils.env_checker import check_env
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.readers.dm import DmEnv
 from dmcvb_gen.readers.envs import DistractedEnv
-from dmcvb_gen.readers.register import SETTINGS, TASKS, environment_ids
+from dmcvb_gen.readers.register import MAZES, SETTINGS, TASKS, environment_ids
 from dmcvb_gen.store import open_release
-from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task
 
 SMALL = dict(size=16, samples=1)
 
 
-def test_every_locomotion_task_and_distractor_is_registered():
-    assert TASKS == LOCOMOTION_TASKS and len(environment_ids()) == len(TASKS) * len(SETTINGS)
+def test_every_task_and_distractor_is_registered():
+    assert TASKS == LOCOMOTION_TASKS and MAZES == ANT_MAZE_TASKS
+    assert len(environment_ids()) == len(TASKS) * len(SETTINGS) + 2 * len(MAZES)
     assert set(environment_ids()) <= set(gymnasium.registry)
 
 
@@ -113,6 +114,23 @@ def test_pictures_are_those_that_the_store_has_for_the_same_physics_and_labels(s
     for step in (0, 250, 500):
         env._stage.state = env._stage.batch.set_physics(episode["physics"][step : step + 1])
         np.testing.assert_array_equal(env._stage.observe()["pixels"][0], episode["pixels"][step])
+
+
+def test_a_maze_shows_its_views_and_hides_its_goal():
+    views = ["top", "egocentric"]
+    seen, hidden = (
+        gymnasium.make(f"dmcvb_gen/ant-maze-empty7x7-{goal}-v0", views=views, size=32, samples=1)
+        for goal in ("visible", "hidden")
+    )
+    one, other = seen.reset(seed=1)[0], hidden.reset(seed=1)[0]
+    np.testing.assert_array_equal(one["state"], other["state"])
+    assert one["pixels"].shape == (32, 32, 6) and (one["pixels"][..., :3] != other["pixels"][..., :3]).any()
+    _, reward, terminated, truncated, _ = seen.step(seen.action_space.sample())
+    assert -2 <= reward <= 0 and not terminated and not truncated
+    with pytest.raises(DmcvbError, match="egocentric"):
+        DistractedEnv("ant-maze-empty7x7", "visible", views=["behind"])
+    with pytest.raises(DmcvbError, match="hidden"):
+        DistractedEnv("ant-maze-empty7x7", "dynamic")
 
 
 def test_evaluation_shows_videos_that_training_does_not():

@@ -12,6 +12,7 @@ import resource
 import shutil
 import signal
 import threading
+import types
 import urllib.parse
 
 import numpy as np
@@ -456,3 +457,63 @@ def test_a_full_disk_is_said_and_what_came_stays(s3, tmp_path, small_release):
         signal.signal(signal.SIGXFSZ, handler)
     fetch("s3://bucket/small", tmp_path / "r", [NAME], options=s3.options)
     assert verify(tmp_path / "r").sound
+
+
+class FakeHub:
+    """The calls of huggingface_hub.HfApi that publishing makes, with a repository in memory."""
+
+    def __init__(self):
+        self.files, self.commits, self.fail = {}, [], None
+
+    def create_repo(self, repo_id, repo_type, exist_ok):
+        assert repo_type == "dataset" and exist_ok
+
+    def repo_info(self, repo_id, repo_type):
+        return types.SimpleNamespace(sha=str(len(self.commits)))
+
+    def get_paths_info(self, repo_id, paths, repo_type):
+        for path in paths:
+            if path in self.files:
+                data = self.files[path]
+                blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+                yield types.SimpleNamespace(path=path, blob_id=blob, lfs=None)
+
+    def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit=None):
+        if self.fail is not None and len(self.commits) == self.fail:
+            raise ConnectionError("the line went dead, token=hf_secret123")
+        if parent_commit is not None and parent_commit != str(len(self.commits)):
+            raise RuntimeError("412: a commit has happened since")
+        for operation in operations:
+            with operation.as_file() as file:
+                self.files[operation.path_in_repo] = file.read()
+        self.commits.append([operation.path_in_repo for operation in operations])
+        return types.SimpleNamespace(oid=str(len(self.commits)))
+
+
+def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(tiny, copy, monkeypatch, tmp_path):
+    pytest.importorskip("huggingface_hub")
+    from dmcvb_gen.release import hub
+    from dmcvb_gen.release.publish import make_index
+
+    monkeypatch.setattr(hub, "BATCH", 20)
+    api, url = FakeHub(), "hf://datasets/me/tiny"
+    manifest = open_release(tiny).manifest
+    index = make_index(tiny, manifest)
+    api.fail = 1
+    with pytest.raises(StoreError, match="run the same command again") as caught:
+        hub.publish_to_hub(tiny, manifest, index, url, api=api)
+    assert "hf_secret123" not in str(caught.value) and "manifest.json" not in api.files
+    api.fail = None
+    assert hub.publish_to_hub(tiny, manifest, index, url, api=api) == len(index.files) - 20
+    assert api.commits[-1] == [INDEX, "manifest.json"] and len(api.commits) == 4
+    for path, data in api.files.items():
+        (tmp_path / "there" / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "there" / path).write_bytes(data)
+    assert verify(tmp_path / "there").sound
+    assert hub.publish_to_hub(tiny, manifest, index, url, api=api) == 0
+    new_version(copy)
+    changed = open_release(copy).manifest
+    with pytest.raises(StoreError, match="never changes"):
+        hub.publish_to_hub(copy, changed, make_index(copy, changed), url, api=api)
+    with pytest.raises(StoreError, match="hf://datasets/OWNER/NAME"):
+        hub.publish_to_hub(tiny, manifest, index, "hf://models/x", api=api)

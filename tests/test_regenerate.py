@@ -87,6 +87,11 @@ def test_lost_metadata_is_put_back(copy):
     assert repair(copy).shards == ()
 
 
+def test_a_release_keeps_its_own_codecs_when_the_code_has_new_ones(copy, monkeypatch):
+    monkeypatch.setattr("dmcvb_gen.store.writer.picture_layout_for", lambda setting: "zstd-9")
+    assert check(copy, [NAME], (2, 3)).sound
+
+
 def change_actions(folder):
     """Another machine's data: other values under digests of their own."""
     group = zarr.open_group(str(folder / f"{NAME}.zarr"), mode="r+", use_consolidated=False)

@@ -16,11 +16,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from dmcvb_gen.distractors import DistractorSetting, Exogenous, ExogenousWalk, load_backgrounds
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.rendering import floor_alpha_for, make_renderer
 from dmcvb_gen.rendering.warp import WarpRenderer
 from dmcvb_gen.rollout.plan import check_renderer
-from dmcvb_gen.rollout.recipe import check_size
+from dmcvb_gen.rollout.recipe import check_size, distractor_of, is_maze, normalize_setting
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
@@ -31,11 +31,20 @@ PURPOSE = "evaluation"
 class _Stage:
     """`count` episodes with their distractors and pictures; restarted one by one."""
 
-    def __init__(self, count, task, distractor, difficulty, size, renderer, samples, split, backgrounds, threads):
+    def __init__(
+        self, count, task, distractor, difficulty, size, renderer, samples, split, backgrounds, views, threads
+    ):
         self.task, self.count = get_task(task), count
-        self.setting = DistractorSetting.parse(distractor)
-        if difficulty:
+        if is_maze(task) and distractor == "none":
+            distractor = "visible"  # mazes differ in style, always, and in whether the goal is seen
+        self.setting = distractor_of(task, normalize_setting(task, distractor))
+        self.hide_goal = is_maze(task) and distractor == "hidden"
+        if difficulty and not is_maze(task):
             self.setting = DistractorSetting(self.setting.kind, difficulty)
+        for view in views or ():
+            if view not in self.task.views:
+                raise UnknownNameError(f"view of {task}", view, self.task.views)
+        self.views = tuple(views or self.task.views)
         check_size(size)
         check_renderer(renderer)
         self.size, self.split = size, split
@@ -56,8 +65,7 @@ class _Stage:
         self.state = np.zeros((count, self.task.state_size))
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
-        views = len(self.task.views)
-        shape = (self.size, self.size, 3 * views)
+        shape = (self.size, self.size, 3 * len(self.views))
         observation = {
             "pixels": spaces.Box(0, 255, shape, np.uint8),
             "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
@@ -89,7 +97,8 @@ class _Stage:
     def observe(self) -> dict[str, np.ndarray]:
         """ "pixels" (place, size, size, 3 * view) uint8 and "state" (place, state) float32."""
         physics = self.batch.physics()
-        pictures = self.renderer.render(physics, self.labels(physics))  # (place, view, size, size, 3)
+        labels = self.labels(physics)
+        pictures = self.renderer.render(physics, labels, self.views, self.hide_goal)  # (place, view, size, size, 3)
         pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
         return {"pixels": pixels, "state": self.state.astype(np.float32)}
 
@@ -109,11 +118,14 @@ class DistractedEnv(gymnasium.Env):
     [-1, 1] is held for two control steps, whose rewards are summed (an episode earns at most 1000).
 
     Args:
-      task: e.g. "walker-walk". distractor: "none", "static", "dynamic", or with a difficulty ("dynamic_hard").
+      task: e.g. "walker-walk".
+      distractor: "none", "static", "dynamic", or with a difficulty ("dynamic_hard"); for mazes whether the goal is
+        "visible" or "hidden".
       difficulty: easy, medium or hard.
       size: pixels a side. renderer: "warp" or "opengl"; samples: a pixel.
       split: "val" shows videos that no released data show, "train" those of the data.
       backgrounds: "builtin" or a folder of videos.
+      views: pictures of a task that has several (mazes), side by side in the channels; all by default.
       seed of `reset`: decides initial states, distractors and all episodes after it.
     """
 
@@ -129,11 +141,12 @@ class DistractedEnv(gymnasium.Env):
         samples: int | None = None,
         split: str = "val",
         backgrounds: str = "builtin",
+        views: Sequence[str] | None = None,
         render_mode: str | None = None,
     ):
         if render_mode not in (None, "rgb_array"):
             raise DmcvbError(f"render_mode {render_mode!r} is not offered; give 'rgb_array' or None")
-        self._stage = _Stage(1, task, distractor, difficulty, size, renderer, samples, split, backgrounds, 1)
+        self._stage = _Stage(1, task, distractor, difficulty, size, renderer, samples, split, backgrounds, views, 1)
         self.task, self.render_mode = self._stage.task, render_mode
         self.observation_space, self.action_space = self._stage.spaces()
         self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
@@ -188,13 +201,14 @@ class DistractedVectorEnv(VectorEnv):
         samples: int | None = None,
         split: str = "val",
         backgrounds: str = "builtin",
+        views: Sequence[str] | None = None,
         threads: int = 1,
     ):
         if num_envs < 1:
             raise DmcvbError(f"num_envs is {num_envs}; give at least 1")
         self.num_envs = num_envs
         self._stage = _Stage(
-            num_envs, task, distractor, difficulty, size, renderer, samples, split, backgrounds, threads
+            num_envs, task, distractor, difficulty, size, renderer, samples, split, backgrounds, views, threads
         )
         self.task, self.render_mode = self._stage.task, None
         self.single_observation_space, self.single_action_space = self._stage.spaces()

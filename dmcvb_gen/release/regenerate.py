@@ -162,6 +162,22 @@ def create_groups(root: Path, manifest: Manifest, records: Sequence[SubsetRecord
         )
 
 
+def _is_json(path: Path) -> bool:
+    try:
+        json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _take_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
+    """Use the release's own array metadata where it can be read: codecs of today's code may not be the release's."""
+    for target in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
+        source = root / target.relative_to(folder)
+        if _is_json(source):
+            shutil.copyfile(source, target)
+
+
 def _unique(records) -> list[SubsetRecord]:
     return list({record.name: record for record in records}.values())
 
@@ -178,6 +194,8 @@ class _Workshop:
         except OSError as error:
             raise StoreError(f"cannot write to {self._root}: {error.strerror or error}; give --out") from None
         create_groups(self._folder, self._manifest, self._records)
+        for record in self._records:
+            _take_metadata(self._root, self._folder, record)
         return self._folder
 
     def __exit__(self, *_):
@@ -324,9 +342,7 @@ def _restore_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
     """Put back Zarr metadata that is missing or no JSON; what can be read stays."""
     for source in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
         target = root / source.relative_to(folder)
-        try:
-            json.loads(target.read_bytes())
-        except (OSError, ValueError):
+        if not _is_json(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
     (root / subset_path(record.name) / ".created").touch()
@@ -381,6 +397,8 @@ def remake(
     )
     fresh = start_release(out, fresh)
     create_groups(out, fresh, _unique(shards.values()))
+    for record in _unique(shards.values()):
+        _take_metadata(root, out, record)
     done = {record.name: read_commits(out, record) for record in _unique(shards.values())}
     todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
     jobs = make_jobs(manifest, root, todo, out, backgrounds=backgrounds, device=device)
