@@ -39,6 +39,7 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     from dmcvb_gen.behaviours.paper import paper_returns
     from dmcvb_gen.behaviours.runs import read_config
     from dmcvb_gen.behaviours.training import open_run
+    from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.tasks import get_task
 
     get_task(task)
@@ -55,10 +56,14 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     with tqdm(
         total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task, disable=as_json or None
     ) as bar:
-        run.train(
-            lambda progress: bar.set_postfix_str(f"return {progress.evaluation.mean:.1f}{goal}", refresh=False),
-            bar.update,
-        )
+
+        def report(progress):
+            bar.set_postfix_str(f"return {progress.evaluation.mean:.1f}{goal}", refresh=False)
+
+        try:
+            run.train(report, bar.update)
+        except KeyboardInterrupt:
+            raise DmcvbError(f"stopped; go on from the last saved state with --out {folder} --resume") from None
     if as_json:
         return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1)))
     click.echo(f"{folder}: trained to {run.step:,} agent steps. Next: dmcvb-gen select-checkpoints {folder}")
