@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import struct
 
 import google_crc32c
@@ -13,10 +14,15 @@ import zarr
 from click.testing import CliRunner
 from PIL import Image
 
+import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.release import export as package
 from dmcvb_gen.release.export import FORMATS, export, format_table
+from dmcvb_gen.release.import_tfds import import_tfds
+from dmcvb_gen.release.regenerate import check
+from dmcvb_gen.release.repaint import repaint
+from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
 
 NAME = "walker-walk/random/static"
@@ -198,8 +204,53 @@ def test_rlds_records_are_examples_of_the_features_that_the_folder_names(exporte
     np.testing.assert_array_equal(actions[:500], episodes[1]["action"])
     rewards = np.array(values["steps/reward"].float_list.value, np.float32)
     np.testing.assert_array_equal(rewards[:500], episodes[1]["reward"])
+    heights = np.array(values["steps/observation/height"].float_list.value, np.float32)  # DMC-VB's own names
+    np.testing.assert_array_equal(heights, episodes[1]["state"][:, 14])
+    assert observation["height"]["tensor"]["shape"] == {} and observation["velocity"]["tensor"]["dtype"] == "float64"
     last = list(values["steps/is_last"].int64_list.value)
     assert last.index(1) == 500 and sum(last) == 1 and sum(values["steps/is_terminal"].int64_list.value) == 0
+
+
+@pytest.fixture(scope="module")
+def imported(exported, tmp_path_factory):
+    """A release imported from a folder in DMC-VB's layout: locomotion/<task>/<level>/<setting>."""
+    root = tmp_path_factory.mktemp("dmc_vb")
+    target = root / "locomotion/walker_walk/random/static_medium"
+    target.parent.mkdir(parents=True)
+    shutil.copytree(exported("rlds"), target)
+    result = CliRunner().invoke(main, ["import", str(root / "locomotion"), "--out", str(root / "release")])
+    assert result.exit_code == 0 and f"{NAME}: 2 episodes" in result.output
+    return root / "release"
+
+
+def test_dmc_vbs_folders_are_imported_whole(imported, episodes):
+    release = dmcvb_gen.open(imported)
+    assert list(release.subsets) == [NAME] and release.manifest.complete
+    for index in range(2):
+        found = release[NAME].episode(index)
+        for name in ("pixels", "state", "action", "reward", "discount", "length", "terminated", "return"):
+            np.testing.assert_array_equal(found[name], episodes[index][name])
+    assert verify(imported).sound
+    assert next(release[NAME].batches(16))["pixels"].shape == (16, 9, 16, 16)
+    with pytest.raises(StoreError, match="was imported"):
+        check(imported)
+    with pytest.raises(StoreError, match="was imported"):
+        repaint(imported, imported.parent / "x", size=8)
+
+
+def test_damaged_or_foreign_folders_are_not_imported(exported, tmp_path):
+    with pytest.raises(StoreError, match="no features.json"):
+        import_tfds(tmp_path, tmp_path / "r")
+    shutil.copytree(exported("rlds"), tmp_path / "somewhere")
+    with pytest.raises(StoreError, match="--task"):
+        import_tfds(tmp_path / "somewhere", tmp_path / "r")
+    [path] = (tmp_path / "somewhere").rglob("*.tfrecord-*")
+    data = path.read_bytes()
+    what = dict(task="walker-walk", level="random", setting="static")
+    for damaged in (data[:-100], data[:5000] + b"x" + data[5001:], b"not records at all"):
+        path.write_bytes(damaged)
+        with pytest.raises(StoreError, match="damaged"):
+            import_tfds(tmp_path / "somewhere", tmp_path / "r", **what)
 
 
 def test_the_command_exports_and_never_writes_over(small_release, tmp_path):

@@ -24,6 +24,7 @@ COMMANDS = {
     "publish": ("release:publish", "Put a release at a URL: s3://, gs://, hf://, file: or any other of fsspec."),
     "fetch": ("release:fetch", "Bring a published release, or a part of it."),
     "export": ("release:export", "Write subsets in another format: HDF5, npz, Minari, LeRobot, RLDS, Zarr 2."),
+    "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
     "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
     "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
     "select-checkpoints": ("behaviours:select_checkpoints", "Pick a run's expert, medium and mixed checkpoints."),

@@ -280,3 +280,27 @@ def export(path, to, only, episodes, out, options, as_json):
     if as_json:
         return print_json([str(folder) for folder in folders])
     click.echo("\n".join(str(folder) for folder in folders))
+
+
+@click.command("import")
+@click.argument("folder")
+@click.option("--task", help="What a single folder holds, where its path does not say it.")
+@click.option("--level", help="Likewise.")
+@click.option("--setting", help="Likewise: none, static_medium, dynamic_medium, ...")
+@click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
+@click.option("--out", type=click.Path(), required=True, help="Folder of the new release.")
+@json_option
+def import_command(folder, task, level, setting, name, out, as_json):
+    """Import DMC-VB's published TFDS folders (locomotion) into a release, without TensorFlow.
+
+    \b
+    dmcvb-gen import dmc_vb/locomotion --out releases/original
+    """
+    from dmcvb_gen.release.import_tfds import import_tfds
+
+    with tqdm(unit=" episodes", disable=as_json or None) as bar:
+        manifest = import_tfds(folder, out, task=task, level=level, setting=setting, name=name, tick=bar.update)
+    if as_json:
+        return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
+    for subset in manifest.subsets:
+        click.echo(f"{subset.name}: {subset.episodes} episodes")

@@ -101,6 +101,8 @@ def repaint(
         raise DmcvbError(f"unknown label {unknown[0]!r}; known: {', '.join(LABELS)}")
     if not release.subsets:
         raise StoreError(f"{root} has no committed episodes yet; run the rollout first")
+    if any(entry.get("kind") == "import" for entry in release.manifest.lineage):
+        raise StoreError(f"{root} was imported and has no physics states to paint from")
     chosen = [release[found] for found in select(list(release.subsets), list(only))]
     recipe, requests = recipe_of(release.manifest)
     source, split = backgrounds or recipe.backgrounds, split or recipe.split

@@ -156,6 +156,8 @@ def make_jobs(
       DmcvbError: policies or backgrounds are not there, or not those of the manifest.
     """
     for entry in manifest.lineage:
+        if entry.get("kind") == "import":
+            raise StoreError(f"{manifest.name} was imported, so there is nothing to make it from; import it again")
         if entry.get("labels"):
             raise StoreError(
                 f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+from dmcvb_gen.tasks import get_task
 
 EPISODES_PER_FILE = 50
 _FEATURES = "tensorflow_datasets.core.features"
@@ -22,8 +23,10 @@ _FEATURES = "tensorflow_datasets.core.features"
 def write(source: Source, folder: Path) -> None:
     """Write `<version>/`: `dataset_info.json`, `features.json` and the TFRecord shards of a split "train".
 
-    A step has observation/<view>, observation/state, action, reward, discount, is_first, is_last, is_terminal; the
-    last step of an episode holds the last observation, its action is zeros and means nothing (RLDS).
+    A step has observation/<view>, observation/state, action, reward, discount, is_first, is_last, is_terminal, and
+    the state's parts once more under the names and types of DMC-VB's own data set (observation/velocity, ...;
+    float64, numbers without an axis where dm_control gives such), so that its loader takes the folder. The last
+    step of an episode holds the last observation; its action is zeros and means nothing (RLDS).
     """
     subset, version = source.subset, source.manifest.version
     name = subset.name.replace("/", "_").replace("-", "_").replace(".", "_")
@@ -31,13 +34,14 @@ def write(source: Source, folder: Path) -> None:
     target.mkdir()
     count = -(-len(source.episodes) // EPISODES_PER_FILE)
     lengths, size, file = [0] * count, 0, None
+    fields = get_task(subset.task).state_slices
     for number, episode in enumerate(source):
         shard = number // EPISODES_PER_FILE
         if number % EPISODES_PER_FILE == 0:
             if file:
                 file.close()
             file = (target / f"{name}-train.tfrecord-{shard:05d}-of-{count:05d}").open("wb")
-        size += file.write(record(encode_example(_example(episode))))
+        size += file.write(record(encode_example(_example(episode, fields))))
         lengths[shard] += 1
     if file:
         file.close()
@@ -89,6 +93,8 @@ def _features(source: Source) -> dict[str, Any]:
     }
     observation = {view: picture for view in source.views}
     observation["state"] = _tensor("float32", subset.group["state"].shape[-1])
+    for name, part in get_task(subset.task).state_slices.items():
+        observation[name] = _tensor("float64", *([part.stop - part.start] if part.stop - part.start > 1 else []))
     step = {
         "observation": _dict(observation),
         "action": _tensor("float32", subset.group["action"].shape[-1]),
@@ -105,7 +111,7 @@ def _features(source: Source) -> dict[str, Any]:
     return _dict({"steps": steps, "episode_index": _tensor("int64")})
 
 
-def _example(episode: ExportEpisode) -> dict[str, np.ndarray | list[bytes]]:
+def _example(episode: ExportEpisode, fields: dict[str, slice]) -> dict[str, np.ndarray | list[bytes]]:
     rows = episode.length + 1
     step = np.arange(rows)
 
@@ -115,6 +121,7 @@ def _example(episode: ExportEpisode) -> dict[str, np.ndarray | list[bytes]]:
     values: dict[str, np.ndarray | list[bytes]] = {
         f"steps/observation/{view}": [_png(frame) for frame in frames] for view, frames in episode.pixels.items()
     }
+    values |= {f"steps/observation/{name}": episode.state[:, part] for name, part in fields.items()}
     return values | {
         "steps/observation/state": episode.state,
         "steps/action": padded(episode.action, 0),
