@@ -153,6 +153,12 @@ def test_pictures_that_do_not_fit_are_read_from_the_shards_and_are_the_same(smal
         torch.testing.assert_close(one.observation, two.observation)
         torch.testing.assert_close(one.next_observation, two.next_observation)
     assert len(held) == 2000
+    settings = TrainSettings(steps=2, batch_size=4, half=True)
+    losses = []
+    for data in (held, stored):
+        torch.manual_seed(0)
+        losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), 6), data, settings)[-1]["loss"])
+    assert losses[0] == losses[1]
 
 
 def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):

@@ -18,7 +18,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from dmcvb_gen.agents.data import TrainingData, batches
+from dmcvb_gen.agents.data import StoredFrames, TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.errors import DmcvbError
 
@@ -43,7 +43,7 @@ class TrainSettings:
       points: points of the learning curve.
       half: bfloat16 autocast. Pays for pictures, not for states.
       compile: torch.compile of the losses.
-      workers: threads that draw batches ahead; 0 draws them in turn.
+      workers: threads that draw batches ahead; 0 draws them in turn (data read from shards have two in any case).
     """
 
     steps: int = 400_000
@@ -117,7 +117,8 @@ def train(
     def make(step: int) -> Batch:
         return draw(learner, data, settings.batch_size, seed, step)
 
-    for step, batch in batches(make, first, settings.steps, settings.workers):
+    workers = max(settings.workers, 2 if isinstance(data.frames, StoredFrames) else 0)
+    for step, batch in batches(make, first, settings.steps, workers):
         torch.manual_seed((seed << 32) + step)
         for name, value in learner.update(batch).items():
             sums[name] = sums.get(name, 0.0) + value

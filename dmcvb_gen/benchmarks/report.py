@@ -270,7 +270,7 @@ def _label(part: dict[str, Any]) -> str:
 def _score(result: dict[str, Any], tag: str) -> str:
     score, paper = result["score"], result["paper"]
     text = f"<b>{score['mean']:.0f} &plusmn; {score['stderr']:.0f}</b> {tag}"
-    if result["share"] is not None:
+    if result["share"] is not None and result["profile"]["scores"]:
         text += f"<br>{100 * result['share']:.0f} % of {_text(result['share_of'])}"
     if score["success"] is not None:
         text += f"<br>success {100 * score['success']:.0f} %"
