@@ -197,21 +197,21 @@ def test_a_part_moves_only_its_shards_verifies_and_can_be_completed(s3, small_re
     assert open_release(part).manifest == open_release(small_release).manifest and verify(part).sound
 
 
-def test_an_agent_can_be_trained_from_a_fetched_part(s3, tmp_path):
+def test_behavior_cloning_trains_on_a_fetched_part(s3, tmp_path):
     import torch
 
+    from dmcvb_gen.agents.data import Source, load_data
+    from dmcvb_gen.agents.learners import BehaviorCloning
+    from dmcvb_gen.agents.networks import observation_encoder
+    from dmcvb_gen.agents.trainer import TrainSettings, train
+
     fetch("s3://bucket/small", tmp_path / "part", ["*/*/static"], options=s3.options)
-    data = dmcvb_gen.open(tmp_path / "part")["walker-walk/random/static"].torch("stream", batch_size=64, stack=1)
-    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 16 * 16, 64), torch.nn.ReLU())
-    network.append(torch.nn.Linear(64, 6))
-    optimizer, losses, batch = torch.optim.Adam(network.parameters(), 1e-3), [], next(iter(data))
-    for _ in range(30):  # random actions cannot be learned but by heart
-        loss = (network(batch["pixels"] / 255 - 0.5) - batch["action"]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.8 * losses[0]
+    assert verify(tmp_path / "part").sound
+    torch.manual_seed(0)
+    data = load_data([Source(dmcvb_gen.open(tmp_path / "part")["walker-walk/random/static"])])
+    learner = BehaviorCloning(observation_encoder(9, 16), 6)
+    curve = train(learner, data, TrainSettings(steps=20, batch_size=16))
+    assert np.isfinite(curve[-1]["loss"]) and 0 < curve[-1]["loss"] < 1  # random actions cannot be foretold
 
 
 def test_a_remote_release_is_read_in_place(s3, small_release):

@@ -13,10 +13,13 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.release.regenerate import check, remake, repair
+from dmcvb_gen.release.shards import chosen_shards, make_jobs
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
 from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
+from tests.conftest import small_recipe
 
 NAME = "walker-walk/random/dynamic"
 
@@ -33,6 +36,19 @@ def files_of(folder):
 
 def stamps_of(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+LOCOMOTION = {"tasks": "walker-walk", "levels": ["random", "expert"], "settings": ["none", "static"], "episodes": 3}
+MAZE = {"tasks": "ant-maze-empty7x7", "levels": "random", "settings": ["visible", "hidden", "fixed"]}
+MAZE |= {"episodes": 3, "fixed_goals": 2, "episodes_per_goal": 2, "episodes_per_shard": 2}
+
+
+@pytest.mark.parametrize("trajectories", ["shared", "independent"])
+@pytest.mark.parametrize("pattern", [LOCOMOTION, MAZE], ids=["locomotion", "maze"])
+def test_the_jobs_are_those_of_the_rollout(tmp_path, pattern, trajectories):
+    plan = make_plan(small_recipe(subsets=[pattern], trajectories=trajectories), tmp_path / "r")
+    jobs = make_jobs(plan.manifest, tmp_path / "r", chosen_shards(plan.manifest), tmp_path / "r")
+    assert sorted(jobs, key=str) == sorted(plan.jobs, key=str) and jobs
 
 
 def test_a_part_of_a_release_comes_out_with_its_digests(small_release):

@@ -9,7 +9,7 @@ from dmcvb_gen.behaviours.bundled import resolve_policies
 from dmcvb_gen.behaviours.policy_file import load_policy
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
-from dmcvb_gen.rollout.plan import Job
+from dmcvb_gen.rollout.plan import Job, trajectory_names
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand, make_recipe, select
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, parse_commit
 from dmcvb_gen.store.writer import commit_path, sha256_file, shard_count, shard_episodes
@@ -77,8 +77,7 @@ def stream_names(manifest: Manifest, record: SubsetRecord) -> tuple[str, ...]:
     for entry in reversed(manifest.lineage):
         if record.name in entry.get("streams", {}):
             return tuple(entry["streams"][record.name])
-    shared = manifest.recipe.get("trajectories", "shared") == "shared" and record.setting != "fixed"
-    return (record.task, record.level) if shared else (record.task, record.level, record.setting)
+    return trajectory_names(manifest.recipe.get("trajectories", "shared"), record)
 
 
 def recipe_of(manifest: Manifest) -> tuple[Recipe, dict[str, SubsetRequest]]:

@@ -209,8 +209,7 @@ def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, e
             continue
         commits = read_commits(root, record) if (root / "manifest.json").exists() else {}
         done += len(commits)
-        shared = recipe.trajectories == "shared" and not is_maze(record.task)  # every maze subset has both pictures
-        names = (record.task, record.level) if shared else (record.task, record.level, record.setting)
+        names = trajectory_names(recipe.trajectories, record)
         for shard in range(shard_count(record)):
             first, last = shard_episodes(record, shard)
             if shard in commits or (episodes and not (first < episodes[1] and episodes[0] < last)):
@@ -238,6 +237,16 @@ def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, e
         for key, subsets in groups.items()
     )
     return Plan(root, manifest, jobs, done)
+
+
+def trajectory_names(trajectories: str, record: SubsetRecord) -> tuple[str, ...]:
+    """Names of the random streams of a subset's episodes; subsets of the same names share their trajectories.
+
+    Args:
+      trajectories: the recipe's "shared" or "independent".
+    """
+    shared = trajectories == "shared" and not is_maze(record.task)  # every maze subset has both pictures
+    return (record.task, record.level) if shared else (record.task, record.level, record.setting)
 
 
 def check_renderer(name: str) -> None:
