@@ -138,7 +138,7 @@ def train(
             if evaluating and evaluate:
                 point |= evaluate(learner)
             curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})
-        if path is not None and time.perf_counter() - saved > SAVE_SECONDS and done < settings.steps:
+        if path is not None and time.perf_counter() - saved > SAVE_SECONDS:  # the end too: its evaluation may be long
             _save_state(learner, path, done, curve, spent + time.perf_counter() - started)
             saved = time.perf_counter()
     return curve

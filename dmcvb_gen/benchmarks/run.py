@@ -38,7 +38,7 @@ from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pret
 from dmcvb_gen.agents.data import Source, TrainingData, load_data
 from dmcvb_gen.agents.learners import ObservationReadout, StateReadout
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, hold_out_losses, train
-from dmcvb_gen.benchmarks.evaluate import Evaluator, Score
+from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.tables import Cell, Part, slug
@@ -247,11 +247,11 @@ def run_cell(setup: Setup, cell: Cell, tick: Tick = lambda what, steps: None) ->
     )
     steps = policy_steps(profile, agent)
     folder = setup.cells / f"{cell.id}.{mark[:12]}.run"
-    scores: list[Score] = []
 
     def evaluate(learner) -> dict[str, Any]:
         score = evaluator(learner)
-        scores.append(score)
+        if score.pictures is not None:
+            _save_sheet(setup.cells / f"{cell.id}.rollout.png", [score.pictures])
         return {"score": score.facts()}
 
     label = f"{agent.name} on {cell.task} {cell.policy_label}/{cell.setting}"
@@ -275,8 +275,6 @@ def run_cell(setup: Setup, cell: Cell, tick: Tick = lambda what, steps: None) ->
     inspection = inspect(setup, policy.encoder, data, cell, tick) if pixels and profile.readout_steps else None
     inspected = time.perf_counter() - inspected
     setup.cells.mkdir(parents=True, exist_ok=True)
-    if scores and scores[-1].pictures is not None:
-        _save_sheet(setup.cells / f"{cell.id}.rollout.png", [scores[-1].pictures])
     evaluating = sum(point["score"]["seconds"] for point in evaluations)
     paper = (
         paper_score(cell.task, cell.policy_label, cell.setting, agent.paper_name) if cell.benchmark == "b1" else None
