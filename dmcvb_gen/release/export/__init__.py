@@ -67,7 +67,7 @@ FORMATS = {
     ),
     "rlds": Format(
         "rlds:write",
-        "TensorFlow Datasets (`tfds.builder_from_directory`), RLDS steps, PNG pictures",
+        "TensorFlow Datasets (`tfds.builder_from_directory`): RLDS steps, PNG, state fields also under DMC-VB's names",
         "pixels, states, actions, rewards, discounts, ends",
         "physics, labels",
     ),
