@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from dmcvb_gen.agents.data import Normalization, training_views
+from dmcvb_gen.agents.data import Normalization, Source, load_data, normalize_pixels, training_views
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.run import Setup, pretraining_of, run_cells
 from dmcvb_gen.benchmarks.tables import BENCHMARKS, plan_benchmark
+from dmcvb_gen.distractors import ExogenousWalk
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import Manifest, SubsetRecord
@@ -172,6 +173,21 @@ def test_pictures_are_of_unseen_videos_newest_frame_last(small_release):
     assert torch.equal(stacks[3][:, 0], stacks[2][:, 1]) and torch.equal(stacks[3][:, 1], stacks[2][:, 2])
     assert not torch.equal(stacks[3][:, 2], stacks[2][:, 2])
     assert score.pictures.shape == (2, 16, 16, 3) and score.pictures.std() > 5
+
+
+def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_release):
+    subset = open_release(small_release)["walker-walk/random/none"]
+    data = load_data([Source(subset)])
+    evaluator = Evaluator(subset, episodes=3, max_steps=4)
+    streams = {name: evaluator.streams(name) for name in ("camera", "color", "background", "style")}
+    walk = ExogenousWalk(evaluator.task, evaluator.setting, 5, streams, None, split="val")
+    physics, stack = subset.read("physics"), None
+    for step in range(4):
+        stack = evaluator._see(stack, physics[:, step], walk, step, np.ones(3, bool))
+        shown = normalize_pixels(torch.from_numpy(stack).flatten(1, 2))
+        rows = torch.arange(3) * 501 + step
+        assert torch.equal(shown, data.observe(rows, *data._no_shift(3)))
+    evaluator.close()
 
 
 def test_evaluation_episodes_are_no_releases_episodes(small_release):
