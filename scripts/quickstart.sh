@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Sets everything up on a fresh machine (Python 3.11, pip), makes a small release and shows it.
+# Sets everything up on a fresh machine (Python 3.11, pip), makes a small release, shows and validates it.
 #   bash scripts/quickstart.sh [OUT]      OUT: the release's folder, releases/quickstart by default
 . "$(dirname "$0")/setup.sh"
 out="${1:-releases/quickstart}"
 dmcvb-gen rollout --recipe quickstart --out "$out" --workers "$(python -c 'import os; print(min(4, os.cpu_count() or 1))')"
 dmcvb-gen info "$out"
 dmcvb-gen preview "$out"
-dmcvb-gen verify "$out"
+dmcvb-gen validate "$out" --profile smoke --only 'walker-walk/expert/none' --agents bc,state-bc --out reports/quickstart
