@@ -170,13 +170,18 @@ def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path
     assert cost.jobs == 2 and cost.episodes == 9 and cost.steps == 4500
     actual = sum(subset.bytes for subset in release.subsets.values())
     assert 0.4 * actual < cost.bytes < 2.5 * actual
-    assert cost.core_seconds > 0 and not (tmp_path / "r").exists()
+    assert all(1 / 5000 < rate.seconds_per_step < 1 for rate in cost.rates.values())
+    assert not (tmp_path / "r").exists()
 
 
 def test_shipped_recipes_expand_to_what_the_paper_has():
     assert {"quickstart", "dmcvb-mini"} <= set(shipped_recipes())
     mini = expand(load_recipe("dmcvb-mini"))
-    assert len(mini) == 36 and all(request.episodes == 20 for request in mini)
+    assert len(mini) == 33 and all(request.episodes == 20 for request in mini)
+    whole = expand(load_recipe("dmcvb-v1"))
+    locomotion = [request for request in whole if not request.task.startswith("ant-maze")]
+    assert len(locomotion) == 36 and all(request.episodes * 500 == 1_000_000 for request in locomotion)
+    assert len(whole) == 36 + 7 * 2 * 2 + 7
 
 
 @pytest.mark.parametrize(
