@@ -170,7 +170,7 @@ def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path
     assert cost.jobs == 2 and cost.episodes == 9 and cost.steps == 4500
     actual = sum(subset.bytes for subset in release.subsets.values())
     assert 0.4 * actual < cost.bytes < 2.5 * actual
-    assert all(1 / 5000 < rate.seconds_per_step < 1 for rate in cost.rates.values())
+    assert all(1e-6 < rate.seconds_per_step < 1 for rate in cost.rates.values())
     assert not (tmp_path / "r").exists()
 
 
