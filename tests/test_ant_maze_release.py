@@ -92,17 +92,22 @@ def test_fixed_goals(tmp_path):
     assert (joints[0] != joints[1]).all()
 
 
+def frames(task, seed, count):
+    """Physics states and labels of the starts of `count` episodes."""
+    batch = task.batch(count)
+    batch.reset([np.random.default_rng([seed, i]) for i in range(count)])
+    physics = batch.physics()
+    generators = {"style": [np.random.default_rng(i) for i in range(count)]}
+    return physics, make_exogenous(task, DistractorSetting(), physics[:, None], generators)[:, 0]
+
+
 @pytest.mark.parametrize("name", ["warp", "opengl"])
 def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
     reason = available_renderers()[name]
     if reason:
         pytest.skip(reason)
     task = get_task("ant-maze-easy7x7b")
-    batch = task.batch(24)
-    batch.reset([np.random.default_rng([7, i]) for i in range(24)])
-    physics = batch.physics()
-    generators = {"style": [np.random.default_rng(i) for i in range(24)]}
-    labels = make_exogenous(task, DistractorSetting(), physics[:, None], generators)[:, 0]
+    physics, labels = frames(task, 7, 24)
     renderer = make_renderer(name, task, 32)
     visible, hidden = renderer.render(physics, labels), renderer.render(physics, labels, hide_goal=True)
     renderer.close()
@@ -123,11 +128,7 @@ def test_renderers_agree_on_mazes():
     if reason:
         pytest.skip(reason)
     task = get_task("ant-maze-medium7x7c")
-    batch = task.batch(12)
-    batch.reset([np.random.default_rng([1, i]) for i in range(12)])
-    physics = batch.physics()
-    generators = {"style": [np.random.default_rng(i) for i in range(12)]}
-    labels = make_exogenous(task, DistractorSetting(), physics[:, None], generators)[:, 0]
+    physics, labels = frames(task, 1, 12)
     pictures = []
     for name in ("warp", "opengl"):
         renderer = make_renderer(name, task, 64)
