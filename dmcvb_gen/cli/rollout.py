@@ -327,6 +327,7 @@ def list_command(as_json):
     if as_json:
         return print_json(facts)
     console = Console()
+    console.width = max(console.width, 120)
     table = Table(title="tasks")
     for column in ("task", "state", "action", "steps", "views", "bundled behaviours"):
         table.add_column(column)
