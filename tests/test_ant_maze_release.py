@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from dmcvb_gen.behaviours.bundled import bundled_policies
+from dmcvb_gen.behaviours.policy_file import load_policy
+from dmcvb_gen.behaviours.simulate import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.distractors import DistractorSetting, make_exogenous
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rollout.recipe import make_recipe
+from dmcvb_gen.rollout.worker import paint
 from dmcvb_gen.store import open_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
@@ -120,6 +124,42 @@ def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
         if view == "top":
             assert differs.all()
     assert seen_anywhere > 10  # pictures that need no second rendering
+
+
+@pytest.mark.parametrize("name", ["warp", "opengl"])
+def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(name):
+    reason = available_renderers()[name]
+    if reason:
+        pytest.skip(reason)
+    task = get_task("ant-maze-empty7x7")
+    policy = load_policy(bundled_policies(task.id, "expert")[0], task)
+    run = simulate(task, [policy], range(3), 4, (task.id,), max_steps=80)
+    assert run.terminated.any()  # the goal is reached in one of them, so the ant is beside it too
+    physics, length = run.physics[:, :81], run.length
+    generators = {"style": [np.random.default_rng(i) for i in range(3)]}
+    labels = make_exogenous(task, DistractorSetting(), filled(physics, length), generators)
+    renderer, asked = make_renderer(name, task, 32), []
+    render = renderer.render
+
+    def counting(physics, exogenous, views=None, hide_goal=False):
+        if hide_goal:
+            asked.append((views[0], len(physics)))
+        return render(physics, exogenous, views=views, hide_goal=hide_goal)
+
+    renderer.render = counting
+    painted = {name: picture.copy() for name, picture in paint(task, renderer, physics, labels, length, 81)}
+    episode, row = np.nonzero(np.arange(81)[None] <= length[:, None])
+    every = render(physics[episode, row], labels[episode, row], hide_goal=True)
+    renderer.close()
+    for column, view in enumerate(task.views):
+        np.testing.assert_array_equal(painted[f"pixels_hidden_goal/{view}"][episode, row], every[:, column])
+    assert sum(count for view, count in asked if view == "top") < len(episode) / 2
+
+
+def filled(physics, length):
+    """Physics states with the last one of an episode repeated past its end."""
+    rows = np.minimum(np.arange(physics.shape[1])[None], length[:, None])
+    return np.take_along_axis(physics, rows[..., None], axis=1)
 
 
 def test_renderers_agree_on_mazes():

@@ -111,10 +111,17 @@ def paint(
         yield name, picture
         if not task.goal_geoms:
             continue
-        hidden, seen = picture, _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
+        seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
+        seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
+        shown = [picture[e, rows[0]].copy() for e, rows in spans]
+        hidden = picture
         for first in range(0, len(seen), PAINT_FRAMES):
             e, r = episode[seen[first : first + PAINT_FRAMES]], row[seen[first : first + PAINT_FRAMES]]
             hidden[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view], hide_goal=True)[:, 0]
+        for (e, rows_of), before in zip(spans, shown, strict=True):
+            behind = hidden[e, rows_of[0]]
+            covered = (behind != before).any(axis=-1, keepdims=True)
+            hidden[e, rows_of[1:]] = np.where(covered, behind, hidden[e, rows_of[1:]])
         yield f"pixels_hidden_goal/{view}", hidden
 
 
@@ -123,6 +130,41 @@ def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: Exogen
     if not hasattr(task, "goal_in_sight"):
         return np.arange(len(physics))
     return np.flatnonzero(task.goal_in_sight(view, physics, exogenous))
+
+
+def _spans_of_one_background(
+    task: Task,
+    view: str,
+    size: int,
+    physics: np.ndarray,
+    exogenous: Exogenous,
+    episode: np.ndarray,
+    row: np.ndarray,
+    seen: np.ndarray,
+) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+    """Frames that need no picture of their own with the goal hidden.
+
+    Where the camera stands still, and nothing that moves is near the goal, what is behind the goal is the same in
+    every frame of an episode: one hidden picture tells it for all.
+
+    Returns:
+      What is left of `seen`, and (episode, rows): hide the goal in the first of the rows, copy its pixels to the rest.
+    """
+    if not len(seen) or not hasattr(task, "goal_alone"):
+        return seen, []
+    index = task.views.index(view)
+    alone = np.zeros(len(episode), bool)
+    alone[seen] = task.goal_alone(physics[episode[seen], row[seen]], size)
+    spans = []
+    for e in np.unique(episode[seen]):
+        frames = np.flatnonzero(alone & (episode == e))
+        poses = [field[e, row[frames], index] for field in (exogenous.camera_position, exogenous.camera_quaternion)]
+        if len(frames) > 1 and all((pose == pose[0]).all() for pose in poses):
+            spans.append((int(e), row[frames]))
+            alone[frames[0]] = False
+        else:
+            alone[frames] = False
+    return seen[~alone[seen]], spans
 
 
 class _RendererCache:

@@ -44,6 +44,12 @@ def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return floor, np.minimum(to_wall / (PIXELS / 2), 1.0), nearest
 
 
+def floor_pixels(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """(row, column) bool, the floor; (2, row, column) int, row and column of the floor pixel nearest to each."""
+    floor, _, nearest = _floor(layout)
+    return floor, nearest
+
+
 def _finish(times: np.ndarray, layout: Layout) -> DistanceField:
     floor, _, nearest = _floor(layout)
     filled = np.ma.filled(times, np.nan)

@@ -14,7 +14,8 @@ import numpy as np
 
 from dmcvb_gen.tasks.ant_maze.arena import CAMERAS, GOAL_HEIGHT, GOAL_RADIUS, PHYSICS_STEP, build_arena, look_numbers
 from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
-from dmcvb_gen.tasks.ant_maze.layouts import Layout
+from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
+from dmcvb_gen.tasks.ant_maze.waypoints import way_points
 from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, Task
 
 EPISODE_STEPS = 1200
@@ -184,6 +185,12 @@ class AntMazeBatch(EpisodeBatch):
         """(size, 3): center of the goal's sphere, meters."""
         return self._mocap[:, 0] + [0, 0, GOAL_HEIGHT]
 
+    def guided_state(self, ahead: float) -> np.ndarray:
+        """(size, state) float64: as if the goal were a way-point `ahead` meters down the way to it."""
+        goal = self.goal()
+        points = way_points(self.task.layout, self._xpos[:, self._torso, :2], goal[:, :2], ahead)
+        return self.state(np.concatenate([points, goal[:, 2:]], axis=1))
+
     def distance(self) -> np.ndarray:
         """(size,): distance to the goal over its maximum in the maze, in [0, 1]."""
         position = self._xpos[:, self._torso, :2]
@@ -198,8 +205,9 @@ class AntMazeBatch(EpisodeBatch):
         position = self._xpos[:, self._torso, :2]
         return np.where(self._touched, 0.0, look_up("geodesic", self.task.layout, self._paths, position))
 
-    def state(self):
-        position, goal = self._xpos[:, self._torso], self.goal()
+    def state(self, goal: np.ndarray | None = None):
+        """(size, state) float64; as if the goal's center were at `goal`, (size, 3), where that is given."""
+        position, goal = self._xpos[:, self._torso], self.goal() if goal is None else goal
         rotation = self._xmat[:, self._torso].reshape(self.size, 3, 3)
         vector = goal - position
         values = {name: self._sensors[:, columns] for name, columns in self._columns_of.items()}
@@ -295,6 +303,18 @@ class AntMaze(Task):
         angle = np.arctan(np.sqrt(2) * np.tan(fovy / 2))  # of the picture's corners
         outside = aside * np.cos(angle) - depth * np.sin(angle)  # distance from the cone around the picture
         return outside < GOAL_RADIUS * 1.01
+
+    def goal_alone(self, physics: np.ndarray, size: int) -> np.ndarray:
+        """(frame,) bool: the ant is so far from the goal that no pixel of the top view can have both.
+
+        Args:
+          size: pixels a side.
+        """
+        goal = physics[:, _mocap_columns(self.model)][:, :2]
+        away = np.linalg.norm(physics[:, 1:3] - goal, axis=1)  # time is first, then x and y of the torso
+        extent = max(self.layout.shape) * CELL
+        leaning = 2 * extent / 100  # the camera is 100 m up, ant and goal at most about 1 m high
+        return away > REACH + leaning + 2 * extent / size
 
     def batch(self, size: int, threads: int = 1) -> AntMazeBatch:
         return AntMazeBatch(self, size, threads)
