@@ -8,6 +8,7 @@ processor has them, compiled updates. scripts/bench_training.py sets it beside S
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,21 +108,16 @@ def _init(inputs: int, outputs: int) -> torch.Tensor:
     return torch.empty(inputs, outputs).uniform_(-bound, bound)
 
 
-class ReplayBuffer:
-    """Transitions in memory-mapped files, so that a killed run finds them again.
+class RowBuffer:
+    """The latest rows of named float32 fields, in memory-mapped files, so that a killed run finds them again.
 
     Args:
+      size: rows kept.
+      shapes: name -> shape of one row of the field.
       folder: where the files are; None keeps them in memory.
     """
 
-    def __init__(self, size: int, observation_size: int, action_size: int, folder: Path | None = None):
-        shapes = {
-            "observation": (observation_size,),
-            "next_observation": (observation_size,),
-            "action": (action_size,),
-            "reward": (),
-            "terminated": (),
-        }
+    def __init__(self, size: int, shapes: Mapping[str, tuple[int, ...]], folder: Path | None = None):
         self.position, self.full = 0, False
         self.found = 0
         """Rows that the files held before they were opened."""
@@ -150,8 +146,8 @@ class ReplayBuffer:
         return self.size if self.full else self.position
 
     def add(self, **values: np.ndarray) -> None:
-        """Append one transition of each simulation, (n, ...) a field."""
-        count = len(values["reward"])
+        """Append one row of each simulation, (n, ...) a field."""
+        count = len(next(iter(values.values())))
         rows = (self.position + np.arange(count)) % self.size
         for name, value in values.items():
             self.arrays[name][rows] = value
@@ -159,9 +155,23 @@ class ReplayBuffer:
         self.position = (self.position + count) % self.size
 
     def sample(self, rng: np.random.Generator, count: int) -> dict[str, torch.Tensor]:
-        """`count` transitions drawn uniformly, float32 tensors."""
+        """`count` rows drawn uniformly, float32 tensors."""
         rows = rng.integers(0, len(self), count)
         return {name: torch.from_numpy(np.asarray(array[rows])) for name, array in self.arrays.items()}
+
+
+class ReplayBuffer(RowBuffer):
+    """Transitions."""
+
+    def __init__(self, size: int, observation_size: int, action_size: int, folder: Path | None = None):
+        shapes = {
+            "observation": (observation_size,),
+            "next_observation": (observation_size,),
+            "action": (action_size,),
+            "reward": (),
+            "terminated": (),
+        }
+        super().__init__(size, shapes, folder)
 
 
 class RunningNorm:

@@ -21,12 +21,13 @@ Decay = Annotated[float, Field(ge=0, lt=1)]
 
 ALGORITHMS = {
     "sac": "dmcvb_gen.behaviours.sac:SacSettings",
+    "guided": "dmcvb_gen.behaviours.guided:GuidedSettings",
     "sb3-sac": "dmcvb_gen.behaviours.settings:Sb3SacSettings",
     "td3": "dmcvb_gen.behaviours.settings:Td3Settings",
     "tqc": "dmcvb_gen.behaviours.settings:TqcSettings",
     "ppo": "dmcvb_gen.behaviours.settings:PpoSettings",
 }
-"""What `train-behaviour --algo` takes -> its settings. `sac` is the package's own, the rest are SB3's."""
+"""What `train-behaviour --algo` takes -> its settings. `sac` and `guided` are the package's own, the rest SB3's."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -227,6 +227,10 @@ def run_class(algorithm: str) -> type[Run]:
     """The kind of run that trains an algorithm."""
     if algorithm == "sac":
         return SacRun
+    if algorithm == "guided":
+        from dmcvb_gen.behaviours.guided import GuidedRun
+
+        return GuidedRun
     from dmcvb_gen.behaviours.sb3 import Sb3Run
 
     return Sb3Run

@@ -1,0 +1,179 @@
+"""Imitating a guide through a maze: a policy of the open maze in, an actor that knows one layout out.
+
+A policy that walks straight to goals gets through every maze when it is shown way-points instead of the
+goal. This guide knows the layout, which behaviour policies must not see; so a student, which sees what
+behaviour policies see, learns to act as it does (DAgger, Ross et al. 2011: the student walks, the guide
+says what it would have done there). Minutes, where reinforcement learning in a maze takes hours.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from dmcvb_gen.behaviours.bundled import resolve_policies
+from dmcvb_gen.behaviours.policy_file import Actor, Policy, load_policy
+from dmcvb_gen.behaviours.runs import SAVE_SECONDS, Report, Run, Tick
+from dmcvb_gen.behaviours.sac import RowBuffer
+from dmcvb_gen.behaviours.settings import Count, Natural, NonNegative, Positive, Share
+from dmcvb_gen.errors import DmcvbError
+
+GUIDE = "ant-maze-empty7x7"
+"""The task whose bundled expert is the guide where --init-from names none."""
+
+
+@dataclass(frozen=True)
+class GuidedSettings:
+    """Settings of `GuidedRun`.
+
+    Attributes:
+      simulations: episodes stepped side by side.
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
+      buffer_size: agent steps remembered.
+      ahead: how far down the way the guide's way-point is, meters.
+      guided_share: share of training episodes that the guide walks itself.
+      least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
+      train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
+      final_learning_rate: where the learning rate has fallen to, linearly, at the last step.
+    """
+
+    simulations: Count = 32
+    batch_size: Count = 512
+    learning_rate: Positive = 1e-3
+    final_learning_rate: Positive = 1e-4
+    updates_per_step: Positive = 0.25
+    buffer_size: Count = 400_000
+    ahead: NonNegative = 3.0
+    guided_share: Share = 0.2
+    least_std: Positive = 0.1
+    train_episode_steps: Natural = 300
+    standing_starts: Share = 0.0
+
+
+class GuidedRun(Run):
+    """A run of guided imitation. The student starts from the guide's weights."""
+
+    @functools.cached_property
+    def guide(self) -> Policy:
+        """The policy that is shown way-points."""
+        if not self.task.id.startswith("ant-maze"):
+            raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
+        source = self.config.init_from
+        path = resolve_policies(self.task.id if source else GUIDE, "expert", source)[0]
+        policy = load_policy(path, self.task)
+        if policy.header.distribution != "squashed_gaussian":
+            raise DmcvbError(f"the guide {path} must have a squashed Gaussian, as policies of sac have")
+        return policy
+
+    def network(self) -> dict[str, Any]:
+        header = self.guide.header
+        return {"hidden": header.hidden, "activation": header.activation, "layer_norm": header.layer_norm}
+
+    def warmup(self) -> int:
+        return 0
+
+    def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
+        from dmcvb_gen.behaviours.training import Episodes
+
+        settings, task, config = self.settings, self.task, self.config
+        torch.manual_seed(config.seed)
+        student = Actor(self.header)
+        student.load_state_dict(self.guide.weights)
+        guide = Actor(self.guide.header).requires_grad_(False)
+        guide.load_state_dict(self.guide.weights)
+        optimizer = torch.optim.Adam(student.parameters(), lr=settings.learning_rate, fused=True)
+        shapes = {"observation": (task.behaviour_size,), "mean": (task.action_size,), "std": (task.action_size,)}
+        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
+        buffer = RowBuffer(rows, shapes, self.folder / "resume")
+        rng = np.random.default_rng([config.seed, 0xB0FF])
+        owed, next_evaluation, updates, loss = 0.0, config.evaluate_every, 0, 0.0
+        if saved:
+            student.load_state_dict(saved["student"])
+            optimizer.load_state_dict(saved["optimizer"])
+            torch.set_rng_state(saved["torch_rng"])
+            rng.bit_generator.state = json.loads(saved["rng"])
+            buffer.restore(**saved["buffer"])
+            owed, next_evaluation, updates = saved["owed"], saved["next_evaluation"], saved["updates"]
+        episodes = Episodes(self, rng)
+        if saved:
+            state = episodes.restore(saved["episodes"])
+            guided = saved["guided"].numpy().copy()
+        else:
+            state = episodes.start(np.arange(settings.simulations))
+            guided = rng.random(settings.simulations) < settings.guided_share
+        columns, last_saved = task.behaviour_indices, self._started
+
+        def save() -> None:
+            buffer.flush()
+            self.save(
+                {
+                    "student": student.state_dict(),
+                    "optimizer": optimizer.state_dict(),
+                    "torch_rng": torch.get_rng_state(),
+                    "rng": json.dumps(rng.bit_generator.state),
+                    "buffer": {"position": buffer.position, "full": buffer.full, "rows": buffer.size},
+                    "episodes": episodes.saved(state),
+                    "guided": torch.from_numpy(guided.copy()),
+                    "owed": owed,
+                    "next_evaluation": next_evaluation,
+                    "updates": updates,
+                }
+            )
+
+        while self.step < config.steps:
+            observation = torch.from_numpy(state[:, columns].astype(np.float32))
+            shown = torch.from_numpy(episodes.batch.guided_state(settings.ahead)[:, columns].astype(np.float32))
+            with torch.no_grad():
+                (own_mean, own_std), (mean, std) = student(observation), guide(shown)
+                walks = torch.from_numpy(guided)[:, None]
+                chosen = torch.where(walks, mean, own_mean), torch.where(walks, std, own_std)
+                action = torch.tanh(chosen[0] + chosen[1] * torch.randn_like(mean)).numpy()
+            buffer.add(observation=observation.numpy(), mean=mean.numpy(), std=std.numpy())
+            result = episodes.batch.step(action)
+            self.step += settings.simulations
+            state = episodes.restart_ended(result.state, result.terminated)
+            ended = episodes.elapsed == 0
+            guided[ended] = rng.random(ended.sum()) < settings.guided_share
+            if len(buffer) >= settings.batch_size:
+                owed += settings.updates_per_step * settings.simulations
+                left = max(0.0, 1 - self.step / config.steps)
+                rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
+                optimizer.param_groups[0]["lr"] = rate
+            while owed >= 1:
+                loss = self._update(student, optimizer, buffer.sample(rng, settings.batch_size))
+                owed -= 1
+                updates += 1
+            tick(settings.simulations)
+            if self.step >= next_evaluation:
+                progress = self.record(student.state_dict(), updates, {"divergence": float(loss)}, report)
+                next_evaluation = self.next_evaluation(progress.evaluation)
+                if self._started - last_saved > SAVE_SECONDS:
+                    save()
+                    last_saved = self._started
+        save()
+
+    def _update(self, student: Actor, optimizer: torch.optim.Optimizer, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        loss = divergence(
+            batch["mean"], batch["std"].clamp(min=self.settings.least_std), *student(batch["observation"])
+        )
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        return loss.detach()
+
+
+def divergence(mean: torch.Tensor, std: torch.Tensor, own_mean: torch.Tensor, own_std: torch.Tensor) -> torch.Tensor:
+    """Mean Kullback-Leibler divergence of the student's Gaussian from the guide's, nats an action, (1).
+
+    Of the Gaussians before squashing; means count as within +-3, where tanh leaves nothing to tell.
+    """
+    limit = 3.0
+    # Beyond the limit there is no gradient outwards, so a student may be further out, where the guide is out too.
+    apart = torch.where(mean.abs() < limit, own_mean - mean, own_mean.clamp(-limit, limit) - mean.clamp(-limit, limit))
+    log_ratio = own_std.log() - std.log()
+    return (log_ratio + (std**2 + apart**2) / (2 * own_std**2) - 0.5).sum(dim=1).mean()
