@@ -1,6 +1,7 @@
 """Wall-clock until 90 % of the paper's expert return on walker-walk: ours against plain SB3 SAC, in the same run.
 
     python scripts/bench_training.py --limit 3600
+    python scripts/bench_training.py --limit 3600 --peer-times 4          # stop the peer after four times ours
     python scripts/bench_training.py --limit 3 --every 400 --episodes 2     # does it run?
 
 The peer is Stable-Baselines3's SAC with its own settings on one dm_control environment at action repeat 2. One
@@ -118,6 +119,7 @@ def ours(goal: float, limit: float, seed: int, every: int, episodes: int) -> tup
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--limit", type=float, default=3600.0, help="training seconds a side")
+    parser.add_argument("--peer-times", type=float, help="stop the peer after so many times our seconds")
     parser.add_argument("--every", type=int, default=2_000, help="agent steps between evaluations")
     parser.add_argument("--episodes", type=int, default=20, help="episodes of an evaluation")
     parser.add_argument("--seed", type=int, default=0)
@@ -126,7 +128,8 @@ def main() -> None:
     goal = 0.9 * paper_returns(TASK, "expert")["mean"]
     print(f"{TASK}: seconds of training to a return of {goal:.0f}, one thread")
     mine, reached = ours(goal, arguments.limit, arguments.seed, arguments.every, arguments.episodes)
-    callback = UntilReturn(goal, arguments.limit, arguments.every, arguments.episodes)
+    limit = min(arguments.limit, mine * (arguments.peer_times or np.inf))
+    callback = UntilReturn(goal, limit, arguments.every, arguments.episodes)
     SAC("MlpPolicy", SuiteEnv(arguments.seed), seed=arguments.seed, device="cpu").learn(2_000_000, callback=callback)
     for name, seconds, done in (("ours", mine, reached), ("SB3 SAC", callback.spent, callback.reached)):
         print(f"{name}: {seconds:.0f} s" + ("" if done else " (not reached)"))

@@ -13,6 +13,7 @@ from dm_control.locomotion.tasks import random_goal_maze
 from dm_control.locomotion.walkers import ant
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from dmcvb_gen.errors import LayoutError, UnknownNameError
 from dmcvb_gen.tasks import get_task
@@ -20,6 +21,7 @@ from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, fixed_pairs, layout_task_id
 from dmcvb_gen.tasks.ant_maze.arena import GOAL_HEIGHT, GOAL_RADIUS, WALL_HEIGHT
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, descend, geodesic_field, look_up, make_field, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, get_layout, make_layout
+from dmcvb_gen.tasks.ant_maze.waypoints import way_points
 
 
 def composer_environment(layout, goal):
@@ -324,6 +326,26 @@ def test_distance_falls_along_the_shortest_path(task_id):
         saturated = saturated_field(layout, layout.free[0])
         along = look_up("saturated", layout, np.repeat(saturated.values[None], len(path), axis=0), path)
         assert along[-1] == 0 and along[0] > 0 and along[0] >= along[len(along) // 2] >= 0
+
+
+@pytest.mark.parametrize("task_id", ANT_MAZE_TASKS)
+def test_way_points_lead_to_the_goal_clear_of_walls(task_id):
+    layout = get_task(task_id).layout
+    rng = np.random.default_rng(0)
+    positions = layout.world(np.repeat(layout.free, 2, axis=0)) + rng.uniform(-0.9, 0.9, (2 * len(layout.free), 2))
+    goals = np.tile(layout.world(layout.free[0]) + [0.3, -0.4], (len(positions), 1))
+    floor = np.kron(~layout.walls, np.ones((PIXELS, PIXELS), bool))
+    clear = ndimage.distance_transform_edt(floor) * CELL / PIXELS
+    for number in range(100):
+        points = way_points(layout, positions, goals, 1.0)
+        at_goal = (points == goals).all(axis=1)
+        pixel = ((layout.grid(points) + 0.5) * PIXELS).astype(int)
+        # Wherever it began, the way soon keeps to the middle of the corridors.
+        assert (clear[pixel[:, 0], pixel[:, 1]][~at_goal] >= (0.7 if number > 1 else 0.2)).all()
+        if at_goal.all():
+            break
+        positions = points
+    assert at_goal.all()
 
 
 # -- layouts --------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from dmcvb_gen.errors import DmcvbError
 torch.set_num_threads(1)
 TINY = {
     "sac": dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4),
+    "guided": dict(batch_size=16, simulations=4, train_episode_steps=20, half_life=100),
     "sb3-sac": dict(learning_starts=24, batch_size=16, hidden=[16], simulations=4, normalize_observation=True),
     "tqc": dict(learning_starts=24, batch_size=16, hidden=[16], simulations=4, n_quantiles=5),
     "td3": dict(learning_starts=24, batch_size=16, hidden=[16, 8], simulations=4),
@@ -42,7 +43,8 @@ def quick_evaluations(monkeypatch):
 
 
 def config(algorithm="sac", steps=160, every=40, **changes):
-    fields = dict(task="cheetah-run", algorithm=algorithm, steps=steps, seed=0, settings=TINY[algorithm])
+    task = "ant-maze-easy7x7a" if algorithm == "guided" else "cheetah-run"
+    fields = dict(task=task, algorithm=algorithm, steps=steps, seed=0, settings=TINY[algorithm])
     return RunConfig(**fields | dict(evaluate_every=every, evaluate_sparse=every) | changes)
 
 
@@ -86,10 +88,11 @@ def assert_same_run(first, second, buffer=True):
 
 @pytest.mark.parametrize("algorithm", TINY)
 def test_a_stopped_and_resumed_run_is_an_uninterrupted_one_to_the_bit(tmp_path, algorithm):
-    whole = train(tmp_path / "whole", algorithm=algorithm)
-    train(tmp_path / "parts", algorithm=algorithm, steps=80)
+    fields = dict(algorithm=algorithm, every=160 if algorithm == "guided" else 40)  # mazes: long evaluations
+    whole = train(tmp_path / "whole", **fields)
+    train(tmp_path / "parts", **fields, steps=80)
     np.random.seed(99), torch.manual_seed(99)  # nothing may come from what this process did before
-    assert_same_run(whole, train(tmp_path / "parts", True, algorithm=algorithm))
+    assert_same_run(whole, train(tmp_path / "parts", True, **fields))
 
 
 def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):

@@ -25,11 +25,12 @@ def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
     """{"steps", "evaluate_every", "evaluate_sparse", "settings"} of a task's run.
 
     `settings` of the file are sac's; another algorithm's are under `algorithms: {<name>: {...}}` of "all" and of
-    the task, on top of that algorithm's own defaults.
+    the task, on top of that algorithm's own defaults; its budget, where it differs, under the task's `runs`.
     """
     family = "ant-maze" if task_id.startswith("ant-maze") else task_id
     general, own = _all()["all"], _all().get(family, {})
-    values = {name: value for name, value in (general | own).items() if name != "algorithms"}
+    values = {name: value for name, value in (general | own).items() if name not in ("algorithms", "runs")}
+    values |= (own.get("runs") or {}).get(algorithm) or {}
     if algorithm == "sac":
         return values | {"settings": dict(values.get("settings") or {})}
     parts = ((part.get("algorithms") or {}).get(algorithm) or {} for part in (general, own))

@@ -39,13 +39,13 @@ class GuidedSettings:
       guided_share: share of training episodes that the guide walks itself.
       least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
-      final_learning_rate: where the learning rate has fallen to, linearly, at the last step.
+      half_life: agent steps in which the learning rate halves.
     """
 
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    final_learning_rate: Positive = 1e-4
+    half_life: Positive = 50_000
     updates_per_step: Positive = 0.25
     buffer_size: Count = 400_000
     ahead: NonNegative = 3.0
@@ -73,6 +73,9 @@ class GuidedRun(Run):
     def network(self) -> dict[str, Any]:
         header = self.guide.header
         return {"hidden": header.hidden, "activation": header.activation, "layer_norm": header.layer_norm}
+
+    def describe(self) -> dict[str, Any]:
+        return {"guide": self.guide.digest}
 
     def warmup(self) -> int:
         return 0
@@ -141,8 +144,7 @@ class GuidedRun(Run):
             guided[ended] = rng.random(ended.sum()) < settings.guided_share
             if len(buffer) >= settings.batch_size:
                 owed += settings.updates_per_step * settings.simulations
-                left = max(0.0, 1 - self.step / config.steps)
-                rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
+                rate = settings.learning_rate * 0.5 ** (self.step / settings.half_life)
                 optimizer.param_groups[0]["lr"] = rate
             while owed >= 1:
                 loss = self._update(student, optimizer, buffer.sample(rng, settings.batch_size))

@@ -163,7 +163,8 @@ class Run(abc.ABC):
                 "seed": config.seed,
                 "init_from": config.init_from,
                 "environment": environment(),
-            },
+            }
+            | self.describe(),
             command=command_of(config),
             **self.network(),
         )
@@ -175,6 +176,10 @@ class Run(abc.ABC):
     @abc.abstractmethod
     def network(self) -> dict[str, Any]:
         """The header's fields that say how the actor is built."""
+
+    def describe(self) -> dict[str, Any]:
+        """What else the header's `training` should say."""
+        return {}
 
     @abc.abstractmethod
     def warmup(self) -> int:

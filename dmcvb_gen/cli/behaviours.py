@@ -17,10 +17,10 @@ from dmcvb_gen.cli.common import json_option, print_json
 @click.option("--out", type=click.Path(path_type=Path), help="The run's folder.  [default: runs/TASK]")
 @click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
 @click.option("--seed", type=click.IntRange(0), help="[default: 0]")
-@click.option("--algo", help="sac (the package's own), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac]")
+@click.option("--algo", help="sac, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac]")
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="Override a setting. Repeatable.")
 @click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
-@click.option("--init-from", metavar="RUN|FILE", help="Start from another run's networks (or a policy file).")
+@click.option("--init-from", metavar="RUN|FILE", help="Start from (guided: be guided by) another run or a policy file.")
 @click.option("--evaluate-every", type=click.IntRange(1), help="Agent steps between evaluations while returns are low.")
 @click.option("--resume", is_flag=True, help="Go on with the run in --out; what is not given is as it was.")
 @json_option
@@ -31,6 +31,7 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
     dmcvb-gen train-behaviour cheetah-run --algo tqc --set gradient_steps=8 --out runs/cheetah-tqc
+    dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant-maze-medium7x7a
     dmcvb-gen select-checkpoints runs/walker-walk
     """
     import torch

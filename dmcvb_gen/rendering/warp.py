@@ -8,7 +8,10 @@ background's picture is put on all six faces of the sky.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from typing import Any
 
@@ -50,6 +53,25 @@ def _warp():
     return warp
 
 
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Nothing on standard error, where warp's library says that it finds no CUDA driver; a CPU needs none."""
+    try:
+        sys.stderr.flush()
+        kept = os.dup(2)
+    except (OSError, ValueError, AttributeError):  # there is no standard error
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
 class WarpRenderer(Renderer):
     """See the module and `Renderer`."""
 
@@ -70,7 +92,8 @@ class WarpRenderer(Renderer):
         self._backgrounds = backgrounds
         wp = _warp()
         try:
-            wp.init()
+            with _quiet() if device == "cpu" else contextlib.nullcontext():
+                wp.init()
             self._device = wp.get_device("cuda:0" if device == "cuda" else device)
         except (RuntimeError, ValueError) as error:
             raise RenderingError(f"device {device!r} is not usable ({error}); use --device cpu") from None

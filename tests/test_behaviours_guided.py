@@ -1,0 +1,76 @@
+"""Students of a guide through mazes: what they learn, and what they may see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dmcvb_gen.behaviours import runs
+from dmcvb_gen.behaviours.guided import divergence
+from dmcvb_gen.behaviours.policy_file import load_policy, read_header
+from dmcvb_gen.behaviours.runs import RunConfig
+from dmcvb_gen.behaviours.training import open_run
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.tasks import get_task
+
+
+def config(task="ant-maze-easy7x7a", steps=640, **changes):
+    settings = dict(simulations=8, batch_size=32, updates_per_step=0.25) | changes.pop("settings", {})
+    fields = dict(algorithm="guided", seed=0, evaluate_every=steps, evaluate_sparse=steps)
+    return RunConfig(task=task, steps=steps, settings=settings, **fields | changes)
+
+
+def test_divergence_is_torchs():
+    rng = torch.Generator().manual_seed(0)
+    mean, own_mean = (torch.randn(20, 3, generator=rng) for _ in range(2))
+    std, own_std = (torch.rand(20, 3, generator=rng) + 0.1 for _ in range(2))
+    normal = torch.distributions.Normal
+    wanted = torch.distributions.kl_divergence(normal(mean, std), normal(own_mean, own_std)).sum(dim=1).mean()
+    torch.testing.assert_close(divergence(mean, std, own_mean, own_std), wanted)
+
+
+def test_saturated_actions_need_not_be_met_to_the_digit():
+    std = torch.full((1, 1), 0.5)
+    same = divergence(torch.tensor([[3.5]]), std, torch.tensor([[9.0]]), std)
+    assert float(same) == 0
+    assert float(divergence(torch.tensor([[3.5]]), std, torch.tensor([[2.0]]), std)) > 1
+
+
+def test_a_student_sees_the_goal_and_its_guide_the_way_point():
+    task = get_task("ant-maze-medium7x7a")
+    batch = task.batch(4)
+    batch.reset([np.random.default_rng(i) for i in range(4)])
+    own, shown = batch.state(), batch.guided_state(3.0)
+    told = ("distance_to_target", "target_position", "target_vector", "egocentric_target_vector")
+    for name, part in task.state_slices.items():
+        if name not in told:
+            np.testing.assert_array_equal(own[:, part], shown[:, part])
+    slices = task.state_slices
+    points = shown[:, slices["target_position"]]
+    np.testing.assert_array_equal(points - shown[:, slices["walker_position"]], shown[:, slices["target_vector"]])
+    lengths = [np.linalg.norm(shown[:, slices[f"{kind}target_vector"]], axis=1) for kind in ("", "egocentric_")]
+    np.testing.assert_allclose(*lengths)
+    np.testing.assert_allclose(shown[:, slices["distance_to_target"]][:, 0], lengths[0])
+    assert (points != own[:, slices["target_position"]]).any(axis=1).any()
+
+
+def test_a_student_comes_nearer_to_its_guide(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
+    run = open_run(tmp_path / "run", config(), False)
+    losses, update = [], run._update
+    run._update = lambda *args: losses.append(float(update(*args))) or torch.tensor(losses[-1])
+    run.train()
+    assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:20])
+    header = read_header(next((tmp_path / "run" / "checkpoints").iterdir()))
+    assert header.algorithm == "guided" and header.training["guide"] == run.guide.digest
+    assert "--algo guided" in header.command
+    assert load_policy(next((tmp_path / "run" / "checkpoints").iterdir()), run.task).digest != run.guide.digest
+
+
+def test_what_cannot_be_guided(tmp_path):
+    with pytest.raises(DmcvbError, match="for ant mazes"):
+        open_run(tmp_path / "run", config(task="walker-walk"), False)
+    with pytest.raises(DmcvbError, match="unknown setting of guided"):
+        open_run(tmp_path / "run", config(settings={"progress": 1.0}), False)
+    assert not (tmp_path / "run").exists()
