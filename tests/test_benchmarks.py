@@ -77,6 +77,15 @@ def test_b2_without_mixed_says_how_to_make_it():
     assert missing.command.startswith("dmcvb-gen rollout walker-walk --level expert --level mixed --distractor none")
 
 
+def test_subsets_that_the_user_left_out_are_not_said_to_be_missing():
+    chosen = release_of("walker-walk/expert/none")
+    _, [missing] = plan_benchmark("b1", chosen, left_out={"walker-walk/expert/static", "walker-walk/medium/none"})
+    assert set(missing.left_out) == {"walker-walk/expert/static", "walker-walk/medium/none"}
+    assert "walker-walk/expert/dynamic" in missing.subsets and not set(missing.subsets) & set(missing.left_out)
+    _, [missing] = plan_benchmark("b2", chosen, left_out={"walker-walk/mixed/none"})
+    assert (missing.subsets, missing.command, missing.left_out) == ((), "", ("walker-walk/mixed/none",))
+
+
 def test_b3_has_a_policy_for_each_fixed_goal_and_names_what_is_missing():
     maze = "ant-maze-empty7x7"
     cells, _ = plan_benchmark("b3", release_of(f"{maze}/expert/hidden", f"{maze}/expert/fixed", episodes=50))

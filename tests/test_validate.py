@@ -121,6 +121,18 @@ def test_the_same_command_goes_on_where_it_stopped(report):
     assert after[0] != before[0] and after[1:] == before[1:]
 
 
+def test_subsets_left_out_by_only_are_called_so_and_not_missing(small_release, tmp_path):
+    result = run(
+        *("validate", small_release, "--only", "walker-walk/random/none", "--agents", "state-bc", "--threads", 1),
+        *("--out", tmp_path / "out"),
+    )
+    assert result.exit_code == 0, result.output
+    [left_out] = [line for line in result.output.splitlines() if "left out by --only" in line]
+    [missing] = [line for line in result.output.splitlines() if "not in the release" in line]
+    assert "walker-walk/random/dynamic" in left_out and "walker-walk/random/dynamic" not in missing.split(";")[0]
+    assert "in the release, left out by --only" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
     for arguments, message in (
         ((release, "--profile", "fast"), "paper, quick, smoke"),

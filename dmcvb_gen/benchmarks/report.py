@@ -154,9 +154,16 @@ def _page(facts: dict[str, Any], release: Release, results, setup: Setup) -> str
         parts += ["<p>Above what the agent saw, below what the decoder made of its 64 numbers.</p>"]
         parts += [_sheets(good, setup, "decoder", facts)]
     if facts["missing"]:
-        rows = (
-            (m["benchmark"], ", ".join(m["subsets"]), f"<code>{_text(m['command'])}</code>") for m in facts["missing"]
-        )
+        rows = [
+            (m["benchmark"], ", ".join(m["subsets"]), f"<code>{_text(m['command'])}</code>")
+            for m in facts["missing"]
+            if m["subsets"]
+        ]
+        rows += [
+            (m["benchmark"], ", ".join(m["left_out"]), "in the release, left out by --only")
+            for m in facts["missing"]
+            if m["left_out"]
+        ]
         parts += ["<h2>What the benchmarks would need besides</h2>"]
         parts += [_table(("benchmark", "missing subsets", "how to roll them out"), rows, raw=(2,))]
     parts += ["<h2>Time, settings, versions</h2>", _times(facts)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -94,12 +94,19 @@ class Cell:
 
 @dataclass(frozen=True)
 class Missing:
-    """Subsets that a part of a benchmark needs, and how to make them."""
+    """Subsets that a part of a benchmark needs besides.
+
+    Attributes:
+      subsets: those that the release lacks.
+      command: how to roll those out.
+      left_out: those that the release has and the user left out.
+    """
 
     benchmark: str
     task: str
     subsets: tuple[str, ...]
     command: str
+    left_out: tuple[str, ...] = ()
 
 
 def slug(text: str) -> str:
@@ -107,12 +114,15 @@ def slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", text.replace("%", "pc")).strip("-")
 
 
-def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> tuple[list[Cell], list[Missing]]:
+def plan_benchmark(
+    name: str, release: Release, agents: Sequence[str] = (), left_out: Collection[str] = ()
+) -> tuple[list[Cell], list[Missing]]:
     """The cells that a release has the data for, and what is missing for the others.
 
     Args:
       name: one of `BENCHMARKS`.
       agents: names instead of the benchmark's own.
+      left_out: subsets that are there but that the user left out of `release`.
 
     Raises:
       UnknownNameError: no such benchmark or agent.
@@ -123,7 +133,7 @@ def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> t
     shelf = _Shelf(release)
     chosen = [parse_agent(agent) for agent in agents]
     cells = list(makers[name](shelf, chosen))
-    return list(dict.fromkeys(cells)), shelf.missing(name)
+    return list(dict.fromkeys(cells)), shelf.missing(name, left_out)
 
 
 class _Shelf:
@@ -155,10 +165,16 @@ class _Shelf:
     def episodes(self, name: str) -> int:
         return self._records[name].episodes
 
-    def missing(self, benchmark: str) -> list[Missing]:
+    def missing(self, benchmark: str, left_out: Collection[str]) -> list[Missing]:
         found = []
-        for task, lacking in self._asked.items():
-            lacking = list(dict.fromkeys(lacking))
+        for task, asked in self._asked.items():
+            names = {f"{task}/{level}/{setting}": (level, setting) for level, setting in asked}
+            excluded = tuple(name for name in names if name in left_out)
+            names = {name: where for name, where in names.items() if name not in left_out}
+            if not names:
+                found.append(Missing(benchmark, task, (), "", excluded))
+                continue
+            lacking = list(names.values())
             have = [(level, setting) for t, level, setting in self._names if t == task]
             levels = dict.fromkeys(level for level, _ in have + lacking)
             settings = dict.fromkeys(setting for _, setting in have + lacking)
@@ -174,8 +190,7 @@ class _Shelf:
             else:
                 command += "".join(f" --distractor {s}" for s in settings)
                 command += f" --episodes {count} --out releases/{slug(benchmark)}"
-            names = tuple(f"{task}/{level}/{setting}" for level, setting in lacking)
-            found.append(Missing(benchmark, task, names, command))
+            found.append(Missing(benchmark, task, tuple(names), command, excluded))
         return found
 
 

@@ -107,13 +107,16 @@ def validate(
     chosen = only(release, patterns)
     if not chosen.subsets:
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
+    left_out = release.subsets.keys() - chosen.subsets.keys()
     cells: list[Cell] = []
     missing: list[Missing] = []
     for name in benchmarks:
-        found, lacking = plan_benchmark(name, chosen, agents)
+        found, lacking = plan_benchmark(name, chosen, agents, left_out)
         if not found:
-            needs = "; ".join(f"{', '.join(m.subsets[:4])}: {m.command}" for m in lacking)
-            raise DmcvbError(f"benchmark {name} has no data in {path}. Roll out {needs or 'a locomotion task'}")
+            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
+            needs += [f"let --only take {', '.join(m.left_out[:4])}" for m in lacking if m.left_out]
+            cure = "; ".join(needs) or "roll out a locomotion task"
+            raise DmcvbError(f"benchmark {name} has no data in {path}; {cure}")
         cells += found
         missing += lacking
     structure = check_structure(chosen, setup.backgrounds, progress.checking)

@@ -100,9 +100,11 @@ def _show(result, profile) -> None:
         where = f"{cell.task} {cell.policy_label}/{cell.setting}"
         click.echo(f"{where} {cell.agent.name}: {score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]{beside}")
     for entry in result.missing:
-        click.echo(
-            f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}; make them with: {entry.command}"
-        )
+        if entry.subsets:
+            names = ", ".join(entry.subsets)
+            click.echo(f"{entry.benchmark}: not in the release: {names}; make them with: {entry.command}")
+        if entry.left_out:
+            click.echo(f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}")
     checked = ", ".join(f"{count:,} {name}" for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
     click.echo(f"{'sound' if result.sound else f'{found} findings'} ({checked}); {profile.note}")
