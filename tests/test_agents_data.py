@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -179,10 +181,22 @@ def test_states_alone_need_no_pictures(small_release):
 
 def test_batches_drawn_ahead_come_in_order_and_are_the_same():
     data, learner = make_data(), BehaviorCloning(observation_encoder(9, SIZE), 2)
-    plain, ahead = (list(batches(lambda step: draw(learner, data, 4, 0, step), 2, 9, workers)) for workers in (0, 2))
+    plain, ahead = (list(batches(lambda step, _: draw(learner, data, 4, 0, step), 2, 9, workers)) for workers in (0, 2))
     assert [step for step, _ in ahead] == list(range(2, 9))
     for (_, one), (_, two) in zip(plain, ahead, strict=True):
         torch.testing.assert_close(one.observation, two.observation)
+
+
+def test_a_batch_drawn_over_another_one_is_the_same_in_the_same_memory():
+    data = make_data()
+    for dtype in (torch.float32, torch.bfloat16):
+        ask = dict(next_observation=True, dtype=dtype)
+        used = data.batch(16, np.random.default_rng(0), **ask)
+        places = used.observation.data_ptr(), used.next_observation.data_ptr()
+        again, fresh = (data.batch(16, np.random.default_rng(1), reuse=old, **ask) for old in (used, None))
+        assert (again.observation.data_ptr(), again.next_observation.data_ptr()) == places
+        torch.testing.assert_close(again.observation, fresh.observation, atol=0, rtol=0)
+        torch.testing.assert_close(again.next_observation, fresh.next_observation, atol=0, rtol=0)
 
 
 def test_bfloat16_pictures_are_the_float32_ones_rounded_once():
@@ -214,10 +228,11 @@ def test_the_curve_has_losses_hold_out_and_scores():
     assert curve[-1]["loss"] < curve[0]["loss"]
 
 
-def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch):
-    data = make_data().states_only()
+@pytest.mark.parametrize("decay", [False, True])
+def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, decay):
+    data, settings = make_data().states_only(), dataclasses.replace(SETTINGS, decay=decay)
     whole = state_learner(data)
-    wanted = train(whole, data, SETTINGS)
+    wanted = train(whole, data, settings)
     monkeypatch.setattr(trainer, "SAVE_SECONDS", 0.0)
     made = []
 
@@ -227,14 +242,24 @@ def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(state_learner(data), data, SETTINGS, folder=tmp_path, tick=stop)
+        train(state_learner(data), data, settings, folder=tmp_path, tick=stop)
     resumed = state_learner(data)
     made.clear()
-    curve = train(resumed, data, SETTINGS, folder=tmp_path, tick=made.append)
+    curve = train(resumed, data, settings, folder=tmp_path, tick=made.append)
     assert made[0] == 6 and sum(made) == 12  # the state of step 6 was on disk
     for one, two in zip(whole.parameters(), resumed.parameters(), strict=True):
         torch.testing.assert_close(one, two, atol=0, rtol=0)
     assert [point["step"] for point in curve] == [point["step"] for point in wanted]
+
+
+def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to():
+    data, rates = make_data().states_only(), {True: [], False: []}
+    for decay, seen in rates.items():
+        learner = state_learner(data)
+        [group] = learner.optimizers["main"].param_groups
+        settings = dataclasses.replace(SETTINGS, steps=4, decay=decay)
+        train(learner, data, settings, tick=lambda steps, group=group, seen=seen: seen.append(group["lr"]))
+    assert rates == {True: pytest.approx([1e-3, 0.75e-3, 0.5e-3, 0.25e-3]), False: [1e-3] * 4}
 
 
 def test_a_damaged_state_is_refused_with_what_to_do(tmp_path):

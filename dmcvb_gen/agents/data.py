@@ -116,11 +116,11 @@ class HeldFrames:
         self.table[rows, channels] = pictures.to(self.table.device)[..., self._mirror]
 
     def shifted(self, rows, down, right):
-        batch, frames = rows.shape
+        (batch, frames), wide = rows.shape, self.size + 2 * PAD
         line = self._mirror[down[:, None] + torch.arange(self.size, device=rows.device)]  # (batch, size)
         plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=rows.device)
-        index = plane.reshape(batch, -1, 1) * self.size + line[:, None]  # (batch, frames x channels, size)
-        index = index * (self.size + 2 * PAD) + right[:, None, None]
+        first = plane.flatten(1) * (self.size * wide) + right[:, None]  # (batch, frames x channels)
+        index = first[:, :, None] + (line * wide)[:, None]  # (batch, frames x channels, size)
         flat = self.table.view(-1)
         lines = flat.as_strided((len(flat) - self.size + 1, self.size), (1, 1)).index_select(0, index.reshape(-1))
         return lines.view(batch, frames * self.channels, self.size, self.size)
@@ -152,9 +152,15 @@ class StoredFrames:
         return held.shifted(torch.arange(len(stacks), device=rows.device)[:, None], down, right)
 
 
-def normalize_pixels(pictures: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    """uint8 -> [-0.5, 0.5]. In this order bfloat16 rounds once, as autocast would: 127.5 less is exact in 8 bits."""
-    return pictures.to(dtype).sub_(127.5).mul_(1 / 255)
+def normalize_pixels(
+    pictures: torch.Tensor, dtype: torch.dtype = torch.float32, out: torch.Tensor | None = None
+) -> torch.Tensor:
+    """uint8 -> [-0.5, 0.5], written over `out` if given.
+
+    In this order bfloat16 rounds once, as autocast would: 127.5 less is exact in 8 bits.
+    """
+    values = pictures.to(dtype) if out is None else out.copy_(pictures)
+    return values.sub_(127.5).mul_(1 / 255)
 
 
 def stack_rows(row: torch.Tensor, start: torch.Tensor, frames: int) -> torch.Tensor:
@@ -240,13 +246,18 @@ class TrainingData(Dataset):
         return middle, middle
 
     def observe(
-        self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor, dtype: torch.dtype = torch.float32
+        self,
+        rows: torch.Tensor,
+        down: torch.Tensor,
+        right: torch.Tensor,
+        dtype: torch.dtype = torch.float32,
+        out: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures."""
         if self.frames is None:
             return self.state[rows]
         stacks = stack_rows(rows, self.start[rows], self.stack)
-        return normalize_pixels(self.frames.shifted(stacks, down, right), dtype)
+        return normalize_pixels(self.frames.shifted(stacks, down, right), dtype, out)
 
     def batch(
         self,
@@ -258,6 +269,7 @@ class TrainingData(Dataset):
         sample_k: bool = False,
         hold_out: bool = False,
         dtype: torch.dtype = torch.float32,
+        reuse: Batch | None = None,
     ) -> Batch:
         """Transitions drawn uniformly, with replacement.
 
@@ -266,6 +278,8 @@ class TrainingData(Dataset):
           k: steps between the two; with `sample_k` drawn from 1..k for each.
           hold_out: draw from the held-out episodes, without shifts.
           dtype: of pictures. Half the bytes are half the time to write them.
+          reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
+            memory for a large batch costs several times the work that fills it.
         """
         rows = self.hold_out_rows if hold_out else self.train_rows
         if next_observation and k > 1:
@@ -283,9 +297,9 @@ class TrainingData(Dataset):
         later = steps = None
         if next_observation:
             steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-            later = self.observe(chosen + steps, down, right, dtype)
+            later = self.observe(chosen + steps, down, right, dtype, reuse and reuse.next_observation)
         return Batch(
-            observation=self.observe(chosen, down, right, dtype),
+            observation=self.observe(chosen, down, right, dtype, reuse and reuse.observation),
             state=self.state[chosen],
             action=self.action[chosen],
             reward=self.reward[chosen],
@@ -312,18 +326,27 @@ class TrainingData(Dataset):
 
 
 def batches(
-    draw: Callable[[int], Batch], first: int, last: int, workers: int = 0, ahead: int = 4
+    draw: Callable[[int, Batch | None], Batch], first: int, last: int, workers: int = 0, ahead: int = 4
 ) -> Iterator[tuple[int, Batch]]:
-    """(step, batch) for steps first .. last - 1, in order; drawn ahead by threads where there are workers."""
+    """(step, batch) for steps first .. last - 1, in order; drawn ahead by threads where there are workers.
+
+    A batch is to be used before the next one is asked for: without workers its memory is used again.
+
+    Args:
+      draw: gives the batch of a step; told of a batch whose memory it may take.
+    """
     if not workers:
-        yield from ((step, draw(step)) for step in range(first, last))
+        batch = None
+        for step in range(first, last):
+            batch = draw(step, batch)
+            yield step, batch
         return
     with ThreadPoolExecutor(workers) as pool:
-        waiting = {step: pool.submit(draw, step) for step in range(first, min(first + ahead, last))}
+        waiting = {step: pool.submit(draw, step, None) for step in range(first, min(first + ahead, last))}
         for step in range(first, last):
             batch = waiting.pop(step).result()
             if step + ahead < last:
-                waiting[step + ahead] = pool.submit(draw, step + ahead)
+                waiting[step + ahead] = pool.submit(draw, step + ahead, None)
             yield step, batch
 
 

@@ -44,6 +44,7 @@ class TrainSettings:
       half: bfloat16 autocast. Pays for pictures, not for states.
       compile: torch.compile of the losses.
       workers: threads that draw batches ahead; 0 draws them in turn (data read from shards have two in any case).
+      decay: the learning rate falls linearly to zero over the steps; the paper keeps it, short trainings gain by it.
     """
 
     steps: int = 400_000
@@ -53,10 +54,19 @@ class TrainSettings:
     half: bool = True
     compile: bool = False
     workers: int = 0
+    decay: bool = False
 
 
-def draw(learner: Learner, data: TrainingData, size: int, seed: int, step: int, hold_out: bool = False) -> Batch:
-    """The batch of a step, as the learner needs it."""
+def draw(
+    learner: Learner,
+    data: TrainingData,
+    size: int,
+    seed: int,
+    step: int,
+    hold_out: bool = False,
+    reuse: Batch | None = None,
+) -> Batch:
+    """The batch of a step, as the learner needs it; over a batch that is no longer needed, if one is given."""
     generator = np.random.default_rng((seed, step, int(hold_out)))
     return data.batch(
         size,
@@ -66,6 +76,7 @@ def draw(learner: Learner, data: TrainingData, size: int, seed: int, step: int, 
         sample_k=learner.sample_k,
         hold_out=hold_out,
         dtype=torch.bfloat16 if learner.half else torch.float32,
+        reuse=reuse,
     )
 
 
@@ -114,12 +125,17 @@ def train(
     sums: dict[str, torch.Tensor] = {}
     counts: dict[str, int] = {}
 
-    def make(step: int) -> Batch:
-        return draw(learner, data, settings.batch_size, seed, step)
+    def make(step: int, reuse: Batch | None) -> Batch:
+        return draw(learner, data, settings.batch_size, seed, step, reuse=reuse)
 
+    groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
+    rates = [group["lr"] for group in groups]
     workers = max(settings.workers, 2 if isinstance(data.frames, StoredFrames) else 0)
     for step, batch in batches(make, first, settings.steps, workers):
         torch.manual_seed((seed << 32) + step)
+        if settings.decay:
+            for group, rate in zip(groups, rates, strict=True):
+                group["lr"] = rate * (1 - step / settings.steps)
         for name, value in learner.update(batch).items():
             sums[name] = sums.get(name, 0.0) + value
             counts[name] = counts.get(name, 0) + 1
