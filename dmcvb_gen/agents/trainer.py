@@ -22,8 +22,8 @@ from dmcvb_gen.agents.data import StoredFrames, TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.errors import DmcvbError
 
-HOLD_OUT_BATCHES = 4
-"""Batches of the hold-out that a test loss is the mean of."""
+HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
+"""At least so many batches, and transitions, of the hold-out are what a test loss is the mean of."""
 SAVE_SECONDS = 120.0
 """Work that a stop may cost."""
 RESUME_FILE = "resume.safetensors"
@@ -85,9 +85,10 @@ def hold_out_losses(learner: Learner, data: TrainingData, size: int, seed: int =
     if not len(data.hold_out_rows):
         return {}
     sums: dict[str, float] = {}
-    for index in range(HOLD_OUT_BATCHES):
+    count = max(HOLD_OUT_BATCHES, -(-HOLD_OUT_TRANSITIONS // size))
+    for index in range(count):
         for name, value in learner.metrics(draw(learner, data, size, seed, index, hold_out=True)).items():
-            sums[f"test_{name}"] = sums.get(f"test_{name}", 0.0) + float(value) / HOLD_OUT_BATCHES
+            sums[f"test_{name}"] = sums.get(f"test_{name}", 0.0) + float(value) / count
     return sums
 
 

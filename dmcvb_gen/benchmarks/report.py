@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen import __version__
 from dmcvb_gen.behaviours.paper import paper_returns
@@ -167,7 +168,8 @@ def _page(facts: dict[str, Any], release: Release, results, setup: Setup) -> str
         parts += ["<h2>What the benchmarks would need besides</h2>"]
         parts += [_table(("benchmark", "missing subsets", "how to roll them out"), rows, raw=(2,))]
     parts += ["<h2>Time, settings, versions</h2>", _times(facts)]
-    settings = facts["profile"] | facts["settings"] | facts["versions"]
+    settings = {"profile": facts["profile"]["name"], **facts["profile"], **facts["settings"], **facts["versions"]}
+    del settings["name"], settings["note"]  # said above
     parts += [_table(("setting", "value"), ((key, str(value)) for key, value in settings.items()))]
     body = "\n".join(parts)
     title = f"Validation of {_text(facts['release']['name'])}"
@@ -236,13 +238,15 @@ def _return_figure(release: Release) -> Figure:
         subset = release.subsets[name]
         axis.hist(subset.returns, bins=30, color="#4477aa")
         axis.set_title(name, fontsize=9)
-        axis.set_xlabel("return")
+        axis.set(xlabel="return", ylabel="episodes")
+        axis.yaxis.set_major_locator(MaxNLocator(integer=True))
         paper = paper_returns(subset.task, subset.level)
         if paper:
             low = -0.12 * axis.get_ylim()[1]
             axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)
             axis.plot([paper["p25"], paper["p75"]], [low, low], color="#cc6677", linewidth=6, solid_capstyle="butt")
             axis.plot([paper["median"]], [low], "|", color="black", markersize=9)
+            axis.set_yticks([tick for tick in axis.get_yticks() if tick >= 0])
             axis.set_title(f"{name}\nbelow: the paper's range, quartiles, median", fontsize=8)
     return figure
 
@@ -254,13 +258,17 @@ def _scores(facts: dict[str, Any]) -> str:
         results = [result for result in facts["results"] if result["cell"]["benchmark"] == benchmark]
         agents = list(dict.fromkeys(result["cell"]["agent_name"] for result in results))
         rows: dict[tuple, dict[str, str]] = {}
+        by_state: dict[tuple, dict[str, str]] = {}
         for result in results:
             cell = result["cell"]
             source = "+".join(_label(part) for part in cell["pretrain"])
             policy = cell["policy_label"] + (f" (encoder: {source})" if source else "")
-            setting = "any" if cell["agent"]["sees_state"] and benchmark == "b1" else cell["setting"]
-            key = (cell["task"], policy, setting, f"{result['data_return']:.0f}")
+            key = (cell["task"], policy, cell["setting"], f"{result['data_return']:.0f}")
             rows.setdefault(key, {})[cell["agent_name"]] = _score(result, tag)
+            if cell["agent"]["sees_state"] and benchmark == "b1":
+                by_state.setdefault(key[:2], {})[cell["agent_name"]] = _score(result, tag)
+        for key, row in rows.items():  # states know of no distractors: one score stands beside those of every setting
+            row |= by_state.get(key[:2], {})
         head = ("task", "policy learns from", "setting", "data's mean return", *agents)
         body = ([*key, *(row.get(agent, "") for agent in agents)] for key, row in rows.items())
         tables += [f"<h3>{benchmark}</h3>", _table(head, body, raw=range(4, 4 + len(agents)))]
@@ -311,9 +319,12 @@ def _curves(good, facts: dict[str, Any]) -> Figure:
         title = "/".join(key[1:])
         loss.set(title=f"{title}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log")
         score.set(title=f"online return [{facts['profile']['name']}]", xlabel="Adam step")
+        if members[0][1]["data_return"] > 0:
+            score.set_ylim(bottom=0)
         for axis in (loss, score):
             axis.title.set_fontsize(9)
-        score.legend(fontsize=7)
+            axis.set_xlim(left=0)
+        score.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 
