@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dmcvb_gen.behaviours import runs
-from dmcvb_gen.behaviours.guided import divergence
-from dmcvb_gen.behaviours.policy_file import load_policy, read_header
+from dmcvb_gen.behaviours.guided import deepened, divergence
+from dmcvb_gen.behaviours.policy_file import Actor, load_policy, read_header
 from dmcvb_gen.behaviours.runs import RunConfig
 from dmcvb_gen.behaviours.training import open_run
 from dmcvb_gen.errors import DmcvbError
@@ -35,6 +35,19 @@ def test_saturated_actions_need_not_be_met_to_the_digit():
     same = divergence(torch.tensor([[3.5]]), std, torch.tensor([[9.0]]), std)
     assert float(same) == 0
     assert float(divergence(torch.tensor([[3.5]]), std, torch.tensor([[2.0]]), std)) > 1
+
+
+def test_a_deeper_student_begins_as_its_guide(tmp_path):
+    torch.manual_seed(0)
+    run = open_run(tmp_path / "run", config(), False)
+    weights = run.guide.weights
+    student, guide = Actor(run.header), Actor(run.guide.header)
+    assert run.header.hidden == (256, 256, 256, 256) and run.guide.header.hidden == (256, 256)
+    student.load_state_dict(deepened(weights, student.state_dict()))
+    guide.load_state_dict(weights)
+    observation = weights["observation_mean"] + torch.randn(64, run.header.observation_size)
+    for own, other in zip(student(observation), guide(observation), strict=True):
+        torch.testing.assert_close(own, other)
 
 
 def test_a_student_sees_the_goal_and_its_guide_the_way_point():

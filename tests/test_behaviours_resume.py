@@ -28,7 +28,7 @@ from dmcvb_gen.errors import DmcvbError
 torch.set_num_threads(1)
 TINY = {
     "sac": dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4),
-    "guided": dict(batch_size=16, simulations=4, train_episode_steps=20, half_life=100),
+    "guided": dict(batch_size=16, simulations=4, train_episode_steps=20, half_life=100, layers=2),
     "sb3-sac": dict(learning_starts=24, batch_size=16, hidden=[16], simulations=4, normalize_observation=True),
     "tqc": dict(learning_starts=24, batch_size=16, hidden=[16], simulations=4, n_quantiles=5),
     "td3": dict(learning_starts=24, batch_size=16, hidden=[16, 8], simulations=4),

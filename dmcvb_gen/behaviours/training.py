@@ -89,7 +89,7 @@ class Episodes:
         numbers = run.step * self.size + ids  # never the same stream twice in a run
         names = (self._task.id, "training")
         self.batch.reset([episode_stream(run.config.seed, names, int(i), "initial_state") for i in numbers], ids)
-        standing = ids[self._rng.random(len(ids)) < run.settings.standing_starts]
+        standing = ids[self._rng.random(len(ids)) < getattr(run.settings, "standing_starts", 0.0)]
         if len(standing):
             self.batch.set_physics(standing_states(self._task, self._rng, len(standing)), standing)
         return self.batch.state()
