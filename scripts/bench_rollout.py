@@ -140,7 +140,7 @@ def main() -> None:
         base = maze_peer(task_id, options.peer_steps // 5, True) if maze else peer(task_id, options.peer_steps)
         ours(task_id, "visible" if maze else "none", 1 if maze else 2, 1)  # kernels are compiled once a machine
         for setting in ["visible"] if maze else options.settings:
-            whole, running, parts = ours(task_id, setting, 4 if maze else options.episodes, options.workers)
+            whole, running, parts = ours(task_id, setting, options.episodes // 3 if maze else options.episodes, options.workers)
             shares = ", ".join(f"{name} {share:.0%}" for name, share in parts.items())
             print(
                 f"{task_id:20} {setting:8} {base:6.1f} {whole:7.1f} {whole / base:6.1f} {running:8.1f} "

@@ -7,7 +7,7 @@ import pytest
 
 from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.rendering import available_renderers, floor_alpha_for, make_renderer
+from dmcvb_gen.rendering import available_renderers, floor_alpha_for, make_renderer, warp
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
@@ -57,6 +57,20 @@ def test_a_frame_does_not_depend_on_the_frames_beside_it(name, setting_name):
     other = renderer_of(name, task, setting, 32)
     np.testing.assert_array_equal(other.render(physics[:3], labels[:3]), whole[:3])
     other.close()
+
+
+def test_a_frame_does_not_depend_on_the_size_of_its_launch(monkeypatch):
+    task, setting, physics, labels = frames_of("humanoid-walk", "dynamic")
+    renderer = renderer_of("warp", task, setting, 32)
+    whole = renderer.render(physics, labels)
+    renderer.close()
+    monkeypatch.setattr(warp, "FEW_WORLDS", 2)
+    renderer = renderer_of("warp", task, setting, 32)
+    renderer.worlds = 7
+    sizes = [worlds for _, worlds in renderer._parts(FRAMES)]
+    assert set(sizes) == {7, 2} and FRAMES <= sum(sizes) < FRAMES + 2
+    np.testing.assert_array_equal(renderer.render(physics, labels), whole)
+    renderer.close()
 
 
 @pytest.mark.parametrize("name", RENDERERS)
