@@ -140,7 +140,8 @@ def main() -> None:
         base = maze_peer(task_id, options.peer_steps // 5, True) if maze else peer(task_id, options.peer_steps)
         ours(task_id, "visible" if maze else "none", 1 if maze else 2, 1)  # kernels are compiled once a machine
         for setting in ["visible"] if maze else options.settings:
-            whole, running, parts = ours(task_id, setting, options.episodes // 3 if maze else options.episodes, options.workers)
+            episodes = options.episodes // 3 if maze else options.episodes
+            whole, running, parts = ours(task_id, setting, episodes, options.workers)
             shares = ", ".join(f"{name} {share:.0%}" for name, share in parts.items())
             print(
                 f"{task_id:20} {setting:8} {base:6.1f} {whole:7.1f} {whole / base:6.1f} {running:8.1f} "
