@@ -39,7 +39,7 @@ def test_saturated_actions_need_not_be_met_to_the_digit():
 
 def test_a_deeper_student_begins_as_its_guide(tmp_path):
     torch.manual_seed(0)
-    run = open_run(tmp_path / "run", config(), False)
+    run = open_run(tmp_path / "run", config(settings={"layers": 4}), False)
     weights = run.guide.weights
     student, guide = Actor(run.header), Actor(run.guide.header)
     assert run.header.hidden == (256, 256, 256, 256) and run.guide.header.hidden == (256, 256)

@@ -40,16 +40,17 @@ class GuidedSettings:
       least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
       half_life: agent steps in which the learning rate halves.
-      layers: hidden layers of the student; those that the guide lacks begin as identities. Where to turn is a jagged
-        function of the position: on the same 150,000 steps of medium7x7a, 2, 3 and 4 layers of 256 came to a
-        divergence of 1.9, 1.5 and 1.4 nats on unseen steps after 7,500 updates.
+      layers: hidden layers of the student; those that the guide lacks begin as identities. More fit a fixed set of
+        steps better (medium7x7a, after 7,500 updates: 1.9, 1.5 and 1.4 nats on unseen steps with 2, 3 and 4 layers of
+        256), but cost twice the time and walked no better (returns of -114 after 84k steps with 2, -148 after 72k
+        with 4).
     """
 
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    half_life: Positive = 25_000
-    layers: Count = 4
+    half_life: Positive = 40_000
+    layers: Count = 2
     updates_per_step: Positive = 0.25
     buffer_size: Count = 400_000
     ahead: NonNegative = 3.0
