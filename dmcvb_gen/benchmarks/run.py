@@ -161,6 +161,7 @@ def _settings(setup: Setup, steps: int, half: bool = True, evaluations: int = 1)
         batch_size=setup.profile.batch_size,
         evaluate_every=-(-steps // evaluations),
         half=half,
+        decay=setup.profile.decay,
         compile=setup.compile,
         workers=1 if setup.device != "cpu" else 0,
     )
