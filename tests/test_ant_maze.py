@@ -21,7 +21,7 @@ from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, fixed_pairs, layout_task_id
 from dmcvb_gen.tasks.ant_maze.arena import GOAL_HEIGHT, GOAL_RADIUS, WALL_HEIGHT
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, descend, geodesic_field, look_up, make_field, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, get_layout, make_layout
-from dmcvb_gen.tasks.ant_maze.waypoints import way_points
+from dmcvb_gen.tasks.ant_maze.waypoints import headings
 
 
 def composer_environment(layout, goal):
@@ -329,23 +329,21 @@ def test_distance_falls_along_the_shortest_path(task_id):
 
 
 @pytest.mark.parametrize("task_id", ANT_MAZE_TASKS)
-def test_way_points_lead_to_the_goal_clear_of_walls(task_id):
+def test_headings_lead_to_the_goal_clear_of_walls(task_id):
     layout = get_task(task_id).layout
     rng = np.random.default_rng(0)
     positions = layout.world(np.repeat(layout.free, 2, axis=0)) + rng.uniform(-0.9, 0.9, (2 * len(layout.free), 2))
     goals = np.tile(layout.world(layout.free[0]) + [0.3, -0.4], (len(positions), 1))
     floor = np.kron(~layout.walls, np.ones((PIXELS, PIXELS), bool))
     clear = ndimage.distance_transform_edt(floor) * CELL / PIXELS
-    for number in range(100):
-        points = way_points(layout, positions, goals, 1.0)
-        at_goal = (points == goals).all(axis=1)
-        pixel = ((layout.grid(points) + 0.5) * PIXELS).astype(int)
-        # Wherever it began, the way soon keeps to the middle of the corridors.
-        assert (clear[pixel[:, 0], pixel[:, 1]][~at_goal] >= (0.7 if number > 1 else 0.2)).all()
-        if at_goal.all():
-            break
-        positions = points
-    assert at_goal.all()
+    for number in range(400):
+        vector = headings(layout, positions, goals, 2.0)
+        length = np.linalg.norm(vector, axis=1, keepdims=True)
+        assert np.isfinite(vector).all() and (length < 2.0 * 2**0.5 + CELL).all()
+        positions = positions + vector / np.maximum(length, 1e-9) * np.minimum(length, 0.15)
+        pixel = ((layout.grid(positions) + 0.5) * PIXELS).astype(int)
+        assert (clear[pixel[:, 0], pixel[:, 1]] > (0.4 if number > 10 else 0)).all()
+    assert (np.linalg.norm(positions - goals, axis=1) < GOAL_RADIUS).all()
 
 
 # -- layouts --------------------------------------------------------------------------------------

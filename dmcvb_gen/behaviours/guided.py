@@ -1,7 +1,7 @@
 """Imitating a guide through a maze: a policy of the open maze in, an actor that knows one layout out.
 
-A policy that walks straight to goals gets through every maze when it is shown way-points instead of the
-goal. This guide knows the layout, which behaviour policies must not see; so a student, which sees what
+A policy that walks straight to goals gets through every maze when it is shown a point on the way instead
+of the goal. This guide knows the layout, which behaviour policies must not see; so a student, which sees what
 behaviour policies see, learns to act as it does (DAgger, Ross et al. 2011: the student walks, the guide
 says what it would have done there). Minutes, where reinforcement learning in a maze takes hours.
 """
@@ -35,7 +35,7 @@ class GuidedSettings:
       simulations: episodes stepped side by side.
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       buffer_size: agent steps remembered.
-      ahead: how far down the way the guide's way-point is, meters.
+      ahead: how far down the way the guide is shown where to go, meters.
       guided_share: share of training episodes that the guide walks itself.
       least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
@@ -49,11 +49,11 @@ class GuidedSettings:
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    half_life: Positive = 40_000
+    half_life: Positive = 30_000
     layers: Count = 2
     updates_per_step: Positive = 0.25
     buffer_size: Count = 400_000
-    ahead: NonNegative = 3.0
+    ahead: NonNegative = 2.0
     guided_share: Share = 0.2
     least_std: Positive = 0.1
     train_episode_steps: Natural = 300
@@ -64,7 +64,7 @@ class GuidedRun(Run):
 
     @functools.cached_property
     def guide(self) -> Policy:
-        """The policy that is shown way-points."""
+        """The policy that is shown the way."""
         if not self.task.id.startswith("ant-maze"):
             raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
         source = self.config.init_from

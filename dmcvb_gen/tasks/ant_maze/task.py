@@ -15,7 +15,7 @@ import numpy as np
 from dmcvb_gen.tasks.ant_maze.arena import CAMERAS, GOAL_HEIGHT, GOAL_RADIUS, PHYSICS_STEP, build_arena, look_numbers
 from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
-from dmcvb_gen.tasks.ant_maze.waypoints import way_points
+from dmcvb_gen.tasks.ant_maze.waypoints import headings
 from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, Task
 
 EPISODE_STEPS = 1200
@@ -186,10 +186,13 @@ class AntMazeBatch(EpisodeBatch):
         return self._mocap[:, 0] + [0, 0, GOAL_HEIGHT]
 
     def guided_state(self, ahead: float) -> np.ndarray:
-        """(size, state) float64: as if the goal were a way-point `ahead` meters down the way to it."""
-        goal = self.goal()
-        points = way_points(self.task.layout, self._xpos[:, self._torso, :2], goal[:, :2], ahead)
-        return self.state(np.concatenate([points, goal[:, 2:]], axis=1))
+        """(size, state) float64: as if the ant stood in the middle of an open maze, its goal where `headings` point."""
+        position, goal = self._xpos[:, self._torso], self.goal()
+        vector = headings(self.task.layout, position[:, :2], goal[:, :2], ahead)
+        state = self.state(np.concatenate([position[:, :2] + vector, goal[:, 2:]], axis=1))
+        for name, xy in {"walker_position": 0.0, "target_position": vector}.items():
+            state[:, self.task.state_slices[name]][:, :2] = xy
+        return state
 
     def distance(self) -> np.ndarray:
         """(size,): distance to the goal over its maximum in the maze, in [0, 1]."""

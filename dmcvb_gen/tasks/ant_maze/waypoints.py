@@ -1,7 +1,7 @@
-"""Way-points: from where an ant is, the place a little further down the way to its goal, clear of walls.
+"""Ways to the goal: from where an ant is, in which direction to walk, around the walls and clear of them.
 
-An ant that can walk straight to a goal in an open maze gets through any maze when it is shown way-points
-instead of the goal. They need the layout, so no behaviour policy sees them; teachers do (`behaviours.guided`).
+An ant that can walk straight to a goal in an open maze gets through any maze when it is shown a point on the
+way instead of the goal. That needs the layout, so no behaviour policy sees it; guides do (`behaviours.guided`).
 """
 
 from __future__ import annotations
@@ -9,10 +9,17 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from scipy import ndimage
 
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, floor_pixels, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
+CLEARANCE = 1.1
+"""Meters to a wall below which a heading turns away from it; the middle of a corridor has 1.25."""
+PUSH = 2.0
+"""Weight of turning away at the wall itself, against 1 for going on."""
+LENGTH = 3.0
+"""Meters to the point that is headed for: policies of the open maze know goals this far away best."""
 _AROUND = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column)
 
 
@@ -36,30 +43,49 @@ def _downhill(layout: Layout, goal_cell: tuple[int, int]) -> np.ndarray:
     return best.ravel()
 
 
-def way_points(layout: Layout, positions: np.ndarray, goals: np.ndarray, ahead: float) -> np.ndarray:
-    """Where to head for.
+@functools.cache
+def _clearance(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """(row, column) distance of every pixel to the nearest wall, meters; (row, column, 2) unit x and y away from it."""
+    floor, _ = floor_pixels(layout)
+    clear = ndimage.distance_transform_edt(floor) * CELL / PIXELS
+    down, right = np.gradient(ndimage.gaussian_filter(np.where(floor, clear, -CELL / PIXELS), 1.0))
+    away = np.stack([right, -down], axis=-1)
+    return clear, away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-6)
+
+
+def headings(layout: Layout, positions: np.ndarray, goals: np.ndarray, ahead: float) -> np.ndarray:
+    """Where to head for, seen from the ant.
+
+    It is the point `ahead` meters down the way, pushed away from a wall that is nearer than `CLEARANCE`: an ant that
+    leans on a corner would stay there. On 100 episodes of medium7x7b a guide without that push returned -127 and
+    reached the goal in 97 %, with it -78 and 100 %.
 
     Args:
       positions: (n, 2) x and y of the ants, meters; one in a wall counts as on the nearest floor.
       goals: (n, 2) x and y of the goals, meters.
-      ahead: how far down the way, meters; rounded to pixels of 0.25 m.
+      ahead: meters down the way, rounded to pixels of 0.25 m.
 
     Returns:
-      (n, 2) meters: the goal itself where the way-point lies in its cell.
+      (n, 2) meters: the vector to the goal where nothing is in between, else one of length `LENGTH`.
 
     Raises:
       LayoutError: a goal is in a wall.
     """
     floor, nearest = floor_pixels(layout)
+    clear, away = _clearance(layout)
     height, width = floor.shape
     cells = np.rint(layout.grid(goals)).astype(int)
     pixel = np.clip(((layout.grid(positions) + 0.5) * PIXELS).astype(int), 0, [height - 1, width - 1])
     row, column = nearest[:, pixel[:, 0], pixel[:, 1]]
-    index = row * width + column
-    next_ = np.stack([_downhill(layout, (int(row), int(column))) for row, column in cells])
-    each = np.arange(len(index))
+    index, each = row * width + column, np.arange(len(pixel))
+    next_ = np.stack([_downhill(layout, (int(y), int(x))) for y, x in cells])
     for _ in range(round(ahead / (CELL / PIXELS))):
         index = next_[each, index]
     found = np.stack([index // width, index % width], axis=1)
-    points = layout.world((found + 0.5) / PIXELS - 0.5)
-    return np.where((found // PIXELS == cells).all(axis=1)[:, None], goals, points)
+    arrives = (found // PIXELS == cells).all(axis=1)[:, None]
+    vector = np.where(arrives, goals, layout.world((found + 0.5) / PIXELS - 0.5)) - positions
+    push = PUSH * np.clip(1 - clear[pixel[:, 0], pixel[:, 1]] / CLEARANCE, 0, 1)[:, None]
+    length = np.linalg.norm(vector, axis=1, keepdims=True)
+    direction = vector / np.maximum(length, 1e-6) + push * away[row, column]
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-6)
+    return np.where(arrives & (push == 0), vector, direction * np.where(arrives, np.minimum(length, LENGTH), LENGTH))
