@@ -80,6 +80,15 @@ def test_a_student_comes_nearer_to_its_guide(tmp_path, monkeypatch):
     assert load_policy(next((tmp_path / "run" / "checkpoints").iterdir()), run.task).digest != run.guide.digest
 
 
+def test_a_run_does_not_go_on_with_another_guide(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
+    open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000, evaluate_sparse=10_000), False).train()
+    longer = open_run(tmp_path / "run", config(steps=128, evaluate_every=10_000, evaluate_sparse=10_000), True)
+    longer.guide.digest = "another"
+    with pytest.raises(DmcvbError, match="another guide"):
+        longer.train()
+
+
 def test_what_cannot_be_guided(tmp_path):
     with pytest.raises(DmcvbError, match="for ant mazes"):
         open_run(tmp_path / "run", config(task="walker-walk"), False)

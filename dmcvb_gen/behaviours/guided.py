@@ -41,9 +41,9 @@ class GuidedSettings:
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
       half_life: agent steps in which the learning rate halves.
       layers: hidden layers of the student; those that the guide lacks begin as identities. More fit a fixed set of
-        steps better (medium7x7a, after 7,500 updates: 1.9, 1.5 and 1.4 nats on unseen steps with 2, 3 and 4 layers of
-        256), but cost twice the time and walked no better (returns of -114 after 84k steps with 2, -148 after 72k
-        with 4).
+        steps better (medium7x7a, an earlier guide, after 7,500 updates: 1.9, 1.5 and 1.4 nats on unseen steps with 2,
+        3 and 4 layers of 256), but an update of 4 takes twice the time of 2, and no student with 4 was seen to walk
+        better.
     """
 
     simulations: Count = 32
@@ -108,6 +108,10 @@ class GuidedRun(Run):
         rng = np.random.default_rng([config.seed, 0xB0FF])
         owed, next_evaluation, updates, loss = 0.0, config.evaluate_every, 0, 0.0
         if saved:
+            if saved["guide"] != self.guide.digest:
+                raise DmcvbError(
+                    f"{self.folder} learned from another guide than the one that is here now; choose another --out"
+                )
             student.load_state_dict(saved["student"])
             optimizer.load_state_dict(saved["optimizer"])
             torch.set_rng_state(saved["torch_rng"])
@@ -127,6 +131,7 @@ class GuidedRun(Run):
             buffer.flush()
             self.save(
                 {
+                    "guide": self.guide.digest,
                     "student": student.state_dict(),
                     "optimizer": optimizer.state_dict(),
                     "torch_rng": torch.get_rng_state(),

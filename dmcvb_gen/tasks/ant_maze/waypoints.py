@@ -57,8 +57,8 @@ def headings(layout: Layout, positions: np.ndarray, goals: np.ndarray, ahead: fl
     """Where to head for, seen from the ant.
 
     It is the point `ahead` meters down the way, pushed away from a wall that is nearer than `CLEARANCE`: an ant that
-    leans on a corner would stay there. On 100 episodes of medium7x7b a guide without that push returned -127 and
-    reached the goal in 97 %, with it -78 and 100 %.
+    leans on a corner would stay there. On the same 100 episodes of medium7x7b a first guide, 3 m ahead and without that
+    push, returned -127 and reached the goal in 97 %; this one -82 and 99 %.
 
     Args:
       positions: (n, 2) x and y of the ants, meters; one in a wall counts as on the nearest floor.
