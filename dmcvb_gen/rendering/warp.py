@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from importlib import metadata
 from typing import Any
 
+import mujoco
 import numpy as np
 from PIL import Image
 
@@ -130,6 +131,9 @@ class WarpRenderer(Renderer):
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(mjm)
             self._textures = [self._texture(i) for i in range(mjm.ntex)]
+            self._geom_size = self._model.geom_size
+            halved = np.where((mjm.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[:, None], 0.5, 1.0) * mjm.geom_size
+            self._tight_size = wp.array(halved[None].astype(np.float32), dtype=wp.vec3)
         self._floor_materials = np.unique(mjm.geom_matid[mjm.geom_type == 0])
         self._floor_materials = self._floor_materials[self._floor_materials >= 0]
 
@@ -172,11 +176,13 @@ class WarpRenderer(Renderer):
                     render_rgb=True,
                     render_depth=labels,
                     render_seg=labels,
+                    use_textures=False,  # else it uploads all of them in full size, for each context; see _set_sky
                     use_fast_math=False,
                     use_shadows=True,
                     render_skybox=True,
                     shadow_light_fraction=0.0,
                 )
+                context.use_textures = True
                 context.ray.assign(self._rays(float(self.task.model.cam_fovy[camera])))
             self._contexts[key] = context
         return self._contexts[key]
@@ -267,7 +273,10 @@ class WarpRenderer(Renderer):
             self._model.geom_rgba = wp.array(self._geom_rgba(hide_goal), dtype=wp.vec4)
             self._model.geom_matid = wp.array(self._geom_matid(exogenous.style), dtype=int)
             self._set_sky(context, exogenous, worlds)
+            # The tracer's boxes around planes are twice as wide as the planes; tight ones are missed by more rays.
+            self._model.geom_size = self._tight_size
             mjw.refit_bvh(self._model, data, context)
+            self._model.geom_size = self._geom_size
             mjw.render(self._model, data, context)
             picture = self._read(context, count)
             depth = segmentation = None
