@@ -88,11 +88,19 @@ def assert_same_run(first, second, buffer=True):
 
 @pytest.mark.parametrize("algorithm", TINY)
 def test_a_stopped_and_resumed_run_is_an_uninterrupted_one_to_the_bit(tmp_path, algorithm):
-    fields = dict(algorithm=algorithm, every=160 if algorithm == "guided" else 40)  # mazes: long evaluations
+    fields = dict(algorithm=algorithm, every=80 if algorithm == "guided" else 40)  # mazes: long evaluations
     whole = train(tmp_path / "whole", **fields)
     train(tmp_path / "parts", **fields, steps=80)
     np.random.seed(99), torch.manual_seed(99)  # nothing may come from what this process did before
     assert_same_run(whole, train(tmp_path / "parts", True, **fields))
+
+
+def test_what_is_learned_does_not_depend_on_how_often_it_is_evaluated(tmp_path):
+    often, once = (train(tmp_path / str(every), every=every) for every in (40, 1000))
+    names = [sorted(int(path.stem) for path in (run.folder / "checkpoints").iterdir()) for run in (often, once)]
+    assert names == [[40, 80, 120, 160], [160]]  # the last step always has one
+    one, other = (load_policy(run.folder / "checkpoints" / "0000000160.safetensors") for run in (often, once))
+    assert all(torch.equal(value, other.weights[key]) for key, value in one.weights.items())
 
 
 def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):

@@ -168,9 +168,11 @@ class GuidedRun(Run):
                 owed -= 1
                 updates += 1
             tick(settings.simulations)
-            if self.step >= next_evaluation:
+            due = self.step >= next_evaluation
+            if due or self.step >= self.config.steps:
                 progress = self.record(student.state_dict(), updates, {"divergence": float(loss)}, report)
-                next_evaluation = self.next_evaluation(progress.evaluation)
+                if due:
+                    next_evaluation = self.next_evaluation(progress.evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
                     last_saved = self._started

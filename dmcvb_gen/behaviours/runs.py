@@ -231,9 +231,10 @@ class Run(abc.ABC):
         self.seconds += time.time() - self._started
         header = self.header.model_copy(update={"agent_step": self.step})
         weights = {name: value.detach().clone() for name, value in weights.items()}
-        actor = Actor(header)
-        actor.load_state_dict(weights)
-        evaluation, _ = evaluate(Policy(header, actor, ""), self.task, EVALUATION_EPISODES, seed=self.step)
+        with torch.random.fork_rng(devices=()):  # learning goes on as if it had not been looked at
+            actor = Actor(header)
+            actor.load_state_dict(weights)
+            evaluation, _ = evaluate(Policy(header, actor, ""), self.task, EVALUATION_EPISODES, seed=self.step)
         trained = header.training | {"seconds": round(self.seconds, 1)}
         header = header.model_copy(update={"evaluation": evaluation, "training": trained})
         save_policy(self._checkpoint(self.step), header, weights)

@@ -190,9 +190,11 @@ class SacRun(Run):
                     learner.update(buffer.sample(rng, settings.batch_size))
                     owed -= 1
             tick(settings.simulations)
-            if self.step >= next_evaluation:
+            due = self.step >= next_evaluation
+            if due or self.step >= self.config.steps:
                 progress = self.record(learner.actor.state_dict(), learner.updates, learner.metrics(), report)
-                next_evaluation = self.next_evaluation(progress.evaluation)
+                if due:
+                    next_evaluation = self.next_evaluation(progress.evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
                     last_saved = self._started
