@@ -108,6 +108,20 @@ def test_the_critics_fit_a_known_value():
     assert (values - 0.5 * batch["reward"]).abs().mean() < 0.05
 
 
+def test_a_sharpened_policy_is_paid_less_for_its_entropy():
+    entropies, temperatures = [], []
+    for sharpen_after in (0, 10):
+        settings = dict(target_entropy_scale=-0.5, sharp_entropy_scale=4.0, learning_rate=3e-3)
+        sac, batch = learner(sharpen_after=sharpen_after, **settings), batch_of()
+        for step in range(600):
+            sac.sharpen(step)
+            assert sac.target_entropy == (-8.0 if sharpen_after and step >= sharpen_after else 1.0)  # two actions
+            sac.update(batch)
+        entropies.append(sac.metrics()["entropy"])
+        temperatures.append(sac.metrics()["temperature"])
+    assert temperatures[1] < 0.7 * temperatures[0] and entropies[1] < entropies[0]
+
+
 def test_running_statistics_are_those_of_all_values():
     rng, norm, seen = np.random.default_rng(0), RunningNorm(3), []
     for count in (1, 7, 100, 30):

@@ -31,6 +31,9 @@ class SacSettings:
       warmup_steps: agent steps of uniform random actions before the first update.
       actor_every: an actor update every so many critic updates.
       target_entropy_scale: the target entropy is minus this times the action size.
+      sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` (0: never). A policy
+        that explores loses return to its own noise; sharpened at the end of a run it gets most of that back.
+      sharp_entropy_scale: see `sharpen_after`.
       reward_scale: multiplies rewards before learning.
       shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
       progress: mazes: weight of the meters of shortest path covered in a step, added to the training reward (never to
@@ -57,6 +60,8 @@ class SacSettings:
     warmup_steps: Natural = 5000
     actor_every: Count = 2
     target_entropy_scale: float = 0.5
+    sharpen_after: Natural = 0
+    sharp_entropy_scale: float = 1.5
     initial_temperature: Positive = 0.1
     reward_scale: Positive = 0.5
     shaping: NonNegative = 0.0
@@ -206,6 +211,7 @@ class Sac:
         self.target.requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
         self.target_entropy = -settings.target_entropy_scale * action
+        self._sharp_entropy = -settings.sharp_entropy_scale * action
         rate = settings.learning_rate
         decay = {"weight_decay": settings.weight_decay, "fused": True}
         self.actor_optimizer = torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay)
@@ -218,6 +224,11 @@ class Sac:
         if settings.compile:
             self._critic_loss = torch.compile(self.critic_loss)
             self._actor_loss = torch.compile(self.actor_loss)
+
+    def sharpen(self, step: int) -> None:
+        """Aim at the lower entropy from the agent step on that the settings name."""
+        if self.settings.sharpen_after and step >= self.settings.sharpen_after:
+            self.target_entropy = self._sharp_entropy
 
     def sync_norm(self) -> None:
         """Put the running statistics into the actor, where every network reads them."""

@@ -184,6 +184,7 @@ class SacRun(Run):
             self.step += settings.simulations
             state = episodes.restart_ended(result.state, result.terminated)
             learner.sync_norm()
+            learner.sharpen(self.step)
             if len(buffer) >= settings.warmup_steps:
                 owed += settings.updates_per_step * settings.simulations
                 while owed >= 1:
