@@ -47,6 +47,15 @@ def test_a_repainted_subset_has_the_bytes_of_a_rolled_out_one(small_release, dyn
     assert digests[0] == digests[1]
 
 
+def test_two_processes_paint_the_same_bytes_as_one(small_release, dynamic, tmp_path):
+    ticks = []
+    repaint(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic", workers=2, tick=ticks.append)
+    name = "walker-walk/random/dynamic"
+    assert len(list((dynamic / "commits").rglob("*.json"))) > 1  # else one process does it all
+    assert shard_bytes(tmp_path / "r", name) == shard_bytes(dynamic, name) != {}
+    assert len(ticks) > 1
+
+
 def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dynamic, small_release):
     assert verify(dynamic).sound and check(dynamic, episodes=(2, 3)).sound
     manifest = open_release(dynamic).manifest

@@ -302,11 +302,12 @@ def _curves(good, facts: dict[str, Any]) -> Figure:
     groups: dict[tuple, list] = {}
     for cell, result in good:
         groups.setdefault((cell.benchmark, cell.task, cell.policy_label, cell.setting), []).append((cell, result))
+    agents = list(dict.fromkeys(cell.agent.name for cell, _ in good))
     figure = Figure(figsize=(11, 2.8 * len(groups)), layout="constrained")
     for line, (key, members) in enumerate(groups.items()):
         loss, score = figure.add_subplot(len(groups), 2, 2 * line + 1), figure.add_subplot(len(groups), 2, 2 * line + 2)
-        for index, (cell, result) in enumerate(members):
-            color, curve = f"C{index}", result["curve"]
+        for cell, result in members:
+            color, curve = f"C{agents.index(cell.agent.name)}", result["curve"]
             for name, style in (("loss", ":"), ("test_loss", "-")):
                 points = [(point["step"], point[name]) for point in curve if name in point]
                 if points:
