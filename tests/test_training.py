@@ -122,6 +122,18 @@ def test_a_sharpened_policy_is_paid_less_for_its_entropy():
     assert temperatures[1] < 0.7 * temperatures[0] and entropies[1] < entropies[0]
 
 
+def test_a_sharpened_learner_takes_smaller_steps():
+    sac = learner(sharpen_after=10, sharp_learning_rate=1e-5)
+    sac.sharpen(9)
+    assert sac.critic_optimizer.param_groups[0]["lr"] > 1e-4
+    sac.sharpen(10)
+    optimizers = (sac.actor_optimizer, sac.critic_optimizer, sac.alpha_optimizer)
+    assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == [1e-5] * 3
+    before = sac.critic.head.clone()
+    sac.update(batch_of())
+    assert 0 < (sac.critic.head - before).abs().max() < 1.1e-5  # Adam's first step is the learning rate
+
+
 def test_running_statistics_are_those_of_all_values():
     rng, norm, seen = np.random.default_rng(0), RunningNorm(3), []
     for count in (1, 7, 100, 30):

@@ -31,9 +31,11 @@ class SacSettings:
       warmup_steps: agent steps of uniform random actions before the first update.
       actor_every: an actor update every so many critic updates.
       target_entropy_scale: the target entropy is minus this times the action size.
-      sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` (0: never). A policy
-        that explores loses return to its own noise; sharpened at the end of a run it gets most of that back.
+      sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` and the learning rate
+        `sharp_learning_rate` (0: never). A policy that explores loses return to its own noise, one that learns fast
+        swings from checkpoint to checkpoint; the end of a run can do without both.
       sharp_entropy_scale: see `sharpen_after`.
+      sharp_learning_rate: see `sharpen_after`; 0: as before.
       reward_scale: multiplies rewards before learning.
       shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
       progress: mazes: weight of the meters of shortest path covered in a step, added to the training reward (never to
@@ -62,6 +64,7 @@ class SacSettings:
     target_entropy_scale: float = 0.5
     sharpen_after: Natural = 0
     sharp_entropy_scale: float = 1.5
+    sharp_learning_rate: NonNegative = 0.0
     initial_temperature: Positive = 0.1
     reward_scale: Positive = 0.5
     shaping: NonNegative = 0.0
@@ -226,9 +229,14 @@ class Sac:
             self._actor_loss = torch.compile(self.actor_loss)
 
     def sharpen(self, step: int) -> None:
-        """Aim at the lower entropy from the agent step on that the settings name."""
-        if self.settings.sharpen_after and step >= self.settings.sharpen_after:
-            self.target_entropy = self._sharp_entropy
+        """Aim at the lower entropy, by smaller steps, from the agent step on that the settings name."""
+        settings = self.settings
+        if not settings.sharpen_after or step < settings.sharpen_after:
+            return
+        self.target_entropy = self._sharp_entropy
+        for optimizer in (self.actor_optimizer, self.critic_optimizer, self.alpha_optimizer):
+            for group in optimizer.param_groups:
+                group["lr"] = settings.sharp_learning_rate or group["lr"]
 
     def sync_norm(self) -> None:
         """Put the running statistics into the actor, where every network reads them."""
