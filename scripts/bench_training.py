@@ -2,6 +2,7 @@
 
     python scripts/bench_training.py --limit 3600
     python scripts/bench_training.py --limit 3600 --peer-times 4          # stop the peer after four times ours
+    python scripts/bench_training.py --recipes sac sb3-sac tqc --limit 900  # which --algo is soonest at 95 %?
     python scripts/bench_training.py --limit 3 --every 400 --episodes 2     # does it run?
 
 The peer is Stable-Baselines3's SAC with its own settings on one dm_control environment at action repeat 2. One
@@ -95,25 +96,39 @@ class Enough(Exception):
     """Ours got there, or ran out of time."""
 
 
-def ours(goal: float, limit: float, seed: int, every: int, episodes: int) -> tuple[float, bool]:
-    """Training seconds, and whether the goal was reached."""
-    last = []
+def ours(
+    goal: float, limit: float, seed: int, every: int, episodes: int, algorithm: str = "sac"
+) -> tuple[float, bool, int]:
+    """Training seconds, whether the goal was reached, and agent steps."""
+    last, name = [], "ours" if algorithm == "sac" else algorithm
 
     def report(progress):
-        last[:] = [progress.seconds, progress.evaluation.mean >= goal]
-        print(f"  ours  {progress.step:>8,} steps  {last[0]:7.0f} s  return {progress.evaluation.mean:.0f}", flush=True)
+        last[:] = [progress.seconds, progress.evaluation.mean >= goal, progress.step]
+        print(
+            f"  {name:7} {progress.step:>8,} steps  {last[0]:7.0f} s  return {progress.evaluation.mean:.0f}", flush=True
+        )
         if last[1] or last[0] >= limit:
             raise Enough
 
     with tempfile.TemporaryDirectory() as folder:
         runs.EVALUATION_EPISODES = episodes
-        settings = default_run(TASK)["settings"]
-        config = RunConfig(TASK, "sac", 2_000_000, seed, settings, evaluate_every=every, evaluate_sparse=every)
+        settings = default_run(TASK, algorithm)["settings"]
+        config = RunConfig(TASK, algorithm, 2_000_000, seed, settings, evaluate_every=every, evaluate_sparse=every)
         try:
             open_run(Path(folder) / "run", config, resume=False).train(report)
         except Enough:
             pass
-    return last[0], last[1]
+    return last[0], last[1], last[2]
+
+
+def compare(arguments: argparse.Namespace) -> None:
+    """Seconds of each algorithm, with its default settings, until 95 % of the paper's expert return."""
+    goal = 0.95 * paper_returns(TASK, "expert")["mean"]
+    print(f"{TASK}: seconds of training to a return of {goal:.0f}, one thread")
+    sizes = arguments.limit, arguments.seed, arguments.every, arguments.episodes
+    results = {algorithm: ours(goal, *sizes, algorithm) for algorithm in arguments.recipes}
+    for algorithm, (seconds, reached, steps) in results.items():
+        print(f"{algorithm}: {seconds:.0f} s, {steps:,} agent steps" + ("" if reached else " (not reached)"))
 
 
 def main() -> None:
@@ -123,11 +138,14 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=2_000, help="agent steps between evaluations")
     parser.add_argument("--episodes", type=int, default=20, help="episodes of an evaluation")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--recipes", nargs="+", help="compare these of train-behaviour's algorithms, to 95 %%, instead")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.recipes:
+        return compare(arguments)
     goal = 0.9 * paper_returns(TASK, "expert")["mean"]
     print(f"{TASK}: seconds of training to a return of {goal:.0f}, one thread")
-    mine, reached = ours(goal, arguments.limit, arguments.seed, arguments.every, arguments.episodes)
+    mine, reached, _ = ours(goal, arguments.limit, arguments.seed, arguments.every, arguments.episodes)
     limit = min(arguments.limit, mine * (arguments.peer_times or np.inf))
     callback = UntilReturn(goal, limit, arguments.every, arguments.episodes)
     SAC("MlpPolicy", SuiteEnv(arguments.seed), seed=arguments.seed, device="cpu").learn(2_000_000, callback=callback)
