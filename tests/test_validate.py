@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -240,3 +245,22 @@ def test_returns_unlike_the_papers_are_a_warning(release, small_release):
     subset.__dict__["returns"] = np.array([400.0, 402.0])
     [finding] = check_paper_returns(subset)
     assert finding.check == "paper" and "the paper's is 957.8" in finding.message
+
+
+@pytest.mark.slow
+def test_a_stopped_validation_takes_its_workers_with_it(small_release, tmp_path):
+    command = [sys.executable, "-m", "dmcvb_gen", "validate", str(small_release), "--profile", "quick"]
+    command += ["--agents", "bc", "--train-unsound", "--workers", "2", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    children, deadline = Path(f"/proc/{process.pid}/task/{process.pid}/children"), time.time() + 240
+    while len(started := children.read_text().split()) < 3 and time.time() < deadline:  # two, and Python's tracker
+        assert process.poll() is None, "it ended by itself"
+        time.sleep(0.1)
+    assert len(started) == 3
+    time.sleep(5)  # they are at work
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 1
+    deadline = time.time() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in started) and time.time() < deadline:
+        time.sleep(0.1)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in started)

@@ -19,8 +19,8 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -377,7 +377,7 @@ def _save_sheet(path: Path, rows: Sequence[np.ndarray]) -> None:
 def run_cells(
     setup: Setup, cells: Sequence[Cell], workers: int = 1, tick: Tick = lambda what, steps: None
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Results of cells as they come: encoders first, each once, then the cells.
+    """Results of cells as they come; encoders are trained first, each once, the cells that need none beside them.
 
     A cell that cannot be run has a result of {"error": message}; the others go on.
 
@@ -395,19 +395,26 @@ def run_cells(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(setup.threads,))
     try:
-        waiting = {pool.submit(_try, run_pretraining, setup, work): work for work in encoders}
-        failed = {}
-        for future in as_completed(waiting):
-            tick(f"encoder {waiting[future].id}", setup.profile.pretrain_steps)
-            if "error" in future.result():
-                failed[waiting[future]] = future.result()["error"]
-        todo = [cell for cell in cells if pretraining_of(cell) not in failed]
-        yield from ((cell, {"error": failed[pretraining_of(cell)]}) for cell in cells if cell not in todo)
-        running = {pool.submit(_try, run_cell, setup, cell): cell for cell in todo}
-        for future in as_completed(running):
-            cell = running[future]
-            tick(cell.id, policy_steps(setup.profile, cell.agent))
-            yield cell, future.result()
+        running: dict[Future, Pretraining | Cell] = {}
+
+        def submit(members: Iterable[Cell]) -> None:
+            running.update({pool.submit(_try, run_cell, setup, cell): cell for cell in members})
+
+        running.update({pool.submit(_try, run_pretraining, setup, work): work for work in encoders})
+        submit(cell for cell in cells if pretraining_of(cell) is None)
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                item, result = running.pop(future), future.result()
+                if isinstance(item, Cell):
+                    tick(item.id, policy_steps(setup.profile, item.agent))
+                    yield item, result
+                    continue
+                tick(f"encoder {item.id}", setup.profile.pretrain_steps)
+                after = [cell for cell in cells if pretraining_of(cell) == item]
+                if "error" in result:
+                    yield from ((cell, {"error": result["error"]}) for cell in after)
+                else:
+                    submit(after)
     except BrokenProcessPool:
         raise DmcvbError(
             "a worker process was killed (out of memory?); finished cells are kept: run the same command again with "

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
+import threading
 
 import click
 
@@ -66,6 +68,18 @@ def main():
     dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8 --out releases/demo
     dmcvb-gen preview releases/demo
     """
+    _stop_on_sigterm(click.get_current_context())
+
+
+def _stop_on_sigterm(context: click.Context) -> None:
+    """SIGTERM ends a command as Ctrl-C does: its workers stop with it, what is finished stays."""
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGTERM, stop)
+        context.call_on_close(lambda: signal.signal(signal.SIGTERM, before))
 
 
 if __name__ == "__main__":

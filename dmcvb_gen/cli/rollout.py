@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import signal
+import contextlib
 import time
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def rollout(tasks, recipe, only, episode_range, out, workers, executor, device, 
         return _show_plan(plan, estimate(plan), workers, as_json)
     prepared = prepare(plan, raw_bytes(plan))
     started, steps, seconds = time.time(), 0, {}
-    with _stop_on_sigterm(), _progress(prepared, as_json) as bar:
+    with _told_when_stopped(), _progress(prepared, as_json) as bar:
         finished = 0
         for result in run_jobs(prepared.jobs, workers, bar.update, executor):
             finished += sum(commit.episodes[1] - commit.episodes[0] for commit in result.commits)
@@ -188,17 +188,13 @@ def _progress(plan, as_json):
     )
 
 
-class _stop_on_sigterm:
-    """SIGTERM ends a rollout as Ctrl-C does: workers stop, what is committed stays."""
-
-    def __enter__(self):
-        self._before = signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-
-    def __exit__(self, kind, *_):
-        signal.signal(signal.SIGTERM, self._before)
-        if kind is KeyboardInterrupt:
-            click.echo("\nstopped; what was committed is safe, the same command goes on from there", err=True)
-        return False
+@contextlib.contextmanager
+def _told_when_stopped():
+    try:
+        yield
+    except KeyboardInterrupt:
+        click.echo("\nstopped; what was committed is safe, the same command goes on from there", err=True)
+        raise
 
 
 def _show_plan(plan, cost, workers, as_json):
