@@ -252,6 +252,19 @@ def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path
     assert "--dino-weights" in results["dino+bc"]["error"] and results["state-bc"]["score"]["mean"] >= 0
 
 
+def test_processes_train_each_encoder_before_its_cells(small_release, tmp_path):
+    cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc", "id+bc"])[0]]
+    cells = [c for c in cells if c.setting in ("none", "static") and c.policy_label == cells[0].policy_label]
+    done = []
+    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+    results = {cell: result for cell, result in run_cells(setup, cells, 2, lambda what, steps: done.append(what))}
+    assert results.keys() == set(cells) and not any("error" in result for result in results.values())
+    encoders = {pretraining_of(cell).id: cell for cell in cells if cell.agent.pretrain}
+    assert len(encoders) == 2
+    for name, cell in encoders.items():
+        assert done.index(f"encoder {name}") < done.index(cell.id)
+
+
 def test_a_result_of_another_seed_or_profile_is_not_taken_for_this_one(small_release, tmp_path):
     cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
     made = []
