@@ -72,8 +72,8 @@ PROFILES = {
         # Sized so that BC, BC(state) and ID+BC on one subset take under an hour on two cores. For so short a training
         # small batches and a falling rate pay: after 175 s of one CPU, BC's loss on walker expert was 0.048 with 4,000
         # batches of 16 and 0.053 with 1,000 of 64; 5,500 of 64 at a constant rate had returned 517. On walker expert,
-        # none, 100 episodes, one thread each: BC 31 min (return 708 +- 72), ID and BC on its encoder 28 (571 +- 56; with
-        # 10,000 steps of each it was 104), BC(state) 1.3 (948 +- 6, all of the data's mean).
+        # none, 100 episodes, one thread each: BC 31 min (return 708 +- 72), ID and BC on its encoder 28 (571 +- 56; 104
+        # with 10,000 steps of each), BC(state) 1.3 (948 +- 6, all of the data's mean).
         Profile(
             "quick",
             pixel_steps=40_000,
