@@ -168,11 +168,9 @@ class GuidedRun(Run):
                 owed -= 1
                 updates += 1
             tick(settings.simulations)
-            due = self.step >= next_evaluation
-            if due or self.step >= self.config.steps:
+            if self.step >= min(next_evaluation, self.config.steps):
                 progress = self.record(student.state_dict(), updates, {"divergence": float(loss)}, report)
-                if due:
-                    next_evaluation = self.next_evaluation(progress.evaluation)
+                next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
                     last_saved = self._started

@@ -245,8 +245,10 @@ class Run(abc.ABC):
         self._started = time.time()
         return progress
 
-    def next_evaluation(self, evaluation: Evaluation) -> int:
-        """The agent step of the evaluation after this one."""
+    def next_evaluation(self, evaluation: Evaluation, planned: int) -> int:
+        """The agent step of the evaluation after this one: the planned one, where the run ended before it."""
+        if self.step < planned:
+            return planned
         config, expert = self.config, paper_returns(self.task.id, "expert")
         dense = expert is None or evaluation.mean < self._base + DENSE_SHARE * (expert["mean"] - self._base)
         return self.step + (config.evaluate_every if dense else config.evaluate_sparse)

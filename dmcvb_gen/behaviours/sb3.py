@@ -101,13 +101,11 @@ class Sb3Run(Run):
             steps = min(next_evaluation, config.steps) - self.step
             model.learn(steps, callback=_Ticker(tick), log_interval=None, reset_num_timesteps=False)
             self.step = model.num_timesteps
-            due = self.step >= next_evaluation
-            if due or self.step >= self.config.steps:
+            if self.step >= min(next_evaluation, self.config.steps):
                 progress = self.record(
                     self._actor_weights(model, normalize), model._n_updates, self._metrics(model), report
                 )
-                if due:
-                    next_evaluation = self.next_evaluation(progress.evaluation)
+                next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
                     last_saved = self._started

@@ -191,11 +191,9 @@ class SacRun(Run):
                     learner.update(buffer.sample(rng, settings.batch_size))
                     owed -= 1
             tick(settings.simulations)
-            due = self.step >= next_evaluation
-            if due or self.step >= self.config.steps:
+            if self.step >= min(next_evaluation, self.config.steps):
                 progress = self.record(learner.actor.state_dict(), learner.updates, learner.metrics(), report)
-                if due:
-                    next_evaluation = self.next_evaluation(progress.evaluation)
+                next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
                     last_saved = self._started
