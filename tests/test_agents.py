@@ -24,6 +24,8 @@ from dmcvb_gen.agents.learners import (
 )
 from dmcvb_gen.agents.networks import (
     MLP,
+    PAPER,
+    Architecture,
     Convolutions,
     ObservationDecoder,
     observation_encoder,
@@ -91,6 +93,15 @@ def test_the_decoder_is_the_encoder_in_reverse():
     kernels = 256 * 128 * 9 + 128 + 128 * 64 * 9 + 64 + 64 * 32 * 9 + 32 + 32 * 9 * 9 + 9
     assert parameters(decoder) == 64 * 65_536 + 65_536 + kernels
     assert decoder(torch.zeros(2, 64)).shape == (2, 9, 64, 64)
+
+
+@pytest.mark.parametrize("size", [16, 47, 50, 64])
+@pytest.mark.parametrize("architecture", [PAPER, Architecture((4, 8, 8, 16), (2, 2, 2, 1))])
+def test_pictures_of_any_size_are_encoded_and_decoded_to_that_size(size, architecture):
+    encoder = observation_encoder(9, size, architecture)
+    pictures = torch.zeros(1, 9, size, size)
+    assert encoder.body(pictures).shape == (1, encoder.body.features)
+    assert ObservationDecoder(9, size, architecture=architecture)(encoder(pictures)).shape == pictures.shape
 
 
 def test_state_networks_and_heads_have_the_papers_sizes():

@@ -25,7 +25,7 @@ from dmcvb_gen.agents.learners import (
     Policy,
     StatePrediction,
 )
-from dmcvb_gen.agents.networks import Convolutions, Encoder, observation_encoder, state_encoder
+from dmcvb_gen.agents.networks import PAPER, Architecture, Convolutions, Encoder, observation_encoder, state_encoder
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
 PRETRAIN = ("id", "lfd", "ae", "state", "dino", "bc")
@@ -106,7 +106,9 @@ def parse_agent(name: str) -> Agent:
     return Agent(policy, pretrain if plus else None, **values)
 
 
-def make_encoder(agent: Agent, data: TrainingData, dino_weights: str | Path | None = None) -> nn.Module:
+def make_encoder(
+    agent: Agent, data: TrainingData, dino_weights: str | Path | None = None, architecture: Architecture = PAPER
+) -> nn.Module:
     """phi of an agent, untrained (or DINO's).
 
     Raises:
@@ -116,23 +118,23 @@ def make_encoder(agent: Agent, data: TrainingData, dino_weights: str | Path | No
         return state_encoder(data.state.shape[1])
     if agent.pretrain == "dino":
         return load_dino(dino_weights, data.channels)
-    return observation_encoder(data.channels, data.frames.size)
+    return observation_encoder(data.channels, data.frames.size, architecture)
 
 
-def make_pretrainer(agent: Agent, encoder: Encoder, data: TrainingData) -> Learner:
+def make_pretrainer(agent: Agent, encoder: Encoder, data: TrainingData, architecture: Architecture = PAPER) -> Learner:
     """What pre-trains phi."""
     actions, states = data.action.shape[1], data.state.shape[1]
     makers = {
         "id": lambda: InverseDynamics(encoder, actions, agent.k, agent.sample_k),
         "lfd": lambda: LatentForwardDynamics(encoder, actions),
-        "ae": lambda: Autoencoder(encoder, data.channels, data.frames.size),
+        "ae": lambda: Autoencoder(encoder, data.channels, data.frames.size, architecture),
         "state": lambda: StatePrediction(encoder, states),
         "bc": lambda: BehaviorCloning(encoder, actions),
     }
     return makers[agent.pretrain]()
 
 
-def make_policy(agent: Agent, encoder: nn.Module, data: TrainingData) -> Policy:
+def make_policy(agent: Agent, encoder: nn.Module, data: TrainingData, architecture: Architecture = PAPER) -> Policy:
     """What learns the policy, on the pre-trained encoder (frozen) or with one of its own."""
     actions, frozen = data.action.shape[1], agent.pretrain is not None
     if agent.policy == "bc":
@@ -141,5 +143,5 @@ def make_policy(agent: Agent, encoder: nn.Module, data: TrainingData) -> Policy:
         return TD3BC(encoder, encoder.features, actions, frozen=True)
     if agent.sees_state:
         return TD3BC(nn.Identity(), data.state.shape[1], actions)
-    body = Convolutions(data.channels, data.frames.size)
+    body = Convolutions(data.channels, data.frames.size, architecture)
     return TD3BC(body, body.features, actions)

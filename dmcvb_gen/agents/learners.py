@@ -16,7 +16,17 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from dmcvb_gen.agents.networks import LATENT, MLP, Encoder, ObservationDecoder, Trunk, initialize, state_decoder
+from dmcvb_gen.agents.networks import (
+    LATENT,
+    MLP,
+    PAPER,
+    Architecture,
+    Encoder,
+    ObservationDecoder,
+    Trunk,
+    initialize,
+    state_decoder,
+)
 
 EMA_DECAY = 0.99
 """Of LFD's target encoder and TD3-BC's target networks."""
@@ -175,9 +185,16 @@ class LatentForwardDynamics(Learner):
 class Autoencoder(Learner):
     """AE: || psi(phi(o)) - o ||^2."""
 
-    def __init__(self, encoder: Encoder, channels: int, size: int = 64, lr=LEARNING_RATE):
+    def __init__(
+        self,
+        encoder: Encoder,
+        channels: int,
+        size: int = 64,
+        architecture: Architecture = PAPER,
+        lr=LEARNING_RATE,
+    ):
         super().__init__()
-        self.encoder, self.decoder = encoder, ObservationDecoder(channels, size)
+        self.encoder, self.decoder = encoder, ObservationDecoder(channels, size, LATENT, architecture)
         self.optimizers = {"main": adam([self], lr)}
 
     def losses(self, batch):
@@ -357,10 +374,17 @@ class TD3BC(Policy):
 class ObservationReadout(Learner):
     """|| psi(phi(o)) - o ||^2 over psi, phi frozen."""
 
-    def __init__(self, encoder: nn.Module, channels: int, size: int = 64, lr=LEARNING_RATE):
+    def __init__(
+        self,
+        encoder: nn.Module,
+        channels: int,
+        size: int = 64,
+        architecture: Architecture = PAPER,
+        lr=LEARNING_RATE,
+    ):
         super().__init__()
         self.encoder = encoder.requires_grad_(False)
-        self.decoder = ObservationDecoder(channels, size, encoder.features)
+        self.decoder = ObservationDecoder(channels, size, encoder.features, architecture)
         self.optimizers = {"main": adam([self.decoder], lr)}
 
     def reconstruct(self, observation: torch.Tensor) -> torch.Tensor:

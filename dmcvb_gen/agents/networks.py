@@ -7,18 +7,38 @@ Sizes are those of the paper's appendix "Architecture and hyperparameters". Fram
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import nn
 
 LATENT = 64
 """Width of every encoder's output."""
-CHANNELS, STRIDES = (32, 64, 128, 256), (2, 2, 1, 1)
-"""Of the encoder's four 3x3 convolutions; 64 x 64 pictures become 16 x 16 x 256 = 65,536 features."""
-DECODER_CHANNELS, DECODER_STRIDES = (128, 64, 32), (1, 1, 2, 2)
 HIDDEN = (256, 256)
 """Hidden layers of every MLP."""
-DOWNSCALE = 4
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The 3x3 convolutions of an encoder; its decoder has the same ones in reverse.
+
+    Attributes:
+      channels: of each convolution's output. strides: of each.
+    """
+
+    channels: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def sizes(self, size: int) -> tuple[int, ...]:
+        """Pixels a side before the first convolution and after each: (64, 32, 16, 16, 16)."""
+        found = [size]
+        for stride in self.strides:
+            found.append(-(-found[-1] // stride))
+        return tuple(found)
+
+
+PAPER = Architecture((32, 64, 128, 256), (2, 2, 1, 1))
+"""The paper's: 64 x 64 pictures become 16 x 16 x 256 = 65,536 features, and 0.2 GFLOP a stack of 9 channels."""
 
 
 def initialize(module: nn.Module) -> nn.Module:
@@ -41,18 +61,16 @@ class Trunk(nn.Sequential):
 
 
 class Convolutions(nn.Sequential):
-    """(batch, channel, size, size) -> (batch, 256 (size / 4)^2): four 3x3 convolutions with GELU, flattened."""
+    """(batch, channel, size, size) -> (batch, features): 3x3 convolutions with GELU, flattened."""
 
-    def __init__(self, channels: int, size: int = 64):
-        if size % DOWNSCALE:
-            raise ValueError(f"pictures of {size} pixels; the encoder needs a multiple of {DOWNSCALE}")
+    def __init__(self, channels: int, size: int = 64, architecture: Architecture = PAPER):
         layers: list[nn.Module] = []
         width = channels
-        for out, stride in zip(CHANNELS, STRIDES, strict=True):
+        for out, stride in zip(architecture.channels, architecture.strides, strict=True):
             layers += [nn.Conv2d(width, out, 3, stride, padding=1), nn.GELU()]
             width = out
         super().__init__(*layers, nn.Flatten())
-        self.features = width * (size // DOWNSCALE) ** 2
+        self.features = width * architecture.sizes(size)[-1] ** 2
         initialize(self)
 
 
@@ -73,9 +91,9 @@ class Encoder(nn.Module):
         return self.trunk(self.body(observation))
 
 
-def observation_encoder(channels: int, size: int = 64) -> Encoder:
+def observation_encoder(channels: int, size: int = 64, architecture: Architecture = PAPER) -> Encoder:
     """phi for frame stacks."""
-    body = Convolutions(channels, size)
+    body = Convolutions(channels, size, architecture)
     return Encoder(body, body.features)
 
 
@@ -99,14 +117,17 @@ class MLP(nn.Sequential):
 class ObservationDecoder(nn.Module):
     """psi: (batch, 64) -> (batch, channel, size, size), the encoder in reverse; no activation at the end."""
 
-    def __init__(self, channels: int, size: int = 64, features: int = LATENT):
+    def __init__(self, channels: int, size: int = 64, features: int = LATENT, architecture: Architecture = PAPER):
         super().__init__()
-        self.shape = (CHANNELS[-1], size // DOWNSCALE, size // DOWNSCALE)
-        self.linear = nn.Linear(features, CHANNELS[-1] * (size // DOWNSCALE) ** 2)
+        sizes, width = architecture.sizes(size)[::-1], architecture.channels[-1]
+        self.shape = (width, sizes[0], sizes[0])
+        self.linear = nn.Linear(features, width * sizes[0] ** 2)
         layers: list[nn.Module] = []
-        width = CHANNELS[-1]
-        for out, stride in zip((*DECODER_CHANNELS, channels), DECODER_STRIDES, strict=True):
-            layers += [nn.ConvTranspose2d(width, out, 3, stride, padding=1, output_padding=stride - 1), nn.GELU()]
+        wanted = (*architecture.channels[-2::-1], channels)
+        for index, (out, stride) in enumerate(zip(wanted, architecture.strides[::-1], strict=True)):
+            # Without output padding n pixels become stride (n - 1) + 1: what an odd size needs.
+            missing = sizes[index + 1] - (stride * (sizes[index] - 1) + 1)
+            layers += [nn.ConvTranspose2d(width, out, 3, stride, padding=1, output_padding=missing), nn.GELU()]
             width = out
         self.deconvolutions = nn.Sequential(*layers[:-1])
         initialize(self)
