@@ -14,8 +14,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous  # noqa: E402
-from dmcvb_gen.rendering import floor_alpha_for, make_renderer  # noqa: E402
+from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, make_exogenous  # noqa: E402
+from dmcvb_gen.rendering import make_renderer  # noqa: E402
 from dmcvb_gen.seeding import episode_stream  # noqa: E402
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task  # noqa: E402
 

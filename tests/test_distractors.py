@@ -12,9 +12,9 @@ from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exog
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.rendering.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
 
 STREAMS = ("camera", "color", "background", "style")
 DIFFICULTIES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous
+from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, make_exogenous
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.rendering import available_renderers, floor_alpha_for, make_renderer, warp
+from dmcvb_gen.rendering import available_renderers, make_renderer, warp
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task

@@ -26,6 +26,7 @@ from torch.utils.data import Dataset
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.store import Subset
+from dmcvb_gen.store.pictures import training_pictures
 
 FRAMES = 3
 """Frames an observation; the first one of an episode is repeated (paper, appendix "Encoders")."""
@@ -170,14 +171,8 @@ def stack_rows(row: torch.Tensor, start: torch.Tensor, frames: int) -> torch.Ten
 
 
 def training_views(subset: Subset) -> tuple[str, ...]:
-    """The picture arrays that agents see: the goal hidden where the setting hides it, never the overhead view."""
-    hidden = subset.task.startswith("ant-maze") and subset.setting != "visible"
-    root = "pixels_hidden_goal" if hidden else "pixels"
-    names = subset.pixel_arrays
-    if names == ("pixels",):
-        return names
-    order = ("top", "egocentric", "follow")
-    return tuple(f"{root}/{view}" for view in order if f"{root}/{view}" in names)
+    """The picture arrays that agents see (`store.pictures.training_pictures`); none where no pictures are stored."""
+    return training_pictures(subset).arrays if subset.pixel_arrays else ()
 
 
 class TrainingData(Dataset):

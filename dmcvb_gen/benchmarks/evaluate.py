@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from dmcvb_gen.agents.data import Normalization, normalize_pixels, training_views
+from dmcvb_gen.agents.data import Normalization, normalize_pixels
 from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.distractors import ExogenousWalk
 from dmcvb_gen.rollout.plan import renderer_for
 from dmcvb_gen.rollout.recipe import distractor_of
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store import Subset
+from dmcvb_gen.store.pictures import training_pictures
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 STREAM_NAME = "validate"
@@ -102,9 +103,8 @@ class Evaluator:
             self.renderer, self._videos = renderer_for(subset.record, source, "val", on)
             if hasattr(self.renderer, "worlds"):
                 self.renderer.worlds = episodes  # frames a launch: more would only be padding
-            arrays = training_views(subset)
-            self.hide_goal = arrays[0].startswith("pixels_hidden_goal")
-            self.views = [name.split("/")[1] for name in arrays] if "/" in arrays[0] else list(self.task.views)
+            pictures = training_pictures(subset)
+            self.hide_goal, self.views = pictures.hide_goal, list(pictures.views)
 
     def close(self) -> None:
         """Free the renderer."""

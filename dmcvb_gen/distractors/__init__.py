@@ -11,11 +11,12 @@ import numpy as np
 
 from dmcvb_gen.distractors.background import background_walk
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
-from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, Exogenous
+from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, floor_alpha_for
 from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at
 from dmcvb_gen.distractors.color import color_walk
-from dmcvb_gen.rendering.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
+from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
 
 TRAIN_STYLES, VAL_STYLES = (2, 3, 4, 5), (1,)
 """Maze styles of data and of evaluation (paper, section 3.1: unseen distractors)."""
@@ -128,8 +129,8 @@ __all__ = [
     "SCALES",
     "Backgrounds",
     "DistractorSetting",
-    "Exogenous",
     "ExogenousWalk",
+    "floor_alpha_for",
     "load_backgrounds",
     "make_exogenous",
 ]

@@ -1,13 +1,11 @@
-"""What varies in a picture and nowhere else: the setting's name, and the per-frame labels it expands to."""
+"""What varies in a picture and nowhere else: the setting's name in, its ranges and videos out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
-
-import numpy as np
+from dataclasses import dataclass
 
 from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.tasks.base import Task
 
 KINDS = ("none", "static", "dynamic")
 SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
@@ -49,40 +47,11 @@ class DistractorSetting:
         return cls(kind, difficulty or "medium")
 
 
-@dataclass(frozen=True)
-class Exogenous:
-    """Labels of the distractors, a row a frame; the leading shape is (frame,) or (episode, step).
+def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
+    """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
 
-    Pictures are painted from these very values, so a stored frame can be painted again from its labels.
-
-    Attributes:
-      camera_position: (..., view, 3) float32, world frame, meters.
-      camera_quaternion: (..., view, 4) float32, w x y z, MuJoCo's camera frame (looks along -z, y up).
-      material_rgb: (..., material, 3) float32 in [0, 1], the model's materials in their order.
-      background_video: (...,) int16, index of the video seen through the sky; -1: the model's own sky.
-      background_frame: (...,) int16, frame of that video; -1 with the model's own sky.
-      style: (...,) int16, visual look of a maze, its style * 100 + variant; -1: none.
+    1.0 for walker and cheetah, 0.3 otherwise (Distracting Control Suite); untouched without distractors.
     """
-
-    camera_position: np.ndarray
-    camera_quaternion: np.ndarray
-    material_rgb: np.ndarray
-    background_video: np.ndarray
-    background_frame: np.ndarray
-    style: np.ndarray
-
-    def __getitem__(self, index) -> Exogenous:
-        """Index the leading axes of all labels alike."""
-        return Exogenous(**{name: value[index] for name, value in self.items()})
-
-    def __len__(self) -> int:
-        return len(self.background_video)
-
-    def items(self) -> Iterator[tuple[str, np.ndarray]]:
-        for field in fields(self):
-            yield field.name, getattr(self, field.name)
-
-    def flat(self) -> Exogenous:
-        """With the leading (episode, step) axes made one frame axis."""
-        lead = self.background_video.ndim
-        return Exogenous(**{name: value.reshape(-1, *value.shape[lead:]) for name, value in self.items()})
+    if setting.kind == "none" or task.id in ("walker-walk", "cheetah-run"):
+        return 1.0
+    return 0.3

@@ -15,9 +15,10 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from dmcvb_gen.distractors import DistractorSetting, Exogenous, ExogenousWalk, load_backgrounds
+from dmcvb_gen.distractors import DistractorSetting, ExogenousWalk, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.rendering import floor_alpha_for, make_renderer
+from dmcvb_gen.labels import Exogenous
+from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.warp import WarpRenderer
 from dmcvb_gen.rollout.plan import check_renderer
 from dmcvb_gen.rollout.recipe import check_size, distractor_of, is_maze, normalize_setting

@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import DistractorSetting, Exogenous
+from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
+from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.release.regenerate import copy_policies
 from dmcvb_gen.release.shards import damage, policy_files, recipe_of, stream_names
 from dmcvb_gen.rendering.base import Renderer
@@ -29,7 +30,7 @@ from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.schema import EXOGENOUS_NAMES, ArraySpec, array_specs
+from dmcvb_gen.store.schema import ArraySpec, array_specs
 from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, sha256_file, start_release, write_shard
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
-from dmcvb_gen.distractors.base import Exogenous
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.release.import_tfds import MISSING
 from dmcvb_gen.rollout.plan import renderer_for
 from dmcvb_gen.store import Release, Subset, open_release
-from dmcvb_gen.store.schema import EXOGENOUS_NAMES, array_specs
+from dmcvb_gen.store.pictures import picture_of
+from dmcvb_gen.store.schema import array_specs
 from dmcvb_gen.store.writer import read_commits, sha256_file, shard_count, subset_digest
 from dmcvb_gen.tasks import get_task
 
@@ -182,7 +183,6 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
             )
             return
     renderer, _ = renderer_for(subset.record, source, split)
-    task = get_task(subset.task)
     try:
         for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
             episode, length = int(subset.episodes[index]), int(subset.lengths[index])
@@ -191,8 +191,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
             labels = Exogenous(**{name: values[f"exogenous/{name}"] for name in EXOGENOUS_NAMES})
             for name in subset.pixel_arrays:
                 stored = values[name][steps]
-                view = name.split("/")[1] if "/" in name else task.views[0]
-                hidden = name.startswith("pixels_hidden_goal")
+                view, hidden = picture_of(name)
                 painted = renderer.render(values["physics"][steps], labels[steps], [view], hide_goal=hidden)[:, 0]
                 gaps = np.abs(painted.astype(int) - stored).reshape(len(steps), -1).mean(axis=1)
                 for step, gap in zip(steps, gaps, strict=True):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.rendering.base import Renderer, floor_alpha_for
-from dmcvb_gen.rendering.cameras import centers_of_mass, nominal_cameras
+from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks.base import Task
 
 RENDERERS = ("warp", "opengl")
@@ -27,7 +26,7 @@ def make_renderer(
     Args:
       size: pixels a side.
       backgrounds: the videos that labels may name (`load_backgrounds`).
-      floor_alpha: opacity of the ground plane (`floor_alpha_for`).
+      floor_alpha: opacity of the ground plane (`distractors.floor_alpha_for`).
       device: "cpu" or "cuda" (warp).
       samples: samples a pixel; None: the default.
 
@@ -55,8 +54,5 @@ __all__ = [
     "RENDERERS",
     "Renderer",
     "available_renderers",
-    "centers_of_mass",
-    "floor_alpha_for",
     "make_renderer",
-    "nominal_cameras",
 ]

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import DistractorSetting, Exogenous
 from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.tasks.base import Task
 
 MIN_SIZE, MAX_SIZE = 8, 1024
@@ -53,16 +53,6 @@ class Renderer(abc.ABC):
 
     def close(self) -> None:  # noqa: B027  (a renderer may hold nothing)
         """Free what the renderer holds; it cannot be used afterwards."""
-
-
-def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
-    """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
-
-    1.0 for walker and cheetah, 0.3 otherwise (Distracting Control Suite); untouched without distractors.
-    """
-    if setting.kind == "none" or task.id in ("walker-walk", "cheetah-run"):
-        return 1.0
-    return 0.3
 
 
 def check_size(size: int) -> None:

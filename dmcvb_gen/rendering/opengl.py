@@ -21,11 +21,11 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.distractors.base import Exogenous
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
-from dmcvb_gen.rendering.cameras import camera_ids, matrices
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
+from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
 SKY_WIDTH = 800
 """Texels a side of a background on the sky (the skybox's own width)."""

@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.distractors.base import Exogenous
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
-from dmcvb_gen.rendering.cameras import Kinematics, camera_ids, matrices
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
 
 WORLDS = 256
 """Frames a launch."""

@@ -14,10 +14,10 @@ from typing import Any
 
 from dmcvb_gen.behaviours.bundled import resolve_policies
 from dmcvb_gen.behaviours.policy_file import Policy, load_policy, random_policy
-from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import RecipeError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.rendering import available_renderers, make_renderer
-from dmcvb_gen.rendering.base import Renderer, floor_alpha_for
+from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, distractor_of, expand, is_maze, select
 from dmcvb_gen.store.manifest import Manifest, PolicyRecord, SubsetRecord, environment
 from dmcvb_gen.store.schema import array_specs

@@ -11,13 +11,13 @@ import numpy as np
 
 from dmcvb_gen.behaviours.simulate import Simulation, simulate
 from dmcvb_gen.distractors import make_exogenous
-from dmcvb_gen.distractors.base import Exogenous
+from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.plan import Job, load_policies, renderer_for
 from dmcvb_gen.rollout.recipe import distractor_of
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord
-from dmcvb_gen.store.schema import pixel_array_names
+from dmcvb_gen.store.pictures import picture_arrays
 from dmcvb_gen.store.writer import write_shard
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
@@ -101,8 +101,8 @@ def paint(
     """
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
     size, total = renderer.size, len(episode)
-    names = pixel_array_names(task)
-    for view, name in zip(task.views, names, strict=True):
+    names = zip(picture_arrays(task.views), picture_arrays(task.views, hide_goal=True), strict=True)
+    for view, (name, hidden_name) in zip(task.views, names, strict=True):
         picture = np.zeros((len(physics), rows, size, size, 3), np.uint8)
         for first in range(0, total, PAINT_FRAMES):
             e, r = episode[first : first + PAINT_FRAMES], row[first : first + PAINT_FRAMES]
@@ -122,7 +122,7 @@ def paint(
             behind = hidden[e, rows_of[0]]
             covered = (behind != before).any(axis=-1, keepdims=True)
             hidden[e, rows_of[1:]] = np.where(covered, behind, hidden[e, rows_of[1:]])
-        yield f"pixels_hidden_goal/{view}", hidden
+        yield hidden_name, hidden
 
 
 def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: Exogenous) -> np.ndarray:

@@ -30,6 +30,7 @@ from typing import Any
 import zarr
 from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
+from dmcvb_gen.store.pictures import picture_arrays
 from dmcvb_gen.tasks.base import Task
 
 SCHEMA_VERSION = 1
@@ -64,14 +65,6 @@ class ArraySpec:
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
-def pixel_array_names(task: Task, hidden_goal: bool = False) -> tuple[str, ...]:
-    """Names of the picture arrays, a view each: ("pixels",), or ("pixels/top", ...)."""
-    if task.views == ("pixels",):
-        return ("pixels",)
-    root = "pixels_hidden_goal" if hidden_goal else "pixels"
-    return tuple(f"{root}/{view}" for view in task.views)
-
-
 def picture_spec(name: str, size: int) -> ArraySpec:
     """The spec of one picture array of `size` x `size` RGB."""
     return ArraySpec(name, "uint8", (size, size, 3), ("height", "width", "channel"), picture=True)
@@ -79,7 +72,7 @@ def picture_spec(name: str, size: int) -> ArraySpec:
 
 def array_specs(task: Task, size: int, pixels: bool = True) -> tuple[ArraySpec, ...]:
     """All arrays of a subset of `task` with pictures of `size` (none with pixels=False)."""
-    names = pixel_array_names(task) + (pixel_array_names(task, hidden_goal=True) if task.goal_geoms else ())
+    names = picture_arrays(task.views) + (picture_arrays(task.views, hide_goal=True) if task.goal_geoms else ())
     fields = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
     views = len(task.views)
     specs = [picture_spec(name, size) for name in names] if pixels else []
@@ -103,16 +96,6 @@ def array_specs(task: Task, size: int, pixels: bool = True) -> tuple[ArraySpec, 
         ArraySpec("goal_pair", "int16", steps=False),
     ]
     return tuple(specs)
-
-
-EXOGENOUS_NAMES = (
-    "camera_position",
-    "camera_quaternion",
-    "material_rgb",
-    "background_video",
-    "background_frame",
-    "style",
-)
 
 
 # -- codecs: how one inner chunk becomes bytes ----------------------------------------------------

@@ -295,7 +295,7 @@ class AntMaze(Task):
           physics: (frame, physics) float64.
           exogenous: labels with leading shape (frame,).
         """
-        from dmcvb_gen.rendering.cameras import matrices
+        from dmcvb_gen.tasks.cameras import matrices
 
         index = self.views.index(view)
         fovy = np.radians(self.model.cam_fovy[self.model.camera(self.cameras[index]).id])

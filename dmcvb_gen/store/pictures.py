@@ -1,0 +1,118 @@
+"""Which pictures a subset shows: its setting and views in, the names of its picture arrays in their order out.
+
+The one place that knows. A task with one view stores `pixels`; one with several stores a pair of arrays a view::
+
+    pixels/<view>               the goal seen
+    pixels_hidden_goal/<view>   the goal left out
+
+A subset whose setting hides the goal (`hidden`, `fixed`) has both, and shows the second alone: the first would give
+the answer away. Views come in the task's order, which the subset's attributes record; environments, policies and
+channels stacked of several views all follow it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from dmcvb_gen.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from dmcvb_gen.store.reader import Subset
+
+ONE_VIEW = ("pixels",)
+"""The views of a task with one."""
+SHOWN, HIDDEN = "pixels", "pixels_hidden_goal"
+"""Folders of the pictures with the goal, and without it."""
+HIDDEN_SETTINGS = ("hidden", "fixed")
+"""Settings in which nobody sees the goal."""
+NOT_TRAINED_ON = ("overhead",)
+"""Views that are collected, but that no agent sees (paper, section 3.2)."""
+_USUAL_ORDER = ("top", "egocentric", "follow", "overhead")
+"""Of subsets whose attributes do not record their views."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The pictures of a subset that somebody may look at.
+
+    Attributes:
+      views: in the task's order; ("pixels",) for a task with one.
+      hide_goal: whether the goal is left out of them.
+    """
+
+    views: tuple[str, ...]
+    hide_goal: bool = False
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        """Names of the picture arrays, one a view: ("pixels",), or ("pixels/top", ...)."""
+        return picture_arrays(self.views, self.hide_goal)
+
+    def select(self, views: Sequence[str] | None) -> Pictures:
+        """The asked views alone, in the asked order; all where none are asked for (None).
+
+        Args:
+          views: names of views ("top"), or of picture arrays ("pixels/top"), but of no array that shows what these
+            pictures hide.
+
+        Raises:
+          UnknownNameError: no such view here.
+        """
+        if views is None:
+            return self
+        names = dict(zip(self.arrays, self.views, strict=True)) | {view: view for view in self.views}
+        for view in views:
+            if view not in names:
+                raise UnknownNameError("view", view, self.views)
+        return Pictures(tuple(names[view] for view in views), self.hide_goal)
+
+
+def hides_goal(setting: str) -> bool:
+    """Whether nobody sees the goal under a setting."""
+    return setting in HIDDEN_SETTINGS
+
+
+def picture_arrays(views: Sequence[str], hide_goal: bool = False) -> tuple[str, ...]:
+    """Names of the picture arrays of views: ("pixels",), or ("pixels/top", ...), ("pixels_hidden_goal/top", ...)."""
+    if tuple(views) == ONE_VIEW:
+        return ONE_VIEW
+    folder = HIDDEN if hide_goal else SHOWN
+    return tuple(f"{folder}/{view}" for view in views)
+
+
+def picture_of(array: str) -> tuple[str, bool] | None:
+    """(view, goal hidden) of a picture array's name; None for the name of another array."""
+    folder, _, view = array.partition("/")
+    if folder not in (SHOWN, HIDDEN):
+        return None
+    return view or ONE_VIEW[0], folder == HIDDEN
+
+
+def stored_views(subset: Subset) -> tuple[str, ...]:
+    """The views of a subset, in the task's order, whether their pictures are stored or not."""
+    recorded = subset.attrs.get("views")
+    if recorded:
+        return tuple(map(str, recorded))
+    found = {picture_of(name)[0] for name in subset.pixel_arrays}
+    usual = [view for view in _USUAL_ORDER if view in found]
+    return (*usual, *sorted(found.difference(usual)))
+
+
+def shown(subset: Subset, views: Sequence[str] | None = None) -> Pictures:
+    """The pictures that a subset shows: all its views, in the task's order, the goal hidden where its setting says so.
+
+    Args:
+      views: of them, these alone, in this order.
+
+    Raises:
+      UnknownNameError: no such view.
+    """
+    return Pictures(stored_views(subset), hides_goal(subset.setting)).select(views)
+
+
+def training_pictures(subset: Subset) -> Pictures:
+    """The pictures that agents are trained on: those shown, less the overhead view."""
+    pictures = shown(subset)
+    return pictures.select([view for view in pictures.views if view not in NOT_TRAINED_ON])

@@ -1,0 +1,113 @@
+"""Where cameras, bodies, geoms and lights are: physics states in, poses out, in batches and in float64."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from scipy.spatial.transform import Rotation
+
+from dmcvb_gen.tasks.base import Task, physics_columns
+
+CHUNK = 512
+"""States a call into MuJoCo at most; only memory depends on it."""
+
+
+class _KeptBatch:
+    """A task's simulations for kinematics: made once, as many as the largest call needs (up to `CHUNK`)."""
+
+    def __init__(self, task: Task):
+        self._model, self._columns = task.model, physics_columns(task.model)
+        self._lock = threading.Lock()  # the simulations are one caller's until it has copied its poses
+        self._size, self._batch, self._bound = 0, None, {}
+
+    def __call__(self, physics: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
+        with self._lock:
+            self._make(min(len(physics), CHUNK), fields)
+            out = {name: np.empty((len(physics), *self._bound[name].shape[1:])) for name in fields}
+            for first in range(0, len(physics), self._size):
+                count = min(self._size, len(physics) - first)
+                ids = np.arange(count)
+                self._batch.state[np.ix_(ids, self._columns)] = physics[first : first + count]
+                self._batch.forward(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_POS))
+                for name in fields:
+                    out[name][first : first + count] = self._bound[name][:count]
+        return out
+
+    def _make(self, size: int, fields: Sequence[str]) -> None:
+        if size > self._size or self._batch is None:
+            self._size = 1 << max(size - 1, 0).bit_length()
+            self._batch, self._bound = Batch(self._model, self._size, nthread=1), dict.fromkeys(self._bound)
+        for name in {*self._bound, *fields}:
+            if self._bound.get(name) is None:
+                self._bound[name] = self._batch.bind(name)
+
+
+_kept: weakref.WeakKeyDictionary[Task, _KeptBatch] = weakref.WeakKeyDictionary()
+_kept_lock = threading.Lock()
+
+
+class Kinematics:
+    """Forward kinematics of a task's physics states; cheap to make, may be called from several threads.
+
+    Args:
+      task: whose model it is. All `Kinematics` of a task share one kept batch of simulations.
+      fields: MjData fields to give, e.g. ("geom_xpos", "cam_xmat").
+    """
+
+    def __init__(self, task: Task, fields: Sequence[str]):
+        self._fields = tuple(fields)
+        with _kept_lock:
+            if task not in _kept:
+                _kept[task] = _KeptBatch(task)
+            self._batch = _kept[task]
+
+    def __call__(self, physics: np.ndarray) -> dict[str, np.ndarray]:
+        """(frame, physics) float64 -> each field with a leading frame axis, float64.
+
+        A frame's poses do not depend on the frames beside it.
+        """
+        return self._batch(np.asarray(physics, np.float64), self._fields)
+
+
+def camera_ids(task: Task) -> list[int]:
+    """The model's camera behind each view."""
+    return [camera if isinstance(camera, int) else task.model.camera(camera).id for camera in task.cameras]
+
+
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) as quaternions (..., 4), w x y z with w >= 0."""
+    rotation = Rotation.from_matrix(matrices.reshape(-1, 3, 3))
+    return rotation.as_quat(canonical=True, scalar_first=True).reshape(*matrices.shape[:-2], 4)
+
+
+def matrices(quaternion: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4), w x y z, normalized here, as rotation matrices (..., 3, 3) float64."""
+    rotation = Rotation.from_quat(np.asarray(quaternion, np.float64).reshape(-1, 4), scalar_first=True)
+    return rotation.as_matrix().reshape(*quaternion.shape[:-1], 3, 3)
+
+
+def nominal_cameras(task: Task, physics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The model's own cameras at physics states.
+
+    Args:
+      physics: (frame, physics) float64.
+
+    Returns:
+      position (frame, view, 3) and quaternion (frame, view, 4), float32.
+    """
+    ids = camera_ids(task)
+    found = Kinematics(task, ("cam_xpos", "cam_xmat"))(physics)
+    position = found["cam_xpos"][:, ids]
+    rotation = found["cam_xmat"][:, ids].reshape(len(physics), len(ids), 3, 3)
+    return position.astype(np.float32), quaternions(rotation).astype(np.float32)
+
+
+def centers_of_mass(task: Task, physics: np.ndarray) -> np.ndarray:
+    """(frame, physics) -> (frame, 3) float64: centre of mass of the body that the first camera tracks, meters."""
+    body = int(task.model.cam_bodyid[camera_ids(task)[0]])
+    return Kinematics(task, ("subtree_com",))(physics)["subtree_com"][:, body]

@@ -1,0 +1,82 @@
+"""Kinematics of stored states: MuJoCo's own, the same in any batch, one kept batch a task, also from threads."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+import pytest
+
+from dmcvb_gen.tasks import cameras, get_task
+from dmcvb_gen.tasks.base import PHYSICS_SPEC
+from dmcvb_gen.tasks.cameras import Kinematics, centers_of_mass, matrices, nominal_cameras, quaternions
+
+TASKS = ("walker-walk", "ant-maze-tiny:****/*..*/****")
+FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "subtree_com")
+
+
+def some_states(task, count):
+    batch = task.batch(count)
+    batch.reset([np.random.default_rng(i) for i in range(count)])
+    for _ in range(3):
+        batch.step(np.random.default_rng(9).uniform(-1, 1, (count, task.action_size)))
+    return batch.physics()
+
+
+@pytest.mark.parametrize("task_id", TASKS)
+def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task_id):
+    task = get_task(task_id)
+    physics = some_states(task, 5)
+    together = Kinematics(task, FIELDS)(physics)
+    data = mujoco.MjData(task.model)
+    for frame, state in enumerate(physics):
+        mujoco.mj_setState(task.model, data, state, PHYSICS_SPEC)
+        mujoco.mj_forward(task.model, data)
+        alone = Kinematics(task, FIELDS)(state[None])
+        for name in FIELDS:
+            expected = getattr(data, name)
+            np.testing.assert_allclose(together[name][frame].ravel(), expected.ravel(), atol=1e-12)
+            np.testing.assert_array_equal(alone[name][0], together[name][frame])
+    np.testing.assert_array_equal(nominal_cameras(task, physics)[1][3:4], nominal_cameras(task, physics[3:4])[1])
+    assert centers_of_mass(task, physics[:0]).shape == (0, 3)
+
+
+def test_a_task_keeps_one_batch_of_the_size_that_was_asked_for(monkeypatch):
+    made = []
+    real = cameras.Batch
+    monkeypatch.setattr(
+        cameras, "Batch", lambda model, size, **options: made.append(size) or real(model, size, **options)
+    )
+    task = type(get_task("walker-walk"))()
+    one = some_states(task, 1)
+    for _ in range(3):
+        nominal_cameras(task, one)
+        centers_of_mass(task, one)
+    assert made == [1]
+    many = np.repeat(one, cameras.CHUNK + 88, axis=0)
+    position, _ = nominal_cameras(task, many)
+    assert made == [1, cameras.CHUNK]
+    assert (position == position[0]).all()
+
+
+def test_threads_get_their_own_states_poses():
+    task = get_task("walker-walk")
+    physics = some_states(task, 8)
+    expected = [centers_of_mass(task, state[None]) for state in physics]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda i: centers_of_mass(task, physics[i % 8][None]), range(400)))
+    for index, value in enumerate(found):
+        np.testing.assert_array_equal(value, expected[index % 8])
+
+
+def test_quaternions_do_not_depend_on_the_batch():
+    rng = np.random.default_rng(0)
+    quaternion = rng.normal(size=(1001, 4))
+    rotation = matrices(quaternion)
+    for index in (0, 500, 1000):
+        expected = np.empty(9)
+        mujoco.mju_quat2Mat(expected, quaternion[index] / np.linalg.norm(quaternion[index]))
+        np.testing.assert_allclose(rotation[index].ravel(), expected, atol=1e-14)
+        np.testing.assert_array_equal(matrices(quaternion[index]), rotation[index])
+        np.testing.assert_array_equal(quaternions(rotation[index]), quaternions(rotation)[index])
