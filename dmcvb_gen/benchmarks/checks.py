@@ -16,7 +16,7 @@ import numpy as np
 
 from dmcvb_gen.behaviours.paper import paper_returns
 from dmcvb_gen.distractors import TRAIN_STYLES, VAL_STYLES
-from dmcvb_gen.release.verify import Finding, verify
+from dmcvb_gen.release.verify import Finding, is_imported, verify
 from dmcvb_gen.rollout.recipe import distractor_of, is_maze
 from dmcvb_gen.store import Release, Subset
 from dmcvb_gen.tasks import get_task
@@ -87,39 +87,44 @@ def check_paper_returns(subset: Subset) -> Iterator[Finding]:
 
 
 def check_labels(subset: Subset) -> Iterator[Finding]:
-    """The distractors' labels are what the setting's name says."""
+    """The distractors' labels are what the setting's name says; imported data have none."""
+    if is_imported(subset):
+        return
     task, kind = get_task(subset.task), distractor_of(subset.task, subset.setting).kind
-    recorded = subset.record.backgrounds
-    styles: tuple[int, ...] = (-1,)
-    if task.style_geom_matid(TRAIN_STYLES[0]) is not None:
-        styles = (*TRAIN_STYLES, *VAL_STYLES)
+    looks = [look for style in (*TRAIN_STYLES, *VAL_STYLES) for look in task.looks(style)] or [-1]
     own = task.model.mat_rgba[:, :3].astype(np.float32)
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
     for episode in map(int, subset.episodes):
         video, frame, color, style = subset.episode(episode, names).values()
-        problems = [
-            (~np.isin(style, styles) | (style != style[0]), "the maze's style is not one of its data's"),
-        ]
-        if kind == "none":
-            problems += [
-                ((video != -1) | (frame != -1), "a background is named, the setting has none"),
-                (np.abs(color - own).max(axis=(1, 2)) > 1e-6, "a material has another color, the setting has none"),
-            ]
-        else:
-            problems += [((video < 0) | (video != video[0]), "the background is not one video throughout")]
-            if kind == "static":
-                problems += [
-                    (frame != frame[0], "the background moves in a static setting"),
-                    ((color != color[0]).any(axis=(1, 2)), "colors change in a static setting"),
-                ]
-            else:
-                jumps = np.abs(np.diff(frame.astype(int), prepend=frame[:1])) > 1
-                problems += [(jumps, "the background skips frames")]
+        problems = [(~np.isin(style, looks) | (style != style[0]), "the maze's look is not one of its data's")]
+        problems += _label_problems(kind, own, video, frame, color)
         for bad, message in problems:
             if bad.any():
                 yield Finding("labels", subset.name, message, episode, int(bad.argmax()))
-    if (kind == "none") != (recorded is None):
+    if (kind == "none") != (subset.record.backgrounds is None):
         yield Finding("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
+
+
+def _label_problems(kind: str, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray):
+    """((step,) bool where it is wrong, what is) of one episode of a kind of distractor.
+
+    Args:
+      own: (material, 3), the model's colors.
+      video, frame: (step,). color: (step, material, 3).
+    """
+    if kind == "none":
+        return [
+            ((video != -1) | (frame != -1), "a background is named, the setting has none"),
+            (np.abs(color - own).max(axis=(1, 2)) > 1e-6, "a material has another color, the setting has none"),
+        ]
+    problems = [((video < 0) | (video != video[0]), "the background is not one video throughout")]
+    if kind == "static":
+        return problems + [
+            (frame != frame[0], "the background moves in a static setting"),
+            ((color != color[0]).any(axis=(1, 2)), "colors change in a static setting"),
+        ]
+    jumps = np.abs(np.diff(frame.astype(int), prepend=frame[:1])) > 1
+    return problems + [(jumps, "the background skips frames")]
 
 
 def check_pictures(subset: Subset) -> Iterator[Finding]:
