@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 from collections.abc import Iterable
 
@@ -21,6 +22,9 @@ class UnknownNameError(DmcvbError, KeyError):
 
     def __str__(self) -> str:  # KeyError would print the repr
         return str(self.args[0])
+
+    def __reduce__(self):  # to come back from a worker process, made anew from its message
+        return copyreg.__newobj__, (type(self), *self.args)
 
 
 class PolicyFileError(DmcvbError):

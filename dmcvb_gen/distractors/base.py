@@ -2,49 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.names import DIFFICULTY_SCALES as SCALES
+from dmcvb_gen.names import DISTRACTOR_KINDS as KINDS
+from dmcvb_gen.names import DistractorSetting
 from dmcvb_gen.tasks.base import Task
 
-KINDS = ("none", "static", "dynamic")
-SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
-"""Difficulty -> the scale s of every range (Distracting Control Suite); medium is DMC-VB's."""
-VIDEOS = {"easy": 4, "medium": 8, "hard": None}
-"""Difficulty -> how many background videos are in play; None: all."""
-
-
-@dataclass(frozen=True)
-class DistractorSetting:
-    """A kind of distractor at a difficulty; `name` is "none", "static", "dynamic_hard", ... (medium is not named)."""
-
-    kind: str = "none"
-    difficulty: str = "medium"
-
-    def __post_init__(self):
-        if self.kind not in KINDS:
-            raise UnknownNameError("distractor", self.kind, KINDS)
-        if self.difficulty not in SCALES:
-            raise UnknownNameError("difficulty", self.difficulty, SCALES)
-
-    @property
-    def name(self) -> str:
-        return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
-
-    @property
-    def scale(self) -> float:
-        return 0.0 if self.kind == "none" else SCALES[self.difficulty]
-
-    @property
-    def videos(self) -> int | None:
-        """How many videos are in play, None for all."""
-        return VIDEOS[self.difficulty]
-
-    @classmethod
-    def parse(cls, name: str) -> DistractorSetting:
-        """The setting of a name such as "dynamic", "dynamic_medium" or "static_easy"."""
-        kind, _, difficulty = name.partition("_")
-        return cls(kind, difficulty or "medium")
+__all__ = ["KINDS", "SCALES", "DistractorSetting", "floor_alpha_for"]
 
 
 def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:

@@ -15,8 +15,6 @@
 
 from __future__ import annotations
 
-import fnmatch
-import re
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,16 +22,37 @@ from typing import Annotated, Any, Literal
 import pydantic
 import yaml
 
-from dmcvb_gen.distractors.base import DistractorSetting
-from dmcvb_gen.errors import DmcvbError, RecipeError, UnknownNameError
+from dmcvb_gen.errors import RecipeError
+from dmcvb_gen.names import (
+    ANT_MAZE,
+    FIXED,
+    GOAL_MODES,
+    LEVELS,
+    LOCOMOTION,
+    check_level,
+    distractor_of,
+    family_of,
+    matches,
+    normalize_setting,
+    select,
+    subset_name,
+    task_folder,
+)
 from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
-from dmcvb_gen.tasks import get_task, task_ids
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
-LEVELS = ("expert", "medium", "mixed", "random")
-MAZE_SETTINGS = ("visible", "hidden", "fixed")
-DEFAULT_EPISODES_PER_SHARD = {"locomotion": 50, "maze": 10}
+DEFAULT_EPISODES_PER_SHARD = {LOCOMOTION: 50, ANT_MAZE: 10}
 """Episodes a shard: what a worker holds in memory and what a crash can cost."""
+
+
+# Their place is dmcvb_gen.names; those who still ask here find them.
+MAZE_SETTINGS = GOAL_MODES
+__all__ = ["LEVELS", "distractor_of", "is_maze", "matches", "normalize_setting", "select", "task_folder"]
+
+
+def is_maze(task: str) -> bool:
+    return family_of(task) == ANT_MAZE
 
 
 class _Model(pydantic.BaseModel):
@@ -122,28 +141,6 @@ class SubsetRequest(_Model):
     episodes_per_goal: int | None = None
 
 
-def is_maze(task: str) -> bool:
-    return task.startswith("ant-maze")
-
-
-def normalize_setting(task: str, setting: str) -> str:
-    """The setting's canonical name ("dynamic_medium" -> "dynamic").
-
-    Raises:
-      UnknownNameError: the task has no such setting.
-    """
-    if is_maze(task):
-        if setting not in MAZE_SETTINGS:
-            raise UnknownNameError(f"goal setting of {task}", setting, MAZE_SETTINGS)
-        return setting
-    return DistractorSetting.parse(setting).name
-
-
-def distractor_of(task: str, setting: str) -> DistractorSetting:
-    """The distractors of a subset's setting; mazes have none but their styles."""
-    return DistractorSetting() if is_maze(task) else DistractorSetting.parse(setting)
-
-
 def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     """All subsets that a recipe asks for, in its order.
 
@@ -156,11 +153,10 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
         for task_id in pattern.tasks:
             task = get_task(task_id)
             for level in pattern.levels:
-                if level not in LEVELS:
-                    raise UnknownNameError("level", level, LEVELS)
+                check_level(level)
                 for given in pattern.settings:
                     setting = normalize_setting(task_id, given)
-                    name = f"{task_folder(task_id)}/{level}/{setting}"
+                    name = subset_name(task_id, level, setting)
                     if name in requests:
                         raise RecipeError(f"recipe {recipe.name!r} asks for {name} twice; keep one of the entries")
                     requests[name] = _request(pattern, task, name, level, setting)
@@ -170,16 +166,9 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     return tuple(requests.values())
 
 
-def task_folder(task_id: str) -> str:
-    """A task id as a folder name: without a maze's rows, if it carries its own."""
-    head, _, reward = task_id.partition("@")
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", head.split(":")[0] + (f"-{reward}" if reward else ""))
-
-
 def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting: str) -> SubsetRequest:
-    maze = is_maze(task.id)
     per_goal = None
-    if setting == "fixed":
+    if setting == FIXED:
         episodes, per_goal = pattern.fixed_goals * pattern.episodes_per_goal, pattern.episodes_per_goal
     elif pattern.episodes is not None and pattern.steps is not None:
         raise RecipeError(f"{name}: give episodes or steps, not both")
@@ -187,11 +176,11 @@ def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting:
         episodes = pattern.episodes
     elif pattern.steps is None:
         raise RecipeError(f"{name}: say how much: episodes: N (or steps: N)")
-    elif maze:
+    elif task.family == ANT_MAZE:
         raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
     else:
         episodes = -(-pattern.steps // task.max_steps)
-    shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD["maze" if maze else "locomotion"]
+    shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[task.family]
     return SubsetRequest(
         name=name,
         task=task.id,
@@ -209,26 +198,6 @@ def check_size(size: int) -> None:
     """Raises RecipeError for a picture size that no renderer takes."""
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise RecipeError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)")
-
-
-def matches(name: str, patterns: tuple[str, ...] | list[str]) -> bool:
-    """Whether a subset's name fits one of the patterns: "walker-walk/*/static", "walker-walk/expert", "*"."""
-    return any(
-        fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(name, f"{pattern.rstrip('/')}/*")
-        for pattern in patterns
-    )
-
-
-def select(names: list[str], patterns: tuple[str, ...] | list[str]) -> list[str]:
-    """The names that fit the patterns (all of them when there are no patterns).
-
-    Raises:
-      UnknownNameError: a pattern that fits nothing.
-    """
-    for pattern in patterns:
-        if not any(matches(name, [pattern]) for name in names):
-            raise UnknownNameError("subset pattern", pattern, names)
-    return [name for name in names if not patterns or matches(name, patterns)]
 
 
 def shipped_recipes() -> tuple[str, ...]:
@@ -275,14 +244,3 @@ def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the top"
         raise RecipeError(f"{where}: {place}: {first['msg']}") from None
-
-
-def check_tasks(tasks: tuple[str, ...]) -> None:
-    """Raises UnknownNameError for the first unknown task."""
-    for task in tasks:
-        try:
-            get_task(task)
-        except DmcvbError:
-            raise
-        except KeyError:
-            raise UnknownNameError("task", task, task_ids()) from None

@@ -18,6 +18,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from dmcvb_gen.names import LOCOMOTION
+
 ACTION_REPEAT = 2
 """Control steps an agent step (paper, section 3.2)."""
 
@@ -51,6 +53,7 @@ class Task(abc.ABC):
 
     Attributes:
       id: the task's name, e.g. "walker-walk".
+      family: "locomotion" or "ant-maze" (`names.FAMILIES`): which settings it takes.
       model: the compiled MuJoCo model. Never change it: renderers and batches share it.
       state_fields: name -> size of each part of the state, in the state's order.
       max_steps: agent steps at which the time limit ends an episode.
@@ -60,6 +63,7 @@ class Task(abc.ABC):
     """
 
     id: str
+    family: str = LOCOMOTION
     model: mujoco.MjModel
     state_fields: Mapping[str, int]
     max_steps: int

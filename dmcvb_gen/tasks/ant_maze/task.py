@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.tasks.ant_maze.arena import CAMERAS, GOAL_HEIGHT, GOAL_RADIUS, PHYSICS_STEP, build_arena, look_numbers
 from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
@@ -255,6 +256,7 @@ class AntMaze(Task):
       id: the task's name.
     """
 
+    family = ANT_MAZE
     state_fields = FIELDS
     max_steps = EPISODE_STEPS
     substeps = 25  # 1 ms physics, 25 ms control

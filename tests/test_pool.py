@@ -1,0 +1,113 @@
+"""The one process pool: results as they come, progress, and what happens when something dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.pool import IN_FLIGHT, open_pool, run_all
+
+
+def square(number, tick):
+    tick(number)
+    return number * number
+
+
+def fail(number, tick):
+    raise UnknownNameError("level", "exprt", ("expert", "medium"))
+
+
+def die(number, tick):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def threads(number, tick):
+    import torch
+
+    return torch.get_num_threads(), os.getpid()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_every_item_gives_its_result_and_its_progress(workers):
+    ticks = []
+    found = dict(run_all(square, range(7), workers, tick=ticks.append))
+    assert found == {number: number**2 for number in range(7)} and sorted(ticks) == list(range(7))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_may_ask_for_more_work(workers):
+    with open_pool(workers) as pool:
+        pool.submit("first", square, 3)
+        seen = []
+        for key, value in pool.results():
+            seen.append((key, value))
+            if key == "first":
+                pool.submit("second", square, value)
+    assert seen == [("first", 9), ("second", 81)]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_the_work_arrives_as_it_was_raised(workers):
+    with pytest.raises(UnknownNameError, match="Did you mean 'expert'"):
+        list(run_all(fail, [1, 2], workers))
+
+
+def test_a_killed_worker_is_one_line_with_a_cure():
+    with pytest.raises(StoreError, match="killed .*; what was committed is safe.* fewer --workers than 2") as caught:
+        list(run_all(die, [1, 2], 2))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_handed_out_is_bounded():
+    with open_pool(2) as pool:
+        for number in range(50):
+            pool.submit(number, square, number)
+        results = pool.results()
+        next(results)
+        assert len(pool._running) <= 2 * IN_FLIGHT
+        assert len(list(results)) == 49
+
+
+def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
+    found = [result for _, result in run_all(threads, [1, 2], 2, threads=1)]
+    assert {count for count, _ in found} == {1}
+    deadline = time.time() + 20
+    while any(os.path.exists(f"/proc/{pid}") for _, pid in found) and time.time() < deadline:
+        time.sleep(0.05)
+    assert not any(os.path.exists(f"/proc/{pid}") for _, pid in found)
+
+
+PARENT = """
+import os, sys, time
+from dmcvb_gen.pool import run_all
+
+def announce(number, tick):
+    open(sys.argv[1] + f"/{os.getpid()}", "w").close()
+    time.sleep(120)
+
+if __name__ == "__main__":
+    list(run_all(announce, [1, 2], 2))
+"""
+
+
+def test_workers_end_when_their_parent_was_killed(tmp_path):
+    (tmp_path / "parent.py").write_text(PARENT)
+    pids = tmp_path / "pids"
+    pids.mkdir()
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(pids)])
+    deadline = time.time() + 60
+    while len(list(pids.iterdir())) < 2 and time.time() < deadline:
+        time.sleep(0.05)
+    workers = [path.name for path in pids.iterdir()]
+    assert len(workers) == 2
+    parent.kill()
+    parent.wait()
+    while any(os.path.exists(f"/proc/{pid}") for pid in workers) and time.time() < deadline:
+        time.sleep(0.05)
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in workers)
