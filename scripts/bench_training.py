@@ -27,12 +27,12 @@ import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
-from dmcvb_gen.behaviours import runs
-from dmcvb_gen.behaviours.defaults import default_run
-from dmcvb_gen.behaviours.paper import paper_returns
-from dmcvb_gen.behaviours.runs import RunConfig
-from dmcvb_gen.behaviours.training import open_run
-from dmcvb_gen.behaviours.vec_env import TaskVecEnv
+from dmcvb_gen.behaviours.learning import runs
+from dmcvb_gen.behaviours.learning.defaults import default_run
+from dmcvb_gen.behaviours.learning.runs import RunConfig
+from dmcvb_gen.behaviours.learning.training import open_run
+from dmcvb_gen.behaviours.learning.vec_env import TaskVecEnv
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task
 
 TASK = "walker-walk"

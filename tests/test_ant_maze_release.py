@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.bundled import bundled_policies
-from dmcvb_gen.behaviours.policy_file import load_policy
-from dmcvb_gen.behaviours.simulate import simulate
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
+from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.distractors import DistractorSetting, make_exogenous
 from dmcvb_gen.release.verify import verify

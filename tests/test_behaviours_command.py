@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.bundled import bundled_folder, bundled_levels
-from dmcvb_gen.behaviours.defaults import parse_settings
-from dmcvb_gen.behaviours.evaluation import maze_scores
-from dmcvb_gen.behaviours.paper import paper_returns
-from dmcvb_gen.behaviours.training import RunConfig, command_of
+from dmcvb_gen.behaviours.learning.defaults import parse_settings
+from dmcvb_gen.behaviours.learning.training import RunConfig, command_of
+from dmcvb_gen.behaviours.policies.bundled import bundled_folder, bundled_levels
+from dmcvb_gen.behaviours.policies.evaluation import maze_scores
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import train_behaviour
 from dmcvb_gen.tasks import get_task, task_ids

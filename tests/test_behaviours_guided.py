@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from dmcvb_gen.behaviours import runs
-from dmcvb_gen.behaviours.guided import deepened, divergence
-from dmcvb_gen.behaviours.policy_file import Actor, load_policy, read_header
-from dmcvb_gen.behaviours.runs import RunConfig
-from dmcvb_gen.behaviours.training import open_run
+from dmcvb_gen.behaviours.learning import runs
+from dmcvb_gen.behaviours.learning.guided import deepened, divergence
+from dmcvb_gen.behaviours.learning.runs import RunConfig
+from dmcvb_gen.behaviours.learning.training import open_run
+from dmcvb_gen.behaviours.policies.policy_file import Actor, load_policy, read_header
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 

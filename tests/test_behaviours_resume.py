@@ -17,12 +17,12 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dmcvb_gen.behaviours import runs
-from dmcvb_gen.behaviours.policy_file import load_policy, read_header
-from dmcvb_gen.behaviours.run_log import COLUMNS, read_rows
-from dmcvb_gen.behaviours.runs import RunConfig
-from dmcvb_gen.behaviours.sac import ReplayBuffer
-from dmcvb_gen.behaviours.training import open_run
+from dmcvb_gen.behaviours.learning import runs
+from dmcvb_gen.behaviours.learning.run_log import COLUMNS, read_rows
+from dmcvb_gen.behaviours.learning.runs import RunConfig
+from dmcvb_gen.behaviours.learning.sac import ReplayBuffer
+from dmcvb_gen.behaviours.learning.training import open_run
+from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
 from dmcvb_gen.errors import DmcvbError
 
 torch.set_num_threads(1)
@@ -116,7 +116,7 @@ def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):
 
 SCRIPT = """
 import json, sys, torch
-from dmcvb_gen.behaviours import runs, sb3, training
+from dmcvb_gen.behaviours.learning import runs, sb3, training
 torch.set_num_threads(1)
 runs.EVALUATION_EPISODES = 2
 sb3.SAVE_SECONDS = training.SAVE_SECONDS = 0  # save at each evaluation

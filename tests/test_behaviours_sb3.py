@@ -7,10 +7,10 @@ import pytest
 import torch
 from stable_baselines3.common.vec_env import VecNormalize
 
-from dmcvb_gen.behaviours import runs, sb3
-from dmcvb_gen.behaviours.policy_file import load_policy
-from dmcvb_gen.behaviours.runs import RunConfig
-from dmcvb_gen.behaviours.training import open_run
+from dmcvb_gen.behaviours.learning import runs, sb3
+from dmcvb_gen.behaviours.learning.runs import RunConfig
+from dmcvb_gen.behaviours.learning.training import open_run
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
 
 torch.set_num_threads(1)

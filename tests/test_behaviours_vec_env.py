@@ -9,7 +9,7 @@ from dm_control import suite
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 
-from dmcvb_gen.behaviours.vec_env import TaskEnv, TaskVecEnv
+from dmcvb_gen.behaviours.learning.vec_env import TaskEnv, TaskVecEnv
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 

@@ -11,7 +11,7 @@ import yaml
 from click.testing import CliRunner
 from PIL import Image
 
-from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.card import check_card, write_card

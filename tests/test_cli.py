@@ -9,8 +9,8 @@ import torch
 from click.testing import CliRunner
 from PIL import Image
 
-from dmcvb_gen.behaviours.bundled import bundled_policies
-from dmcvb_gen.behaviours.policy_file import load_policy, save_policy
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
+from dmcvb_gen.behaviours.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.store import open_release
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from dmcvb_gen.behaviours.bundled import bundled_policies, resolve_policies
-from dmcvb_gen.behaviours.policy_file import (
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies, resolve_policies
+from dmcvb_gen.behaviours.policies.policy_file import (
     Actor,
     Evaluation,
     PolicyHeader,
@@ -19,7 +19,7 @@ from dmcvb_gen.behaviours.policy_file import (
     read_header,
     save_policy,
 )
-from dmcvb_gen.behaviours.simulate import TILE, TiledActor
+from dmcvb_gen.behaviours.policies.simulate import TILE, TiledActor
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.tasks import get_task
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours import simulate
+from dmcvb_gen.behaviours.policies import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.release.regenerate import check

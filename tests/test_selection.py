@@ -10,10 +10,8 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.bundled import level_files
-from dmcvb_gen.behaviours.policy_file import Actor, Evaluation, PolicyHeader, read_header, save_policy
-from dmcvb_gen.behaviours.run_log import COLUMNS
-from dmcvb_gen.behaviours.selection import (
+from dmcvb_gen.behaviours.learning.run_log import COLUMNS
+from dmcvb_gen.behaviours.learning.selection import (
     MAZE_LEVELS,
     MIXED_COUNT,
     converge,
@@ -21,7 +19,9 @@ from dmcvb_gen.behaviours.selection import (
     read_curve,
     select_checkpoints,
 )
-from dmcvb_gen.behaviours.thinning import LIMIT, superfluous
+from dmcvb_gen.behaviours.learning.thinning import LIMIT, superfluous
+from dmcvb_gen.behaviours.policies.bundled import level_files
+from dmcvb_gen.behaviours.policies.policy_file import Actor, Evaluation, PolicyHeader, read_header, save_policy
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 
@@ -207,7 +207,7 @@ def test_points_of_thinned_and_half_written_checkpoints(run_folder):
 
 
 def test_a_checkpoint_that_is_thinned_away_meanwhile_is_done_without(run_folder, monkeypatch):
-    import dmcvb_gen.behaviours.selection as module
+    import dmcvb_gen.behaviours.learning.selection as module
 
     seen, load = [], module.load_policy
 

@@ -7,11 +7,12 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.defaults import parse_settings, run_config
-from dmcvb_gen.behaviours.policy_file import PolicyHeader
-from dmcvb_gen.behaviours.runs import RunConfig, check_same
-from dmcvb_gen.behaviours.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
-from dmcvb_gen.behaviours.training import SacRun, open_run, standing_states
+from dmcvb_gen.behaviours.learning.defaults import parse_settings, run_config
+from dmcvb_gen.behaviours.learning.episodes import standing_states
+from dmcvb_gen.behaviours.learning.runs import RunConfig, check_same
+from dmcvb_gen.behaviours.learning.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
+from dmcvb_gen.behaviours.learning.training import SacRun, open_run
+from dmcvb_gen.behaviours.policies.policy_file import PolicyHeader
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.distractors import TRAIN_STYLES, VAL_STYLES
 from dmcvb_gen.release.verify import Finding, is_imported, verify
 from dmcvb_gen.rollout.recipe import distractor_of, is_maze

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen import __version__
-from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.run import Setup

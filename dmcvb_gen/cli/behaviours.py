@@ -36,10 +36,10 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     """
     import torch
 
-    from dmcvb_gen.behaviours.defaults import parse_settings, run_config
-    from dmcvb_gen.behaviours.paper import paper_returns
-    from dmcvb_gen.behaviours.runs import read_config
-    from dmcvb_gen.behaviours.training import open_run
+    from dmcvb_gen.behaviours.learning.defaults import parse_settings, run_config
+    from dmcvb_gen.behaviours.learning.runs import read_config
+    from dmcvb_gen.behaviours.learning.training import open_run
+    from dmcvb_gen.behaviours.policies.paper import paper_returns
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.tasks import get_task
 
@@ -83,7 +83,7 @@ def select_checkpoints(run, episodes, seed, deterministic, as_json):
     dmcvb-gen select-checkpoints runs/walker-walk
     dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk --episodes 20
     """
-    from dmcvb_gen.behaviours import selection as module
+    from dmcvb_gen.behaviours.learning import selection as module
 
     picked = module.select_checkpoints(run, episodes, seed, deterministic)
     if as_json:
@@ -129,11 +129,11 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, 
     dmcvb-gen evaluate-behaviour
     dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
     """
-    from dmcvb_gen.behaviours.bundled import bundled_levels, levels_of, resolve_policies
-    from dmcvb_gen.behaviours.evaluation import maze_scores
-    from dmcvb_gen.behaviours.paper import paper_returns
-    from dmcvb_gen.behaviours.policy_file import load_policy, random_policy, read_header
-    from dmcvb_gen.behaviours.simulate import simulate
+    from dmcvb_gen.behaviours.policies.bundled import bundled_levels, levels_of, resolve_policies
+    from dmcvb_gen.behaviours.policies.evaluation import maze_scores
+    from dmcvb_gen.behaviours.policies.paper import paper_returns
+    from dmcvb_gen.behaviours.policies.policy_file import load_policy, random_policy, read_header
+    from dmcvb_gen.behaviours.policies.simulate import simulate
     from dmcvb_gen.rollout.info import return_statistics
     from dmcvb_gen.tasks import get_task, task_ids
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError

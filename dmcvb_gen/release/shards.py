@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dmcvb_gen.behaviours.bundled import resolve_policies
-from dmcvb_gen.behaviours.policy_file import load_policy
+from dmcvb_gen.behaviours.policies.bundled import resolve_policies
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.rollout.plan import Job, trajectory_names

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.behaviours.simulate import simulate
+from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.rollout.plan import Job, Plan, load_policies, renderer_for
 from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
 from dmcvb_gen.store.manifest import SubsetRecord

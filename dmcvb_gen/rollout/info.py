@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen import __version__
-from dmcvb_gen.behaviours.bundled import bundled_levels
-from dmcvb_gen.behaviours.paper import paper_returns
+from dmcvb_gen.behaviours.policies.bundled import bundled_levels
+from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.distractors.base import KINDS, SCALES
 from dmcvb_gen.rollout.recipe import LEVELS, MAZE_SETTINGS, shipped_recipes
 from dmcvb_gen.store import open_release

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.behaviours.simulate import Simulation, simulate
+from dmcvb_gen.behaviours.policies.simulate import Simulation, simulate
 from dmcvb_gen.distractors import make_exogenous
 from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer

@@ -21,11 +21,11 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from dmcvb_gen.behaviours.policy_file import Actor, load_policy
-from dmcvb_gen.behaviours.row_files import map_rows, rows_in
-from dmcvb_gen.behaviours.runs import SAVE_SECONDS, Report, Run, Tick, read_config
-from dmcvb_gen.behaviours.settings import OffPolicySettings
-from dmcvb_gen.behaviours.vec_env import TaskVecEnv
+from dmcvb_gen.behaviours.learning.row_files import map_rows, rows_in
+from dmcvb_gen.behaviours.learning.runs import SAVE_SECONDS, Report, Run, Tick, read_config
+from dmcvb_gen.behaviours.learning.settings import OffPolicySettings
+from dmcvb_gen.behaviours.learning.vec_env import TaskVecEnv
+from dmcvb_gen.behaviours.policies.policy_file import Actor, load_policy
 from dmcvb_gen.errors import DmcvbError
 
 CLIP_OBSERVATION = 10.0

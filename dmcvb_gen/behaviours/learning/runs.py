@@ -33,9 +33,12 @@ from typing import Any
 
 import torch
 
-from dmcvb_gen.behaviours.evaluation import evaluate
-from dmcvb_gen.behaviours.paper import paper_returns
-from dmcvb_gen.behaviours.policy_file import (
+from dmcvb_gen.behaviours.learning.run_log import RunLog
+from dmcvb_gen.behaviours.learning.settings import check_settings
+from dmcvb_gen.behaviours.learning.thinning import superfluous
+from dmcvb_gen.behaviours.policies.evaluation import evaluate
+from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.behaviours.policies.policy_file import (
     Actor,
     Evaluation,
     Policy,
@@ -43,9 +46,6 @@ from dmcvb_gen.behaviours.policy_file import (
     random_policy,
     save_policy,
 )
-from dmcvb_gen.behaviours.run_log import RunLog
-from dmcvb_gen.behaviours.settings import check_settings
-from dmcvb_gen.behaviours.thinning import superfluous
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.store.manifest import environment
 from dmcvb_gen.tasks import get_task

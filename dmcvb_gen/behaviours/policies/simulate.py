@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from dmcvb_gen.behaviours.policy_file import Policy
+from dmcvb_gen.behaviours.policies.policy_file import Policy
 from dmcvb_gen.seeding import episode_seed, episode_stream
 from dmcvb_gen.tasks.base import Task
 

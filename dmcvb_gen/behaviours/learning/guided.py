@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from dmcvb_gen.behaviours.bundled import resolve_policies
-from dmcvb_gen.behaviours.policy_file import Actor, Policy, load_policy
-from dmcvb_gen.behaviours.runs import SAVE_SECONDS, Report, Run, Tick
-from dmcvb_gen.behaviours.sac import RowBuffer
-from dmcvb_gen.behaviours.settings import Count, Natural, NonNegative, Positive, Share
+from dmcvb_gen.behaviours.learning.episodes import Episodes
+from dmcvb_gen.behaviours.learning.runs import SAVE_SECONDS, Report, Run, Tick
+from dmcvb_gen.behaviours.learning.sac import RowBuffer
+from dmcvb_gen.behaviours.learning.settings import Count, Natural, NonNegative, Positive, Share
+from dmcvb_gen.behaviours.policies.bundled import resolve_policies
+from dmcvb_gen.behaviours.policies.policy_file import Actor, Policy, load_policy
 from dmcvb_gen.errors import DmcvbError
 
 GUIDE = "ant-maze-empty7x7"
@@ -93,8 +94,6 @@ class GuidedRun(Run):
         return 0
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
-        from dmcvb_gen.behaviours.training import Episodes
-
         settings, task, config = self.settings, self.task, self.config
         torch.manual_seed(config.seed)
         student = Actor(self.header)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dmcvb_gen.behaviours.policy_file import Evaluation, Policy
-from dmcvb_gen.behaviours.simulate import Simulation, simulate
+from dmcvb_gen.behaviours.policies.policy_file import Evaluation, Policy
+from dmcvb_gen.behaviours.policies.simulate import Simulation, simulate
 from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
 
 

@@ -20,12 +20,12 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
 
 ALGORITHMS = {
-    "sac": "dmcvb_gen.behaviours.sac:SacSettings",
-    "guided": "dmcvb_gen.behaviours.guided:GuidedSettings",
-    "sb3-sac": "dmcvb_gen.behaviours.settings:Sb3SacSettings",
-    "td3": "dmcvb_gen.behaviours.settings:Td3Settings",
-    "tqc": "dmcvb_gen.behaviours.settings:TqcSettings",
-    "ppo": "dmcvb_gen.behaviours.settings:PpoSettings",
+    "sac": "dmcvb_gen.behaviours.learning.sac:SacSettings",
+    "guided": "dmcvb_gen.behaviours.learning.guided:GuidedSettings",
+    "sb3-sac": "dmcvb_gen.behaviours.learning.settings:Sb3SacSettings",
+    "td3": "dmcvb_gen.behaviours.learning.settings:Td3Settings",
+    "tqc": "dmcvb_gen.behaviours.learning.settings:TqcSettings",
+    "ppo": "dmcvb_gen.behaviours.learning.settings:PpoSettings",
 }
 """What `train-behaviour --algo` takes -> its settings. `sac` and `guided` are the package's own, the rest SB3's."""
 

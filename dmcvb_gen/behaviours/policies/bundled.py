@@ -6,7 +6,7 @@ import json
 from importlib import resources
 from pathlib import Path
 
-from dmcvb_gen.behaviours.policy_file import read_header
+from dmcvb_gen.behaviours.policies.policy_file import read_header
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 
 LEVELS = ("expert", "medium", "mixed")

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.behaviours.evaluation import evaluate
-from dmcvb_gen.behaviours.policy_file import (
+from dmcvb_gen.behaviours.learning.run_log import read_rows
+from dmcvb_gen.behaviours.policies.evaluation import evaluate
+from dmcvb_gen.behaviours.policies.policy_file import (
     Evaluation,
     Policy,
     PolicyHeader,
@@ -24,7 +25,6 @@ from dmcvb_gen.behaviours.policy_file import (
     read_header,
     save_policy,
 )
-from dmcvb_gen.behaviours.run_log import read_rows
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.store.manifest import write_json_atomically
 from dmcvb_gen.tasks import get_task

@@ -11,8 +11,8 @@ from typing import Any
 
 import yaml
 
-from dmcvb_gen.behaviours.runs import RunConfig
-from dmcvb_gen.behaviours.settings import check_settings
+from dmcvb_gen.behaviours.learning.runs import RunConfig
+from dmcvb_gen.behaviours.learning.settings import check_settings
 from dmcvb_gen.errors import DmcvbError
 
 
