@@ -124,9 +124,11 @@ def change_actions(folder):
         for file in commit.files
     ]
     write_json_atomically(path, commit.model_copy(update={"files": tuple(files)}))
-    manifest = open_release(folder).manifest
-    manifest = manifest.model_copy(update={"environments": ({**manifest.environments[0], "cpu": "Another 9000"},)})
-    finish_release(folder, manifest)
+    for path in folder.glob("commits/**/*.json"):
+        commit = parse_commit(path.read_text())
+        elsewhere = {**commit.environment, "cpu": "Another 9000"}
+        write_json_atomically(path, commit.model_copy(update={"environment": elsewhere}))
+    finish_release(folder, open_release(folder).manifest)
 
 
 def test_a_difference_is_said_with_how_far_and_what_differs_in_the_environment(copy):

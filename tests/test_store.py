@@ -93,7 +93,7 @@ def test_the_settings_of_a_seed_share_states_and_rewards_and_differ_in_pixels(sm
 def test_xarray_opens_a_subset_with_named_dimensions(small_release):
     data = xarray.open_zarr(small_release / f"{NAME}.zarr")
     assert data["pixels"].dims == ("episode", "step", "height", "width", "channel")
-    assert data["state"].dims == ("episode", "step", "state") and data["length"].dims == ("episode",)
+    assert data["state"].dims == ("episode", "step", "state_dim") and data["length"].dims == ("episode",)
     assert float(data["reward"].isel(episode=1).sum()) == pytest.approx(
         open_release(small_release)[NAME].returns[1], rel=1e-4
     )

@@ -135,7 +135,7 @@ class StoredFrames:
     """
 
     def __init__(self, subsets: Sequence[Subset], arrays: Sequence[tuple[str, ...]], where: np.ndarray, size: int):
-        self._arrays = [[subset.group[name] for name in names] for subset, names in zip(subsets, arrays, strict=True)]
+        self._arrays = [[subset.array(name) for name in names] for subset, names in zip(subsets, arrays, strict=True)]
         self._where = where
         self.channels, self.size = 3 * len(arrays[0]), size
 

@@ -59,16 +59,16 @@ class StepDataset(Dataset):
         place = int(np.searchsorted(self._ends, index, side="right"))
         episode = int(self.episodes[place])
         step = int(index - (self._ends[place - 1] if place else 0))
-        group, values = self.subset.group, {}
+        array, values = self.subset.array, {}
         first, after = max(0, step - self.stack + 1), step + (2 if self.next_step else 1)
         if self.pictures:
-            frames = np.stack([group[name][episode, first:after] for name in self.pictures], axis=1)
+            frames = np.stack([array(name)[episode, first:after] for name in self.pictures], axis=1)
         for ahead, prefix in enumerate(("", "next_")[: 2 if self.next_step else 1]):
-            values[f"{prefix}state"] = group["state"][episode, step + ahead]
+            values[f"{prefix}state"] = array("state")[episode, step + ahead]
             if self.pictures:
                 rows = np.maximum(np.arange(step + ahead - self.stack + 1, step + ahead + 1), 0) - first
                 values[f"{prefix}pixels"] = stack_channels(frames[np.maximum(rows, 0)])
-        values |= {name: group[name][episode, step] for name in ("action", "reward", "discount")}
+        values |= {name: array(name)[episode, step] for name in ("action", "reward", "discount")}
         return _tensors(values | {"episode": np.asarray(episode), "step": np.asarray(step)})
 
 

@@ -164,7 +164,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
     lines += ["", "Names are task/level/distractor. A step is two control steps with the same action.", ""]
     lines += ["## Arrays", ""]
     rows = [
-        (f"`{name}`", str(first.group[name].dtype), " x ".join(map(str, first.group[name].metadata.dimension_names)))
+        (f"`{name}`", str(first.array(name).dtype), " x ".join(map(str, first.array(name).metadata.dimension_names)))
         for name in first.arrays
     ]
     lines += _table(("array", "type", "dimensions"), rows)

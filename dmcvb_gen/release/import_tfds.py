@@ -20,7 +20,7 @@ from PIL import Image
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD, LEVELS, is_maze, normalize_setting
 from dmcvb_gen.store.manifest import Manifest, SubsetRecord, environment
-from dmcvb_gen.store.schema import ArraySpec, array_specs
+from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     create_subset,
     finish_release,
@@ -42,7 +42,7 @@ MAX_RECORD = 2**31
 
 def imported_specs(task: Task, size: int) -> tuple[ArraySpec, ...]:
     """Arrays of an imported subset."""
-    return tuple(spec for spec in array_specs(task, size) if not spec.name.startswith(MISSING))
+    return tuple(spec for spec in array_specs(EpisodeShape.of(task), size) if not spec.name.startswith(MISSING))
 
 
 def import_tfds(

@@ -30,10 +30,11 @@ from dmcvb_gen.store.manifest import (
     parse_manifest,
     write_json_atomically,
 )
-from dmcvb_gen.store.schema import array_specs
+from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     commit_path,
     create_subset,
+    find_array,
     finish_release,
     read_commits,
     shard_count,
@@ -117,7 +118,8 @@ def environment_difference(manifest: Manifest) -> dict[str, tuple[str, str]]:
     return {
         name: (" or ".join(sorted({old.get(name, "unknown") for old in manifest.environments})) or "unknown", value)
         for name, value in here.items()
-        if value not in {old.get(name) for old in manifest.environments}
+        if any(name in old for old in manifest.environments)
+        and value not in {old.get(name) for old in manifest.environments}
     }
 
 
@@ -130,8 +132,8 @@ def compare_shards(one: Path, other: Path, record: SubsetRecord, shard: int) -> 
             zarr.open_group(str(root / subset_path(record.name)), mode="r", use_consolidated=False)
             for root in (one, other)
         ]
-        for spec in array_specs(get_task(record.task), record.size):
-            a, b = (np.asarray(group[spec.name][first:last]) for group in groups)
+        for spec in array_specs(EpisodeShape.of(get_task(record.task)), record.size):
+            a, b = (np.asarray(find_array(group, spec.name)[0][first:last]) for group in groups)
             if np.array_equal(a, b, equal_nan=a.dtype.kind == "f"):
                 continue
             gap = np.abs(a.astype(np.float64) - b.astype(np.float64))
@@ -158,7 +160,11 @@ def create_groups(root: Path, manifest: Manifest, records: Sequence[SubsetRecord
     for record in records:
         task = get_task(record.task)
         create_subset(
-            root, record, array_specs(task, record.size), task.max_steps + 1, subset_attributes(record, manifest)
+            root,
+            record,
+            array_specs(EpisodeShape.of(task), record.size),
+            task.max_steps + 1,
+            subset_attributes(record, manifest),
         )
 
 
@@ -237,7 +243,7 @@ def check(
             record = shards[commit.subset, commit.shard]
             promised = read_commit(root, record, commit.shard)
             held.setdefault(record.name, {})[commit.shard] = commit
-            equal = None if promised is None else promised == commit
+            equal = None if promised is None else promised.same_data(commit)
             outcomes.append(_outcome(root, folder, record, commit, damage(root, record, commit.shard), equal=equal))
             for file in commit.files:
                 (folder / file.path).unlink(missing_ok=True)  # a checked shard needs no room
@@ -317,7 +323,7 @@ def repair(
                 held.setdefault(record.name, {})[commit.shard] = commit
                 reasons[record.name, commit.shard] = was
                 continue
-            equal = None if promised is None else promised == commit
+            equal = None if promised is None else promised.same_data(commit)
             if equal is not False:
                 _move_in(root, folder, commit)
             outcomes.append(_outcome(root, folder, record, commit, was, equal=equal, repaired=equal is not False))
@@ -411,7 +417,7 @@ def remake(
     for commit in commits:
         record = shards[commit.subset, commit.shard]
         promised = read_commit(root, record, commit.shard)
-        equal = promised == commit if promised else None
+        equal = promised.same_data(commit) if promised else None
         if promised is None and record.digest and digests[record.name]:
             equal = digests[record.name] == record.digest
         outcomes.append(_outcome(root, out, record, commit, None, equal=equal))

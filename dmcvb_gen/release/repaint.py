@@ -30,7 +30,7 @@ from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.schema import ArraySpec, array_specs
+from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
 from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, sha256_file, start_release, write_shard
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -125,7 +125,7 @@ def repaint(
     jobs = []
     for subset, record, keep in pairs.values():
         task = get_task(record.task)
-        specs = array_specs(task, record.size) + label_specs(task, record.size, labels)
+        specs = array_specs(EpisodeShape.of(task), record.size) + label_specs(task, record.size, labels)
         create_subset(out, record, specs, task.max_steps + 1, subset_attributes(record, manifest))
         done = read_commits(out, record)
         for shard in sorted(set(subset.commits) - set(done)):
@@ -158,6 +158,7 @@ def _new_record(old, setting, size, renderer, samples, source, split, device) ->
             "name": f"{old.name.rsplit('/', 1)[0]}/{setting}",
             "setting": setting,
             "size": size or old.size,
+            "split": split,
             "renderer": {"name": backend, "samples": samples},
             "backgrounds": None,
             "digest": None,

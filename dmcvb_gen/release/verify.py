@@ -19,7 +19,7 @@ from dmcvb_gen.release.import_tfds import MISSING
 from dmcvb_gen.rollout.plan import renderer_for
 from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.store.pictures import picture_of
-from dmcvb_gen.store.schema import array_specs
+from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import read_commits, sha256_file, shard_count, subset_digest
 from dmcvb_gen.tasks import get_task
 
@@ -91,13 +91,13 @@ def check_values(subset: Subset) -> Iterator[Finding]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
     episodes = subset.episodes
-    for spec in array_specs(task, subset.record.size, pixels=bool(subset.pixel_arrays)):
+    for spec in array_specs(EpisodeShape.of(task), subset.record.size, pixels=bool(subset.pixel_arrays)):
         if is_imported(subset) and spec.name.startswith(MISSING):
             continue
-        if spec.name not in subset.group:
+        if spec.name not in subset.arrays:
             yield Finding("shapes", subset.name, f"array {spec.name} is missing")
             return
-        array = subset.group[spec.name]
+        array = subset.array(spec.name)
         rows = (task.max_steps + 1,) if spec.steps else ()
         wanted = (subset.record.episodes, *rows, *spec.shape)
         if array.shape != wanted or array.dtype != np.dtype(spec.dtype):
@@ -108,7 +108,7 @@ def check_values(subset: Subset) -> Iterator[Finding]:
         if not 0 < length <= task.max_steps:
             yield Finding("lengths", subset.name, f"length {length} is not in 1..{task.max_steps}", episode)
             continue
-        names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.group]
+        names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
         values = subset.episode(episode, [*names, "return", "terminated"])
         for name in names:
             bad = ~np.isfinite(values[name].reshape(len(values[name]), -1)).all(axis=1)

@@ -14,7 +14,8 @@ from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.rollout.plan import Job, Plan, load_policies, renderer_for
 from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
 from dmcvb_gen.store.manifest import SubsetRecord
-from dmcvb_gen.store.schema import array_specs, create_arrays, picture_layout_for
+from dmcvb_gen.store.schema import EpisodeShape, array_specs, create_arrays, picture_layout_for
+from dmcvb_gen.store.writer import find_array
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES, SHORT_STEPS, LONG_STEPS = 2, 127, 255
@@ -58,14 +59,14 @@ def measure(job: Job, record: SubsetRecord) -> Rate:
         rows = task.max_steps + 1
         with tempfile.TemporaryDirectory() as folder:
             group = zarr.create_group(folder)
-            specs, layout = array_specs(task, record.size), picture_layout_for(record.setting)
+            specs, layout = array_specs(EpisodeShape.of(task), record.size), picture_layout_for(record.setting)
             create_arrays(group, specs, SAMPLE_EPISODES, rows, SAMPLE_EPISODES, layout)
             for name, value in paint(
                 task, renderer, out.physics[:, : len_rows(exogenous)], exogenous, out.length, rows
             ):
-                group[name][:] = value
+                find_array(group, name)[0][:] = value
             for name, value in [*label_arrays(exogenous, out.length, rows), *out.arrays().items()]:
-                group[name][:] = value
+                find_array(group, name)[0][:] = value
             elapsed = time.perf_counter() - started
             files = [path for path in Path(folder).rglob("*") if path.is_file() and path.name != "zarr.json"]
             return elapsed, float(sum(path.stat().st_size for path in files))
@@ -111,6 +112,6 @@ def raw_bytes(plan: Plan) -> float:
     for job in plan.jobs:
         for record in job.subsets:
             task = get_task(record.task)
-            pictures = sum(spec.picture for spec in array_specs(task, record.size))
+            pictures = sum(spec.picture for spec in array_specs(EpisodeShape.of(task), record.size))
             total += len(job.episodes) * task.max_steps * pictures * record.size**2 * 3
     return float(np.ceil(total * 0.5))

@@ -20,7 +20,7 @@ from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, distractor_of, expand, is_maze, select
 from dmcvb_gen.store.manifest import Manifest, PolicyRecord, SubsetRecord, environment
-from dmcvb_gen.store.schema import array_specs
+from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     create_subset,
     finish_release,
@@ -32,6 +32,7 @@ from dmcvb_gen.store.writer import (
 )
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from dmcvb_gen.tasks.base import Task
 
 
 @dataclass(frozen=True)
@@ -163,6 +164,7 @@ def make_plan(
             episodes_per_shard=request.episodes_per_shard,
             size=recipe.size,
             deterministic=request.deterministic,
+            **subset_facts(task, request, recipe.split),
             policies=tuple(
                 PolicyRecord(
                     name=path.stem,
@@ -198,6 +200,20 @@ def make_plan(
         environments=(environment(),),
     )
     return _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, episodes)
+
+
+def subset_facts(task: Task, request: SubsetRequest, split: str) -> dict[str, Any]:
+    """What a `SubsetRecord` says of a subset for readers that know no tasks."""
+    per_goal = request.episodes_per_goal
+    return {
+        "family": "ant-maze" if is_maze(task.id) else "locomotion",
+        "views": tuple(task.views),
+        "hidden_goal": bool(task.goal_geoms) and request.setting in ("hidden", "fixed"),
+        "max_steps": task.max_steps,
+        "fixed_goals": per_goal and request.episodes // per_goal,
+        "episodes_per_goal": per_goal,
+        "split": split,
+    }
 
 
 def _plan_jobs(recipe, requests, manifest, root, wanted, policy_files, device, episodes) -> Plan:
@@ -288,7 +304,7 @@ def prepare(plan: Plan, expected_bytes: float = 0) -> Plan:
             create_subset(
                 root,
                 record,
-                array_specs(task, record.size),
+                array_specs(EpisodeShape.of(task), record.size),
                 task.max_steps + 1,
                 subset_attributes(record, manifest),
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import platform
@@ -51,13 +52,22 @@ class FileRecord(_Model):
 
 
 class CommitRecord(_Model):
-    """A shard that is whole: which episodes, which files. A shard without its record does not exist."""
+    """A shard that is whole: which episodes, which files. A shard without its record does not exist.
+
+    Attributes:
+      environment: what made it, see `environment`; empty in releases of version 1.
+    """
 
     subset: RelativePath
     shard: int = pydantic.Field(ge=0)
     episodes: tuple[int, int]
     steps: int = pydantic.Field(ge=0)
     files: tuple[FileRecord, ...]
+    environment: dict[str, str] = {}
+
+    def same_data(self, other: CommitRecord) -> bool:
+        """Whether both stand for the same bytes, wherever they were made."""
+        return self.model_copy(update={"environment": {}}) == other.model_copy(update={"environment": {}})
 
 
 class PolicyRecord(_Model):
@@ -70,7 +80,18 @@ class PolicyRecord(_Model):
 
 
 class SubsetRecord(_Model):
-    """One subset: what it was asked to be."""
+    """One subset: what it was asked to be.
+
+    Attributes:
+      family: of its task, "locomotion" or "ant-maze".
+      views: names of the pictures of a frame, in the order in which policies see them.
+      hidden_goal: whether the pictures that the subset is about have no goal in them (both kinds may be stored).
+      max_steps: transitions at which the time limit ends an episode.
+      fixed_goals, episodes_per_goal: how many pairs of start and goal there are, and how many episodes each has; what
+        is at hand may be fewer. None where both are drawn for each episode.
+      split: the videos and styles that it was painted with, "train" or "val".
+      pixels: whether pictures are stored; without them, they can be painted from physics states and labels.
+    """
 
     name: RelativePath
     task: str
@@ -83,6 +104,14 @@ class SubsetRecord(_Model):
     policies: tuple[PolicyRecord, ...] = ()
     renderer: dict[str, Any] = {}
     backgrounds: dict[str, Any] | None = None
+    family: str = "locomotion"
+    views: tuple[str, ...] = ("pixels",)
+    hidden_goal: bool = False
+    max_steps: int = 500
+    fixed_goals: int | None = None
+    episodes_per_goal: int | None = None
+    split: str = "train"
+    pixels: bool = True
     digest: Digest | None = None
 
 
@@ -110,8 +139,13 @@ class Manifest(_Model):
     format: Literal["dmcvb-gen release"] = "dmcvb-gen release"
 
 
-def environment() -> dict[str, str]:
-    """Versions and platform that can change a bit of the data."""
+def environment(device: str = "cpu") -> dict[str, str]:
+    """Versions, processor and painting device that can change a bit of the data."""
+    return dict(_environment(device))
+
+
+@functools.cache
+def _environment(device: str) -> dict[str, str]:
     packages = ("mujoco", "mujoco-warp", "warp-lang", "dm-control", "numpy", "torch", "zarr", "numcodecs")
     versions = {name: metadata.version(name) for name in packages}
     return {
@@ -119,6 +153,7 @@ def environment() -> dict[str, str]:
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "cpu": _cpu_name(),
+        "device": device,
         **versions,
     }
 
@@ -158,12 +193,44 @@ def _parse(model, text, where):
             f"{where} has schema version {version}, this dmcvb-gen {__version__} reads up to {SCHEMA_VERSION}; "
             "install a newer dmcvb-gen"
         )
+    if model is Manifest and version == 1:
+        data = _upgraded(data)
     try:
         return model.model_validate(data)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the top"
         raise StoreError(f"{where} is not valid at {place}: {first['msg']}") from None
+
+
+def _upgraded(data: dict[str, Any]) -> dict[str, Any]:
+    """A manifest of version 1 with what version 2 says of each subset; there were two families of tasks then."""
+    subsets, recipe = data.get("subsets"), data.get("recipe")
+    if not isinstance(subsets, list) or not isinstance(recipe, dict):
+        return data  # the model says what is wrong
+    patterns = recipe.get("subsets")
+    patterns = [p for p in patterns if isinstance(p, dict)] if isinstance(patterns, list) else []
+    upgraded = []
+    for old in subsets:
+        if not isinstance(old, dict):
+            return data
+        facts: dict[str, Any] = {"split": (old.get("backgrounds") or {}).get("split") or recipe.get("split", "train")}
+        if str(old.get("task")).startswith("ant-maze"):
+            facts |= {"family": "ant-maze", "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 600}
+            facts["hidden_goal"] = old.get("setting") in ("hidden", "fixed")
+            if old.get("setting") == "fixed":
+                facts |= _goal_pairs_of_version_1(old, patterns)
+        upgraded.append(facts | old)
+    return {**data, "subsets": upgraded}
+
+
+def _goal_pairs_of_version_1(record: dict[str, Any], patterns: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many pairs of start and goal a fixed subset has, from the recipe's pattern that asked for it."""
+    for pattern in patterns:
+        tasks, per_goal = pattern.get("tasks") or (), pattern.get("episodes_per_goal")
+        if record.get("task") in tasks and "fixed" in (pattern.get("settings") or ()) and per_goal:
+            return {"fixed_goals": record.get("episodes", 0) // per_goal, "episodes_per_goal": per_goal}
+    return {}
 
 
 def write_json_atomically(path: Path, value: pydantic.BaseModel | dict[str, Any]) -> None:

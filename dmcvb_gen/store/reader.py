@@ -38,7 +38,9 @@ class Subset:
         return f"<Subset {self.name}: {len(self.episodes)} of {self.record.episodes} episodes>"
 
     def __getstate__(self):  # zarr handles are opened again where the subset lands
-        return {key: value for key, value in self.__dict__.items() if key not in ("group", "lengths", "returns")}
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("group", "lengths", "returns", "paths")
+        }
 
     @functools.cached_property
     def group(self) -> zarr.Group:
@@ -51,10 +53,26 @@ class Subset:
     def attrs(self) -> dict[str, Any]:
         return dict(self.group.attrs)
 
+    @functools.cached_property
+    def paths(self) -> dict[str, str]:
+        """Array name -> path in the group."""
+        members = self.group.members(max_depth=None)
+        return {str(item.attrs.get("array", path)): path for path, item in members if isinstance(item, zarr.Array)}
+
     @property
     def arrays(self) -> tuple[str, ...]:
-        """Names of all arrays, e.g. "pixels", "exogenous/camera_position"."""
-        return tuple(sorted(name for name, item in self.group.members(max_depth=None) if isinstance(item, zarr.Array)))
+        """Names of all arrays, e.g. "pixels", "pixels/top", "exogenous/camera_position"."""
+        return tuple(sorted(self.paths))
+
+    def array(self, name: str) -> zarr.Array:
+        """One array, lazy, with an entry for each episode that the subset will have.
+
+        Raises:
+          UnknownNameError: the subset has no such array.
+        """
+        if name not in self.paths:
+            raise UnknownNameError(f"array of {self.name}", name, self.arrays)
+        return self.group[self.paths[name]]
 
     @property
     def pixel_arrays(self) -> tuple[str, ...]:
@@ -69,12 +87,12 @@ class Subset:
     @functools.cached_property
     def lengths(self) -> np.ndarray:
         """(episode,) int32: transitions of each committed episode, in the order of `episodes`."""
-        return self.group["length"][:][self.episodes]
+        return self.array("length")[:][self.episodes]
 
     @functools.cached_property
     def returns(self) -> np.ndarray:
         """(episode,) float64: return of each committed episode, in the order of `episodes`."""
-        return self.group["return"][:][self.episodes]
+        return self.array("return")[:][self.episodes]
 
     @property
     def steps(self) -> int:
@@ -96,8 +114,7 @@ class Subset:
         Returns:
           (episode, step, ...) for arrays with steps, rows past an episode's length are zero; else (episode, ...).
         """
-        if array not in self.group:
-            raise UnknownNameError(f"array of {self.name}", array, self.arrays)
+        source = self.array(array)
         if episodes is None:
             chosen = self.episodes
         elif isinstance(episodes, slice):
@@ -107,7 +124,6 @@ class Subset:
             missing = np.setdiff1d(chosen, self.episodes)
             if len(missing):
                 raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
-        source = self.group[array]
         if not len(chosen):
             return np.zeros((0, *source.shape[1:]), source.dtype)
         if len(chosen) == chosen[-1] - chosen[0] + 1 and (np.diff(chosen) == 1).all():
@@ -124,7 +140,7 @@ class Subset:
         values = {}
         for name in self.arrays if arrays is None else arrays:
             value = self.read(name, [index])[0]
-            if self.group[name].ndim > 1:
+            if self.array(name).ndim > 1:
                 value = value[: length if name in ("action", "reward", "discount") else length + 1]
             values[name] = value
         return values

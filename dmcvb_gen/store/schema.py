@@ -5,8 +5,14 @@ One Zarr v3 group a subset, arrays episode-major, one shard file an array and jo
     <release>/manifest.json
     <release>/<task>/<level>/<setting>.zarr/
         pixels                    (episode, step, height, width, channel) uint8
+        pixels_top ...            the same, of tasks with several views: pixels_<view>, pixels_hidden_goal_<view>
         state action reward ...   (episode, step, ...)
         length return ...         (episode,)
+        exogenous/...             (episode, step, ...) labels of the distractors
+
+Everything but the labels lies at the root, so `xarray.open_zarr` shows it. In Python the picture of a view is called
+"pixels/top" (`stored_name` says where it lies; releases of version 1 have such a group). Dimensions are named so that
+none has the name of an array: action_dim, state_dim, physics_dim (in version 1: action, state, physics).
 
 An episode of `length` L transitions fills rows 0..L; row t holds observation t, the action taken there
 and the reward that it earned; row L holds the last observation and no action (zeros)::
@@ -31,15 +37,12 @@ import zarr
 from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
 from dmcvb_gen.store.pictures import picture_arrays
-from dmcvb_gen.tasks.base import Task
 
-SCHEMA_VERSION = 1
-"""Version of the layout; a reader refuses a newer one."""
+SCHEMA_VERSION = 2
+"""Version of the layout and the manifest; a reader refuses a newer one, and reads all older ones."""
 
 PIXEL_CHUNK_STEPS = 32
 """Steps an inner chunk of the pictures: the unit of reading (chosen with scripts/bench_store.py)."""
-STATE_CHUNK_STEPS = None
-"""Inner chunks of the small arrays hold a whole episode."""
 
 
 @dataclass(frozen=True)
@@ -65,26 +68,73 @@ class ArraySpec:
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class EpisodeShape:
+    """What the episodes of a task look like; all that the layout needs to know of it.
+
+    Attributes:
+      views: names of the pictures of a frame, in their order; ("pixels",) for one.
+      goal: whether there are pictures with the goal hidden beside them.
+      state_fields: name -> (first, last + 1) in the state.
+      action_size, state_size, physics_size: entries of one step.
+      materials: materials whose colors are labels.
+      max_steps: transitions at which the time limit ends an episode.
+    """
+
+    views: tuple[str, ...]
+    goal: bool
+    state_fields: Mapping[str, tuple[int, int]]
+    action_size: int
+    state_size: int
+    physics_size: int
+    materials: int
+    max_steps: int
+
+    @classmethod
+    def of(cls, task: Any) -> EpisodeShape:
+        """The shape of a `dmcvb_gen.tasks` task (which this package does not import)."""
+        return cls(
+            views=tuple(task.views),
+            goal=bool(task.goal_geoms),
+            state_fields={name: (part.start, part.stop) for name, part in task.state_slices.items()},
+            action_size=task.action_size,
+            state_size=task.state_size,
+            physics_size=task.physics_size,
+            materials=task.model.nmat,
+            max_steps=task.max_steps,
+        )
+
+    @property
+    def rows(self) -> int:
+        """Rows of the step axis: one for each observation."""
+        return self.max_steps + 1
+
+
+def stored_name(name: str, schema_version: int = SCHEMA_VERSION) -> str:
+    """Path of an array inside its Zarr group: "pixels/top" lies at "pixels_top", labels in their group."""
+    return name if schema_version < 2 or name.startswith("exogenous/") else name.replace("/", "_")
+
+
 def picture_spec(name: str, size: int) -> ArraySpec:
     """The spec of one picture array of `size` x `size` RGB."""
     return ArraySpec(name, "uint8", (size, size, 3), ("height", "width", "channel"), picture=True)
 
 
-def array_specs(task: Task, size: int, pixels: bool = True) -> tuple[ArraySpec, ...]:
-    """All arrays of a subset of `task` with pictures of `size` (none with pixels=False)."""
-    names = picture_arrays(task.views) + (picture_arrays(task.views, hide_goal=True) if task.goal_geoms else ())
-    fields = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
-    views = len(task.views)
+def array_specs(shape: EpisodeShape, size: int, pixels: bool = True) -> tuple[ArraySpec, ...]:
+    """All arrays of a subset with episodes of `shape` and pictures of `size` (none with pixels=False)."""
+    names = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
+    fields = {name: list(part) for name, part in shape.state_fields.items()}
+    views = len(shape.views)
     specs = [picture_spec(name, size) for name in names] if pixels else []
     specs += [
-        ArraySpec("state", "float32", (task.state_size,), ("state",), attributes={"fields": fields}),
-        ArraySpec("action", "float32", (task.action_size,), ("action",)),
+        ArraySpec("state", "float32", (shape.state_size,), ("state_dim",), attributes={"fields": fields}),
+        ArraySpec("action", "float32", (shape.action_size,), ("action_dim",)),
         ArraySpec("reward", "float32"),
         ArraySpec("discount", "float32"),
-        ArraySpec("physics", "float64", (task.physics_size,), ("physics",)),
+        ArraySpec("physics", "float64", (shape.physics_size,), ("physics_dim",)),
         ArraySpec("exogenous/camera_position", "float32", (views, 3), ("view", "xyz")),
         ArraySpec("exogenous/camera_quaternion", "float32", (views, 4), ("view", "wxyz")),
-        ArraySpec("exogenous/material_rgb", "float32", (task.model.nmat, 3), ("material", "rgb")),
+        ArraySpec("exogenous/material_rgb", "float32", (shape.materials, 3), ("material", "rgb")),
         ArraySpec("exogenous/background_video", "int16"),
         ArraySpec("exogenous/background_frame", "int16"),
         ArraySpec("exogenous/style", "int16"),
@@ -149,6 +199,7 @@ def create_arrays(
     episodes_per_shard: int,
     picture_layout: str = "zstd",
     chunk_steps: int | None = None,
+    schema_version: int = SCHEMA_VERSION,
 ) -> None:
     """Create the (empty) arrays of a subset: metadata only, no data.
 
@@ -156,6 +207,7 @@ def create_arrays(
       episodes: episodes the subset will have.
       rows: rows of the step axis, max_steps + 1.
       episodes_per_shard: episodes a shard file.
+      schema_version: of the release; a shard of an older one is made again where it lay.
     """
     for spec in specs:
         if not spec.steps:
@@ -173,13 +225,13 @@ def create_arrays(
             codecs = dict(filters=(), compressors=(ZstdCodec(level=3),))
         codecs["compressors"] = (*codecs["compressors"], Crc32cCodec())
         group.create_array(
-            name=spec.name,
+            name=stored_name(spec.name, schema_version),
             shape=shape,
             chunks=chunks,
             shards=shards,
             dtype=spec.dtype,
             fill_value=0,
             dimension_names=dims,
-            attributes=dict(spec.attributes),
+            attributes={"array": spec.name, **spec.attributes},
             **codecs,
         )

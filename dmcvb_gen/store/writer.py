@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -25,7 +26,8 @@ from dmcvb_gen.store.manifest import (
     parse_manifest,
     write_json_atomically,
 )
-from dmcvb_gen.store.schema import ArraySpec, create_arrays, picture_layout_for
+from dmcvb_gen.store.manifest import environment as this_environment
+from dmcvb_gen.store.schema import SCHEMA_VERSION, ArraySpec, create_arrays, picture_layout_for, stored_name
 
 
 def subset_path(name: str) -> str:
@@ -98,17 +100,34 @@ def _short(value) -> str:
 def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
     """Create a subset's group and arrays (metadata alone), unless they are there already.
 
+    Data are never at risk: where shards are committed, only metadata that is missing is written.
+
+    Args:
+      attributes: of the group; its "schema_version" decides where arrays lie.
+
     Raises:
       StoreError: the folder cannot be written.
     """
     path = root / subset_path(subset.name)
     if (path / ".created").exists():
         return
+    version = attributes.get("schema_version", SCHEMA_VERSION)
+    shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
     try:
+        if any((root / "commits" / subset.name).glob("*.json")):
+            with tempfile.TemporaryDirectory(prefix=".create-", dir=root) as folder:
+                group = zarr.create_group(folder, attributes=attributes, overwrite=True)
+                create_arrays(group, specs, *shape, schema_version=version)
+                zarr.consolidate_metadata(folder)
+                for source in sorted(Path(folder).rglob("zarr.json")):
+                    target = path / source.relative_to(folder)
+                    if not target.exists():
+                        target.parent.mkdir(parents=True, exist_ok=True)
+                        os.replace(source, target)
+            (path / ".created").touch()
+            return
         group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
-        create_arrays(
-            group, specs, subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting)
-        )
+        create_arrays(group, specs, *shape, schema_version=version)
         zarr.consolidate_metadata(str(path))
         (path / ".created").touch()  # an interrupted creation is done again from the start
     except OSError as error:
@@ -121,6 +140,7 @@ def write_shard(
     shard: int,
     arrays: Iterable[tuple[str, np.ndarray]],
     lengths: np.ndarray,
+    environment: Mapping[str, str] | None = None,
 ) -> CommitRecord:
     """Write the arrays of one shard and commit it.
 
@@ -128,6 +148,7 @@ def write_shard(
       arrays: (name, values (episode of the shard, ...)) pairs, taken one after the other, so that a caller
         may make the big ones as they are asked for.
       lengths: (episode of the shard,) transitions of each episode.
+      environment: what made them, by default this machine's with pictures painted on the CPU.
 
     Raises:
       StoreError: the disk is full or cannot be written; what was committed stays.
@@ -140,7 +161,7 @@ def write_shard(
         group = zarr.open_group(str(group_path), mode="r+", use_consolidated=False)
         files = []
         for name, values in arrays:
-            array = group[name]
+            array, name = find_array(group, name)
             file = group_path / name / array.metadata.encode_chunk_key((shard,) + (0,) * (array.ndim - 1))
             for stale in file.parent.glob(f"{file.name}*.partial"):
                 stale.unlink(missing_ok=True)  # left by a killed writer
@@ -157,6 +178,7 @@ def write_shard(
             episodes=(first, last),
             steps=int(np.sum(lengths)),
             files=tuple(sorted(files, key=lambda file: file.path)),
+            environment=dict(environment if environment is not None else this_environment()),
         )
         write_json_atomically(record, commit)
     except OSError as error:
@@ -165,6 +187,13 @@ def write_shard(
             "is safe, make room and run the same command again"
         ) from None
     return commit
+
+
+def find_array(group: zarr.Group, name: str) -> tuple[zarr.Array, str]:
+    """An array by its name, and its path, in the layout that the group has."""
+    path = stored_name(name)
+    path = path if path in group else name
+    return group[path], path
 
 
 def shard_count(subset: SubsetRecord) -> int:
@@ -210,13 +239,23 @@ def subset_digest(commits: Mapping[int, CommitRecord]) -> str:
 
 def finish_release(root: Path, manifest: Manifest) -> Manifest:
     """Write digests of the subsets that are whole; the manifest is complete when all are."""
-    subsets, complete = [], True
+    subsets, complete, made = [], True, []
     for subset in manifest.subsets:
         commits = read_commits(root, subset)
         whole = len(commits) == shard_count(subset)
         complete &= whole
+        made += [commits[shard].environment for shard in sorted(commits)]
         subsets.append(subset.model_copy(update={"digest": subset_digest(commits) if whole else None}))
-    manifest = manifest.model_copy(update={"subsets": tuple(subsets), "complete": complete})
+    if not all(made):  # shards of version 1 do not say where they were made, the manifest did
+        made = [*manifest.environments, *(environment for environment in made if environment)]
+    environments = tuple(environment for i, environment in enumerate(made) if environment not in made[:i])
+    manifest = manifest.model_copy(
+        update={
+            "subsets": tuple(subsets),
+            "complete": complete,
+            "environments": environments or manifest.environments,
+        }
+    )
     try:
         write_json_atomically(root / MANIFEST, manifest)
     except OSError as error:

@@ -96,7 +96,7 @@ def _features(subset, names) -> dict:
         for name in names.values()
     }
     for name, array in (("observation.state", "state"), ("action", "action")):
-        features[name] = {"dtype": "float32", "shape": [subset.group[array].shape[-1]], "names": None}
+        features[name] = {"dtype": "float32", "shape": [subset.array(array).shape[-1]], "names": None}
     features |= {"next.reward": {"dtype": "float32", **scalar}, "next.done": {"dtype": "bool", **scalar}}
     features["timestamp"] = {"dtype": "float32", **scalar}
     for name in ("frame_index", "episode_index", "index", "task_index"):

@@ -19,11 +19,11 @@ def write(source: Source, folder: Path) -> None:
     """Write a dataset that `minari.MinariDataset(folder / "data")` opens; copied to
     `~/.minari/datasets/dmcvb_gen/<task>/<level>-<setting>-v0/data`, it goes by that name."""
     subset = source.subset
-    action = subset.group["action"].shape[-1]
+    action = subset.array("action").shape[-1]
     pictures = {
         view: spaces.Box(0, 255, (subset.record.size, subset.record.size, 3), np.uint8) for view in source.views
     }
-    state = spaces.Box(-np.inf, np.inf, (subset.group["state"].shape[-1],), np.float32)
+    state = spaces.Box(-np.inf, np.inf, (subset.array("state").shape[-1],), np.float32)
     storage = MinariStorage.new(
         folder / "data",
         observation_space=spaces.Dict({**pictures, "state": state}),

@@ -92,12 +92,12 @@ def _features(source: Source) -> dict[str, Any]:
         "image": {"shape": {"dimensions": [size, size, "3"]}, "dtype": "uint8", "encodingFormat": "png"},
     }
     observation = {view: picture for view in source.views}
-    observation["state"] = _tensor("float32", subset.group["state"].shape[-1])
+    observation["state"] = _tensor("float32", subset.array("state").shape[-1])
     for name, part in get_task(subset.task).state_slices.items():
         observation[name] = _tensor("float64", *([part.stop - part.start] if part.stop - part.start > 1 else []))
     step = {
         "observation": _dict(observation),
-        "action": _tensor("float32", subset.group["action"].shape[-1]),
+        "action": _tensor("float32", subset.array("action").shape[-1]),
         "reward": _tensor("float32"),
         "discount": _tensor("float32"),
         "is_first": _tensor("bool"),
