@@ -41,6 +41,25 @@ def roll_out(recipe, folder, jobs=lambda jobs: jobs, workers=1, only=()):
     return finish(plan)
 
 
+TINY_MAZE = "ant-maze-tiny:****/*..*/****"
+"""Two cells: even random actions find the goal now and then."""
+
+
+def maze_recipe(settings=("visible",), **changes):
+    """A maze of two cells, random actions, 2 episodes in shards of 1, small pictures."""
+    pattern = {"tasks": TINY_MAZE, "levels": "random", "settings": list(settings), "episodes": 2}
+    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "warp", "samples": 1}}
+    return make_recipe(fields | {"subsets": [pattern | {"episodes_per_shard": 1} | changes]})
+
+
+@pytest.fixture(scope="session")
+def maze_release(tmp_path_factory):
+    """Folder of a finished small release of a maze."""
+    folder = tmp_path_factory.mktemp("maze") / "release"
+    roll_out(maze_recipe(), folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def small_release(tmp_path_factory):
     """Folder of a finished small release."""

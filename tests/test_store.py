@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,14 +15,19 @@ import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
+import dmcvb_gen
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.rollout.executors import run_jobs
+from dmcvb_gen.rollout.plan import finish, make_plan, prepare
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import check_relative_path, parse_commit, parse_manifest
 from dmcvb_gen.store.schema import create_arrays, picture_codecs, picture_spec
-from dmcvb_gen.store.writer import sha256_file, subset_digest
+from dmcvb_gen.store.writer import finish_release, sha256_file, subset_digest
 from dmcvb_gen.tasks import get_task
+from tests.conftest import small_recipe
 
 NAME = "walker-walk/random/dynamic"
+MAZE = "ant-maze-tiny/random/visible"
 
 
 @pytest.mark.parametrize(
@@ -98,6 +107,107 @@ def test_xarray_opens_a_subset_with_named_dimensions(small_release):
         open_release(small_release)[NAME].returns[1], rel=1e-4
     )
     assert data.attrs["task"] == "walker-walk" and data.attrs["state_fields"]["height"] == [14, 15]
+
+
+def test_xarray_opens_a_maze_at_its_root_with_all_pictures(maze_release):
+    path = maze_release / f"{MAZE}.zarr"
+    data = xarray.open_zarr(path)
+    subset = open_release(maze_release)[MAZE]
+    for view in ("top", "egocentric", "follow", "overhead"):
+        for kind in ("pixels", "pixels_hidden_goal"):
+            found = data[f"{kind}_{view}"]
+            assert found.dims == ("episode", "step", "height", "width", "channel")
+            np.testing.assert_array_equal(found[0], subset.read(f"{kind}/{view}", [0])[0])
+    assert {"action", "state", "physics"} <= set(data.data_vars) and not data.coords
+
+
+@pytest.mark.parametrize("name", [NAME, MAZE])
+def test_a_release_of_version_1_reads_as_before(small_release, maze_release, tmp_path, name):
+    source = small_release if name == NAME else maze_release
+    folder = version_1(source, tmp_path / "old", name)
+    old, new = open_release(folder)[name], open_release(source)[name]
+    assert open_release(folder).manifest.schema_version == 1
+    assert old.arrays == new.arrays and old.record.views == new.record.views and old.record.family == new.record.family
+    assert (old.record.hidden_goal, old.record.max_steps) == (new.record.hidden_goal, new.record.max_steps)
+    for array in new.arrays:
+        np.testing.assert_array_equal(old.read(array), new.read(array))
+    data = dmcvb_gen.open(folder)[name].xarray()
+    assert {"action", "state", "physics", "exogenous_style"} <= set(data.data_vars)
+    xarray.testing.assert_equal(data.drop_attrs(), dmcvb_gen.open(source)[name].xarray().drop_attrs())
+
+
+def version_1(source, folder, name):
+    """One subset of a release as version 1 laid it out: a group for a kind of picture, dimensions named as arrays."""
+    shutil.copytree(source, folder, ignore=lambda path, names: [n for n in names if n == "files.json"])
+    root = folder / f"{name}.zarr"
+    for path in sorted(root.glob("pixels_*")):
+        kind, _, view = path.name.rpartition("_")
+        zarr.open_group(str(root / kind), mode="a")
+        path.rename(root / kind / view)
+    for path in root.rglob("zarr.json"):
+        data = json.loads(path.read_text())
+        data.pop("consolidated_metadata", None)
+        data["attributes"].pop("array", None)
+        if data["node_type"] == "array":
+            data["dimension_names"] = [dimension.removesuffix("_dim") for dimension in data["dimension_names"]]
+        path.write_text(json.dumps(data))
+    zarr.consolidate_metadata(str(root))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    keep = ("name task level setting episodes episodes_per_shard size deterministic policies renderer backgrounds "
+            "digest").split()  # fmt: skip
+    records = [record for record in manifest["subsets"] if record["name"] == name]
+    manifest["subsets"] = [{field: record[field] for field in keep} for record in records]
+    known = "name version license authors generator recipe subsets environments lineage complete format".split()
+    manifest = {field: manifest[field] for field in known} | {"schema_version": 1}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    for path in (folder / "commits" / name).glob("*.json"):
+        data = json.loads(path.read_text())
+        del data["environment"]
+        for file in data["files"]:
+            file["path"] = re.sub(r"/(pixels_hidden_goal|pixels)_([a-z]+)/", r"/\1/\2/", file["path"])
+        path.write_text(json.dumps(data))
+    return folder
+
+
+def test_a_subset_without_its_marker_keeps_every_shard(small_release, tmp_path):
+    """`publish` and plain copies do not carry `.created`; going on with a rollout must not start the subset anew."""
+    folder = tmp_path / "copy"
+    shutil.copytree(small_release, folder)
+    (folder / f"{NAME}.zarr" / ".created").unlink()
+    (folder / "commits" / NAME / "00001.json").unlink()
+    (folder / f"{NAME}.zarr" / "reward" / "zarr.json").unlink()
+    kept = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "manifest.json"}
+    plan = prepare(make_plan(small_recipe(), folder))
+    assert {path: path.read_bytes() for path in kept if path.name != "files.json"} == {
+        path: data for path, data in kept.items() if path.name != "files.json"
+    }
+    assert [job.shard for job in plan.jobs] == [1]
+    assert (folder / f"{NAME}.zarr" / "reward" / "zarr.json").is_file()
+    for _ in run_jobs(plan.jobs, 1):
+        pass
+    digests = {subset.name: subset.digest for subset in finish(plan).subsets}
+    assert digests == {name: subset.record.digest for name, subset in open_release(small_release).subsets.items()}
+
+
+def test_the_store_knows_no_tasks():
+    code = "import sys, dmcvb_gen.store; print([m for m in sys.modules if m in ('mujoco', 'dmcvb_gen.tasks')])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_a_commit_says_where_it_was_made_and_the_manifest_sums_up(small_release, tmp_path):
+    release = open_release(small_release)
+    made = [commit.environment for subset in release.subsets.values() for commit in subset.commits.values()]
+    assert all(environment["device"] == "cpu" and environment["mujoco"] for environment in made)
+    assert release.manifest.environments == (made[0],)
+    folder = tmp_path / "copy"
+    shutil.copytree(small_release, folder)
+    path = folder / "commits" / NAME / "00001.json"
+    commit = json.loads(path.read_text())
+    commit["environment"]["cpu"] = "Another 9000"
+    path.write_text(json.dumps(commit))
+    finished = finish_release(folder, release.manifest)
+    assert [where["cpu"] for where in finished.environments] == [made[0]["cpu"], "Another 9000"]
 
 
 def test_digests_of_the_records_are_those_of_the_files(small_release):

@@ -36,8 +36,10 @@ class SubsetReader(Subset):
         options = {"storage_options": self._storage_options} if "://" in self.root else {}
         path = f"{self.root}/{self.name}.zarr"
         parts = []
-        for folder in sorted({name.rpartition("/")[0] for name in self.arrays}):
+        for folder in sorted({path.rpartition("/")[0] for path in self.paths.values()}):
             part = xarray.open_zarr(path, group=folder or None, consolidated=None, chunks=None, **options)
+            # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
+            part = part.reset_coords().rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
             parts.append(part.rename({name: f"{folder}_{name}".replace("/", "_") for name in part} if folder else {}))
         merged = xarray.merge(parts, combine_attrs="override")
         merged = merged.isel(episode=chosen).assign_coords(episode=chosen, step=np.arange(merged.sizes["step"]))

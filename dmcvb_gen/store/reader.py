@@ -55,7 +55,7 @@ class Subset:
 
     @functools.cached_property
     def paths(self) -> dict[str, str]:
-        """Array name -> path in the group."""
+        """Array name -> path in the Zarr group, see `schema.stored_name`."""
         members = self.group.members(max_depth=None)
         return {str(item.attrs.get("array", path)): path for path, item in members if isinstance(item, zarr.Array)}
 
