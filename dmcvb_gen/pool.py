@@ -22,7 +22,7 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 
 from dmcvb_gen.errors import StoreError
 
-Item = TypeVar("Item", bound=Hashable)
+Item = TypeVar("Item")
 Tick = Callable[..., None]
 """Told by the functions at work how far they are; called in the process that asked for the work."""
 

@@ -46,12 +46,11 @@ def _out_default(name: str) -> Path:
 @click.option("--deterministic", is_flag=True, help="Mean actions instead of samples.")
 @click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
-@click.option("--executor", type=click.Choice(["serial", "processes", "ray"]), help="Default: by --workers.")
 @click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
 @click.option("--out", type=click.Path(path_type=Path), help="The release's folder.  [default: releases/NAME]")
 @click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
 @json_option
-def rollout(tasks, recipe, only, episode_range, out, workers, executor, device, dry_run, as_json, **options):
+def rollout(tasks, recipe, only, episode_range, out, workers, device, dry_run, as_json, **options):
     """Roll out behaviour policies into a release of painted episodes.
 
     The same command goes on where it stopped: what is committed is kept.
@@ -78,7 +77,7 @@ def rollout(tasks, recipe, only, episode_range, out, workers, executor, device, 
     started, steps, seconds = time.time(), 0, {}
     with _told_when_stopped(), _progress(prepared, as_json) as bar:
         finished = 0
-        for result in run_jobs(prepared.jobs, workers, bar.update, executor):
+        for result in run_jobs(prepared.jobs, workers, bar.update):
             finished += sum(commit.episodes[1] - commit.episodes[0] for commit in result.commits)
             steps += result.steps
             for part, value in result.seconds.items():

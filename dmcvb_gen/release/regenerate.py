@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.pool import Tick, ignore
 from dmcvb_gen.release.shards import ShardKey, chosen_shards, damage, make_jobs, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.plan import Job, subset_attributes
@@ -44,8 +45,6 @@ from dmcvb_gen.store.writer import (
     subset_path,
 )
 from dmcvb_gen.tasks import get_task
-
-Tick = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,7 @@ def check(
     backgrounds: str | None = None,
     device: str | None = None,
     workers: int = 1,
-    tick: Tick = lambda frames: None,
+    tick: Tick = ignore,
 ) -> Outcome:
     """Make shards again and compare their digests with the release; the release is not changed.
 
@@ -293,7 +292,7 @@ def repair(
     backgrounds: str | None = None,
     device: str | None = None,
     workers: int = 1,
-    tick: Tick = lambda frames: None,
+    tick: Tick = ignore,
 ) -> Outcome:
     """Make damaged and missing shards again, in place; sound ones are not touched.
 
@@ -380,7 +379,7 @@ def remake(
     backgrounds: str | None = None,
     device: str | None = None,
     workers: int = 1,
-    tick: Tick = lambda frames: None,
+    tick: Tick = ignore,
 ) -> Outcome:
     """Write a release beside, from the manifest of `root`; run again, it goes on where it stopped.
 

@@ -7,25 +7,22 @@ the very bytes that rolling it out would have given.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
+from dmcvb_gen.names import ANT_MAZE, DistractorSetting, family_of, select
+from dmcvb_gen.pool import Tick, ignore, run_all
 from dmcvb_gen.release.regenerate import copy_policies
 from dmcvb_gen.release.shards import damage, policy_files, recipe_of, stream_names
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.plan import Job, check_renderer, renderer_for, subset_attributes
-from dmcvb_gen.rollout.recipe import check_size, is_maze, make_recipe, select
+from dmcvb_gen.rollout.recipe import check_size, make_recipe
 from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment
@@ -75,7 +72,7 @@ def repaint(
     labels: Sequence[str] = (),
     name: str | None = None,
     workers: int = 1,
-    tick: Callable[[int], None] = lambda frames: None,
+    tick: Tick = ignore,
 ) -> Manifest:
     """Write a release with new pictures of the episodes of another; run again, it goes on where it stopped.
 
@@ -133,7 +130,7 @@ def repaint(
             job = Job(str(out), (record,), shard, files[record.name], recipe.seed, names, source, split, device)
             jobs.append(PaintJob(subset, record, job, keep, tuple(labels)))
     copy_policies(release.path, out, [record for _, record, _ in pairs.values()], [job.job for job in jobs])
-    for _ in _run(jobs, workers, tick):
+    for _ in run_all(paint_shard, jobs, workers, tick=tick):
         pass
     return finish_release(out, manifest)
 
@@ -141,7 +138,7 @@ def repaint(
 def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None) -> str:
     if distractor is None and difficulty is None:
         return subset.setting
-    if is_maze(subset.task):
+    if family_of(subset.task) == ANT_MAZE:
         raise RecipeError(f"{subset.name} varies in style, not by distractor; leave --distractor away or use --only")
     old = DistractorSetting.parse(subset.setting)
     given = DistractorSetting.parse(distractor) if distractor else old
@@ -251,7 +248,7 @@ def _renderer(record: SubsetRecord, job: Job) -> tuple[Renderer, Any]:
     return _renderers[key]
 
 
-def paint_shard(job: PaintJob, tick: Callable[[int], None] = lambda frames: None) -> CommitRecord:
+def paint_shard(job: PaintJob, tick: Tick = ignore) -> CommitRecord:
     """Paint and commit one shard.
 
     Raises:
@@ -292,24 +289,3 @@ def _label_pictures(task, renderer, physics, exogenous, length, rows, label) -> 
             e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
             out[e, r] = renderer.render_labels(physics[e, r], exogenous[e, r], [view])[label][:, 0]
         yield (label if task.views == ("pixels",) else f"{label}/{view}"), out
-
-
-def _run(jobs: Sequence[PaintJob], workers: int, tick) -> Iterator[CommitRecord]:
-    if workers <= 1 or len(jobs) <= 1:
-        for job in jobs:
-            yield paint_shard(job, tick)
-        return
-    with ProcessPoolExecutor(min(workers, len(jobs)), multiprocessing.get_context("spawn")) as pool:
-        futures = {pool.submit(paint_shard, job): job for job in jobs}
-        try:
-            for future in as_completed(futures):
-                tick(futures[future].job.frames)
-                yield future.result()
-        except BrokenProcessPool:
-            raise StoreError(
-                "a worker process was killed (out of memory?); what was committed is safe: run the same command "
-                f"again, with fewer --workers than {workers} on {os.cpu_count()} cores"
-            ) from None
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise

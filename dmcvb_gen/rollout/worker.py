@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import numpy as np
 from dmcvb_gen.behaviours.policies.simulate import Simulation, simulate
 from dmcvb_gen.distractors import make_exogenous
 from dmcvb_gen.labels import Exogenous
+from dmcvb_gen.names import distractor_of
+from dmcvb_gen.pool import Tick, ignore
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.plan import Job, load_policies, renderer_for
-from dmcvb_gen.rollout.recipe import distractor_of
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord
 from dmcvb_gen.store.pictures import picture_arrays
@@ -92,7 +93,7 @@ def paint(
     exogenous: Exogenous,
     length: np.ndarray,
     rows: int,
-    tick: Callable[[int], None] = lambda frames: None,
+    tick: Tick = ignore,
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Pictures of episodes, one array at a time.
 
@@ -187,7 +188,7 @@ class _RendererCache:
 _renderers = _RendererCache()
 
 
-def run_job(job: Job, tick: Callable[[int], None] = lambda frames: None, threads: int = 1) -> JobResult:
+def run_job(job: Job, threads: int = 1, tick: Tick = ignore) -> JobResult:
     """Simulate, paint and commit a job.
 
     Args:
