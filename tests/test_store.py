@@ -128,7 +128,7 @@ def test_a_release_of_version_1_reads_as_before(small_release, maze_release, tmp
     old, new = open_release(folder)[name], open_release(source)[name]
     assert open_release(folder).manifest.schema_version == 1
     assert old.arrays == new.arrays and old.record.views == new.record.views and old.record.family == new.record.family
-    assert (old.record.hidden_goal, old.record.max_steps) == (new.record.hidden_goal, new.record.max_steps)
+    assert old.record.max_steps == (500 if name == NAME else 1200) and not old.record.hidden_goal
     for array in new.arrays:
         np.testing.assert_array_equal(old.read(array), new.read(array))
     data = dmcvb_gen.open(folder)[name].xarray()

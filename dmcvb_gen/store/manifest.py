@@ -216,7 +216,7 @@ def _upgraded(data: dict[str, Any]) -> dict[str, Any]:
             return data
         facts: dict[str, Any] = {"split": (old.get("backgrounds") or {}).get("split") or recipe.get("split", "train")}
         if str(old.get("task")).startswith("ant-maze"):
-            facts |= {"family": "ant-maze", "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 600}
+            facts |= {"family": "ant-maze", "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 1200}
             facts["hidden_goal"] = old.get("setting") in ("hidden", "fixed")
             if old.get("setting") == "fixed":
                 facts |= _goal_pairs_of_version_1(old, patterns)
