@@ -13,22 +13,38 @@ from dm_control.locomotion.tasks import random_goal_maze
 from dm_control.locomotion.walkers import ant
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from labmaze import assets
 from scipy import ndimage
 
 from dmcvb_gen.errors import LayoutError, UnknownNameError
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, fixed_pairs, layout_task_id
-from dmcvb_gen.tasks.ant_maze.arena import GOAL_HEIGHT, GOAL_RADIUS, WALL_HEIGHT
-from dmcvb_gen.tasks.ant_maze.distance import PIXELS, descend, geodesic_field, look_up, make_field, saturated_field
+from dmcvb_gen.tasks.ant_maze.arena import WALL_HEIGHT
+from dmcvb_gen.tasks.ant_maze.distance import (
+    PIXELS,
+    descend,
+    floor_speed,
+    geodesic_field,
+    look_up,
+    make_field,
+    saturated_field,
+)
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, get_layout, make_layout
+from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
 from dmcvb_gen.tasks.ant_maze.waypoints import headings
+
+GOAL_RADIUS, GOAL_HEIGHT = 0.5, 1.0
+"""The released goal (SPEC, section 3), written here once more."""
+BEHAVIOUR_ENDS = np.cumsum([FIELDS[name] for name in BEHAVIOUR_FIELDS])[:-1]
 
 
 def composer_environment(layout, goal):
-    """dm_control's own environment of a layout, its goal at (x, y)."""
+    """dm_control's own environment of a layout, its goal at (x, y), with DMC-VB's cameras on the walker."""
     maze = labmaze.FixedMazeWithRandomGoals(entity_layer=layout.entity_layer, num_spawns=1, num_objects=1)
     arena = mazes.MazeWithTargets(maze=maze, xy_scale=CELL, z_height=WALL_HEIGHT)
     walker = ant.Ant()
+    walker.mjcf_model.worldbody.add("camera", name="follow", pos=[-1, 0, 2], zaxis=[-1, 0, 2])
+    walker.mjcf_model.worldbody.add("camera", name="overhead", pos=[0, 0, 3], zaxis=[0, 0, 1])
     sphere = target_sphere.TargetSphere(radius=GOAL_RADIUS, height_above_ground=GOAL_HEIGHT)
     task = random_goal_maze.RepeatSingleGoalMaze(
         walker, arena, target=sphere, contact_termination=False, aliveness_threshold=-2
@@ -102,8 +118,22 @@ def test_agrees_with_dm_control(layout, seed, kind, steps):
         np.testing.assert_array_equal(ours["walker_position"], torso.xpos)
         vector = physics.bind(sphere.geom).xpos - torso.xpos
         np.testing.assert_allclose(ours["target_vector"], vector, atol=1e-12)
-        ego = environment.task._walker.transform_vec_to_egocentric_frame(physics, vector)
+        assert ours["target_position"][2] == GOAL_HEIGHT
+        to_egocentric = environment.task._walker.transform_vec_to_egocentric_frame
+        # As released: the goal geom's own position in its body, (0, 0, 1), taken for one of the world.
+        local = physics.bind(sphere.geom).pos
+        ego = to_egocentric(physics, local - torso.xpos)
         np.testing.assert_allclose(ours["egocentric_target_vector"], ego, atol=1e-12)
+        seen = dict(zip(BEHAVIOUR_FIELDS, np.split(batch.behaviour_observation()[0], BEHAVIOUR_ENDS), strict=True))
+        for name, value in ours.items():  # policies see parts of the state, but true vectors
+            if name in seen and name != "egocentric_target_vector":
+                np.testing.assert_array_equal(seen[name], value.astype(np.float32))
+        np.testing.assert_allclose(seen["egocentric_target_vector"], to_egocentric(physics, vector), atol=1e-5)
+        for camera in ("follow", "overhead"):
+            theirs, own = physics.model.camera(f"walker/{camera}").id, task.model.camera(f"walker/{camera}").id
+            np.testing.assert_allclose(batch.sims.bind("cam_xpos")[0, own], physics.data.cam_xpos[theirs], atol=1e-12)
+            np.testing.assert_allclose(batch.sims.bind("cam_xmat")[0, own], physics.data.cam_xmat[theirs], atol=1e-12)
+            assert task.model.cam_fovy[own] == physics.model.cam_fovy[theirs] == 45
         action = {
             "random": rng.uniform(-1, 1, 8),
             "extreme": rng.choice([-1.0, 1.0], 8),
@@ -129,7 +159,7 @@ def test_touch_ends_the_episode_where_dm_control_says_so():
     for seed in range(8):
         rng = np.random.default_rng(seed)
         batch.reset([rng])
-        angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(1.3, 2.5)
+        angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 1.9)
         goal = np.array([0.3, -0.2])
         batch._mocap[0, 0] = [*goal, 0]
         batch._qpos[0, :2] = goal + away * np.array([np.cos(angle), np.sin(angle)])
@@ -206,10 +236,125 @@ def test_starts_and_goals():
         off = np.abs(positions - layout.world(cells))
         assert off.max() <= noise + 1e-9 and off.max() > 0.9 * noise
     assert (np.rint(layout.grid(start)) != np.rint(layout.grid(goal))).any(axis=1).all()
+    height = batch._qpos[:, 2]
+    assert -0.25 <= height.min() < -0.23 and 0.23 < height.max() <= 0.25 and (batch._qpos[:, 7:] == 0).all()
+    assert task.max_steps == 600 and task.evaluation_steps == 1200
     yaw = 2 * np.arctan2(batch._qpos[:, 6], batch._qpos[:, 3])
     counts = np.histogram(yaw % (2 * np.pi), 8, (0, 2 * np.pi))[0]
     assert counts.min() > 25
-    assert ((batch.distance() > 0) & (batch.distance() <= 1)).all()
+    assert ((batch.distance() >= 0) & (batch.distance() / batch._largest <= 1)).all()
+
+
+def times_from_walls(floor):
+    """(row, column) travel times in pixels from walls, by the definition: pixels in the order of their times, each
+    solving the eikonal equation from its finished neighbors, to second order where two in a row are finished."""
+    time, done = np.where(floor, np.inf, 0.0), ~floor
+
+    def arrival(place):
+        terms = []
+        for axis in ((1, 0), (0, 1)):
+            near = [tuple(np.add(place, np.multiply(axis, sign))) for sign in (-1, 1)]
+            sign = -1 if time[near[0]] <= time[near[1]] else 1
+            first, second = near[(sign + 1) // 2], tuple(np.add(place, np.multiply(axis, 2 * sign)))
+            if not done[first]:
+                continue
+            inside = all(0 <= index < size for index, size in zip(second, floor.shape, strict=True))
+            if inside and done[second] and time[second] <= time[first]:
+                terms.append((9 / 4, (4 * time[first] - time[second]) / 3))
+            else:
+                terms.append((1.0, time[first]))
+        weights, values = np.array(terms).T
+        a, b, c = weights.sum(), (weights * values).sum(), (weights * values**2).sum() - 1
+        return (b + np.sqrt(b * b - a * c)) / a
+
+    queue = [(0.0, *place) for place in np.argwhere(~floor).tolist()]
+    while queue:
+        here, *place = heapq.heappop(queue)
+        place = tuple(place)
+        if floor[place] and (done[place] or here != time[place]):
+            continue
+        done[place] = True
+        for axis in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            other = tuple(np.add(place, axis))
+            if all(0 <= index < size for index, size in zip(other, floor.shape, strict=True)) and not done[other]:
+                time[other] = arrival(other)
+                heapq.heappush(queue, (time[other], *map(int, other)))
+    return time
+
+
+def test_speed_map_and_largest_distance_are_the_released_ones():
+    layout = get_layout("medium7x7a")
+    floor = np.kron(~layout.walls, np.ones((10, 10), bool))
+    speed = floor_speed(layout)
+    apart = np.abs(speed - np.minimum(times_from_walls(floor), 5) / 5)
+    # Around the corners of walls scikit-fmm takes other neighbors; a Euclidean distance would be 0.1 off everywhere.
+    assert (apart < 1e-9).mean() > 0.95 and apart.max() < 0.04
+    long_wall = floor_speed(get_layout("empty7x7"))[35, 10:17]
+    np.testing.assert_allclose(long_wall, [0.13, 0.31, 0.50, 0.70, 0.90, 1, 1], atol=5e-3)
+    assert any(abs(saturated_field(layout, cell).largest - 18.50) < 5e-3 for cell in layout.free)
+
+
+def test_distance_to_target_is_the_rewards_distance():
+    """d of the state, in meters along the way, over its maximum is minus the reward of a control step."""
+    task = get_task("ant-maze-medium7x7a")
+    batch = task.batch(6)
+    state = batch.reset([np.random.default_rng(i) for i in range(6)])
+    slices = task.state_slices
+    for number in range(6):
+        goal, start = (state[number, slices[name]][:2] for name in ("target_position", "walker_position"))
+        field = saturated_field(task.layout, tuple(np.rint(task.layout.grid(goal)).astype(int).tolist()))
+        row, column = np.round((task.layout.grid(start) + 0.5) * 10 - 1).astype(int)
+        distance = state[number, slices["distance_to_target"]][0]
+        assert distance == field.values[row, column] >= 0
+        assert -batch._control_reward()[number] == distance / field.largest
+    apart = np.linalg.norm(state[:, slices["target_vector"]], axis=1)
+    assert (state[:, slices["distance_to_target"]][:, 0] > apart + 0.5).any()  # around walls
+
+
+def test_views():
+    """What SPEC says of the four cameras, on the model at rest."""
+    task = get_task("ant-maze-easy7x7c")
+    data = mujoco.MjData(task.model)
+    mujoco.mj_forward(task.model, data)
+    torso, root = data.body("walker/torso"), 0.522
+    turn = torso.xmat.reshape(3, 3)
+    expected = {
+        "follow": ((-1, 0, 2 - root), [(0.894, 0, 0.447), (0, 1, 0), (-0.447, 0, 0.894)]),
+        "overhead": ((0, 0, 3 - root), np.eye(3)),
+    }
+    for view, (place, axes) in expected.items():
+        camera = task.model.camera(task.cameras[task.views.index(view)])
+        np.testing.assert_allclose(turn.T @ (data.cam_xpos[camera.id] - torso.xpos), place, atol=1e-3)
+        np.testing.assert_allclose((turn.T @ data.cam_xmat[camera.id].reshape(3, 3)).T, axes, atol=1e-3)
+        assert camera.fovy[0] == 45
+    assert task.model.camera("walker/egocentric").fovy[0] == 90
+    top = task.model.camera("top_camera")
+    np.testing.assert_allclose(top.fovy[0], np.degrees(2 * np.arctan(17.5 / 2 / 100)), atol=1e-12)
+    assert abs(top.fovy[0] - 10.0013) < 5e-5
+    np.testing.assert_array_equal(data.cam_xpos[top.id], [0, 0, 100])
+    np.testing.assert_allclose(data.cam_xmat[top.id], np.eye(3).ravel(), atol=1e-12)
+
+
+def test_every_texture_of_a_style_has_the_same_chance():
+    task = get_task("ant-maze-empty7x7")
+    assert task.styles("train") == (2, 3, 4, 5) and task.styles("val") == (1,)
+    counts = {style: [len(labmaze_textures(style, kind)) for kind in ("wall", "floor")] for style in range(1, 6)}
+    assert counts == {1: [8, 6], 2: [7, 5], 3: [7, 7], 4: [6, 6], 5: [4, 4]}
+    looks = {style: task.looks(style) for style in range(1, 6)}
+    assert [len(looks[style]) for style in range(1, 6)] == [48, 35, 49, 36, 16]
+    every = [look for style in range(1, 6) for look in looks[style]]
+    assert len(set(every)) == len(every)
+    faces = [task.model.geom(name).id for name in ("wall*_0_texturing_pos_z", "floor_0")]
+    for style in range(1, 6):
+        pairs = {tuple(task.style_geom_matid(look)[faces]) for look in looks[style]}
+        assert len(pairs) == len(looks[style])
+        walls, floors = (set(values) for values in zip(*pairs, strict=True))
+        assert [len(walls), len(floors)] == counts[style]
+
+
+def labmaze_textures(style, kind):
+    find = {"wall": assets.get_wall_texture_paths, "floor": assets.get_floor_texture_paths}[kind]
+    return find(f"style_{style:02}")
 
 
 def test_fixed_pairs():
@@ -222,14 +367,21 @@ def test_fixed_pairs():
     with pytest.raises(LayoutError, match="fixed-goals"):
         fixed_pairs(layout, cells * (cells - 1) + 1, 0)
     task = get_task("ant-maze-easy7x7b")
-    batch = task.batch(3)
-    state = batch.reset_fixed([np.random.default_rng(i) for i in range(3)], [pairs[0]] * 3)
+    for count in (1, 2, 4):
+        assert fixed_pairs(layout, count, seed=3) == pairs[:count]  # pair k does not depend on how many are asked for
+    batch = task.batch(100)
+    state = batch.reset_fixed([np.random.default_rng(i) for i in range(100)], [pairs[0]] * 100)
     slices = task.state_slices
-    for name in ("target_position", "walker_position"):
-        assert np.ptp(state[:, slices[name]], axis=0).max() == 0
-    assert np.ptp(state[:, slices["joints_pos"]], axis=0).min() > 0
+    # Cells are fixed; offsets and yaw are drawn anew, the joints rest.
+    start, goal = (state[:, slices[name]] for name in ("walker_position", "target_position"))
+    for found, cell, noise in ((start, pairs[0][0], 0.25), (goal, pairs[0][1], 0.5)):
+        off = found[:, :2] - layout.world(cell)
+        assert 0.9 * noise < np.abs(off).max() <= noise and np.ptp(off, axis=0).min() > 1.7 * noise
+    assert np.ptp(start[:, 2]) > 0.4 and np.ptp(goal[:, 2]) == 0
+    assert np.ptp(np.arctan2(batch._qpos[:, 6], batch._qpos[:, 3])) > 2.5
+    assert (state[:, slices["joints_pos"]] == 0).all()
     with pytest.raises(LayoutError, match="start"):
-        batch.reset_fixed([np.random.default_rng(0)] * 3, [((0, 0), (1, 1))] * 3)
+        batch.reset_fixed([np.random.default_rng(0)] * 100, [((0, 0), (1, 1))] * 100)
 
 
 # -- distances ------------------------------------------------------------------------------------

@@ -71,7 +71,7 @@ def test_an_episode_that_ends_early_costs_nothing_past_its_end(tmp_path):
     }
     lengths = dict(zip(subset.commits, subset.lengths, strict=True))
     shortest, longest = min(lengths, key=lengths.get), max(lengths, key=lengths.get)
-    assert lengths[shortest] < 1200  # else this test shows nothing: take another seed
+    assert lengths[shortest] < 600  # else this test shows nothing: take another seed
     # Whole chunks of 32 steps and an index a file.
     share = (lengths[shortest] + 33) / (lengths[longest] + 1)
     assert sizes[shortest] <= sizes[longest] * share * 1.5 + 20_000
@@ -89,11 +89,12 @@ def test_fixed_goals(tmp_path):
     task = get_task(TINY)
     first = [subset.episode(i, ["state", "length"])["state"][0] for i in range(4)]
     goals = np.array([state[task.state_slices["target_position"]] for state in first])
-    np.testing.assert_array_equal(goals[[0, 2]], goals[[1, 3]])
-    for (_, goal), position in zip(fixed_pairs(task.layout, 2, 0), goals[::2], strict=True):
-        assert np.abs(position[:2] - task.layout.world(goal)).max() <= 0.5 + 1e-6
-    joints = np.array([state[task.state_slices["joints_pos"]] for state in first])
-    assert (joints[0] != joints[1]).all()
+    starts = np.array([state[task.state_slices["walker_position"]] for state in first])
+    pairs = [pair for pair in fixed_pairs(task.layout, 2, 0) for _ in range(2)]
+    for (start, goal), at, to in zip(pairs, starts, goals, strict=True):
+        assert np.abs(at[:2] - task.layout.world(start)).max() <= 0.25 + 1e-6
+        assert np.abs(to[:2] - task.layout.world(goal)).max() <= 0.5 + 1e-6
+    assert (starts[0] != starts[1]).all() and (goals[0, :2] != goals[1, :2]).all()
 
 
 def frames(task, seed, count):
@@ -185,7 +186,9 @@ def test_styles_of_data_and_of_evaluation_are_apart():
     train = make_exogenous(task, DistractorSetting(), physics, generators, split="train").style
     val = make_exogenous(task, DistractorSetting(), physics, generators, split="val").style
     assert set(np.unique(train) // 100) == {2, 3, 4, 5} and set(np.unique(val) // 100) == {1}
-    assert len(np.unique(train)) == 16
+    assert set(np.unique(train)) <= {look for style in (2, 3, 4, 5) for look in task.looks(style)}
+    styles = np.unique(train[:, 0] // 100, return_counts=True)[1]
+    assert (np.abs(styles - 50) < 25).all() and len(np.unique(train)) > 80  # styles as likely, all textures in play
 
 
 def test_bad_requests(tmp_path):

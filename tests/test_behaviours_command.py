@@ -39,7 +39,7 @@ def simulation(lengths, terminated, distance):
     """A simulation of two-step ant-maze agents as far as maze_scores looks at it."""
     task = get_task("ant-maze-empty7x7")
     state = np.zeros((len(lengths), 3, task.state_size), np.float32)
-    state[:, 0, task.state_slices["distance_to_target"]] = np.array(distance, np.float32)[:, None]
+    state[:, 0, task.state_slices["target_vector"].start] = distance
     return task, SimpleNamespace(length=np.array(lengths), terminated=np.array(terminated), state=state)
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
-from dmcvb_gen.distractors import TRAIN_STYLES, VAL_STYLES
 from dmcvb_gen.release.verify import Finding, is_imported, verify
 from dmcvb_gen.rollout.recipe import distractor_of, is_maze
 from dmcvb_gen.store import Release, Subset
@@ -91,7 +90,7 @@ def check_labels(subset: Subset) -> Iterator[Finding]:
     if is_imported(subset):
         return
     task, kind = get_task(subset.task), distractor_of(subset.task, subset.setting).kind
-    looks = [look for style in (*TRAIN_STYLES, *VAL_STYLES) for look in task.looks(style)] or [-1]
+    looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]
     own = task.model.mat_rgba[:, :3].astype(np.float32)
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
     for episode in map(int, subset.episodes):

@@ -93,7 +93,7 @@ class Evaluator:
         self.subset, self.task = subset, get_task(subset.task)
         self.setting = distractor_of(subset.task, subset.setting)
         self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
-        self.steps = min(max_steps or self.task.max_steps, self.task.max_steps)
+        self.steps = min(max_steps or self.task.evaluation_steps, self.task.evaluation_steps)
         self.device, self.normalization, self.stack = torch.device(device), normalization, stack
         self.pair, self.renderer = pair, None
         if pixels:
@@ -179,6 +179,6 @@ class Evaluator:
 
 
 def _distance(task, state: np.ndarray) -> np.ndarray | None:
-    """(episode,) meters to the goal, for tasks that have one."""
-    part = task.state_slices.get("distance_to_target")
-    return None if part is None else state[:, part][:, 0]
+    """(episode,) meters to the goal in a straight line, for tasks that have one."""
+    part = task.state_slices.get("target_vector")
+    return None if part is None else np.linalg.norm(state[:, part], axis=1)

@@ -12,14 +12,11 @@ import numpy as np
 from dmcvb_gen.distractors.background import background_walk
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
 from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, floor_alpha_for
-from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at
+from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at, nominal_target
 from dmcvb_gen.distractors.color import color_walk
 from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
-
-TRAIN_STYLES, VAL_STYLES = (2, 3, 4, 5), (1,)
-"""Maze styles of data and of evaluation (paper, section 3.1: unseen distractors)."""
 
 
 class ExogenousWalk:
@@ -48,9 +45,9 @@ class ExogenousWalk:
         self._video = np.full((episodes, frames), -1, np.int16)
         self._index = np.full((episodes, frames), -1, np.int16)
         self._style = np.full((episodes, frames), -1, np.int16)
-        looks = [look for style in (TRAIN_STYLES if split == "train" else VAL_STYLES) for look in task.looks(style)]
-        if looks:
-            self._style[:] = [[looks[int(rng.integers(len(looks)))]] for rng in generators["style"]]
+        styles = task.styles(split)
+        if styles:
+            self._style[:] = [[_draw(rng, task.looks(_draw(rng, styles)))] for rng in generators["style"]]
         if setting.kind == "none":
             self._colors = np.broadcast_to(own, (episodes, frames, *own.shape))
             self._offset = None
@@ -62,7 +59,8 @@ class ExogenousWalk:
         self._colors[:, :, unseen] = own[unseen]  # a label of what nobody sees would only cost bytes
         offset = np.asarray(task.model.cam_poscom0[camera_ids(task)[0]])
         self._offset, roll = camera_walk(camera_range(offset, setting), setting, frames, generators["camera"])
-        self._quaternion = quaternions(look_at(self._offset, roll))
+        nominal = task.model.cam_mat0[camera_ids(task)[0]].reshape(3, 3)
+        self._quaternion = quaternions(look_at(self._offset - nominal_target(offset, nominal), roll))
         self._video, self._index = background_walk(backgrounds.lengths, setting, frames, generators["background"])
 
     def frame(self, frame: int, physics: np.ndarray) -> Exogenous:
@@ -99,6 +97,10 @@ class ExogenousWalk:
             background_frame=self._index[episodes, frames],
             style=self._style[episodes, frames],
         )
+
+
+def _draw(rng: np.random.Generator, choices: Sequence[int]) -> int:
+    return choices[int(rng.integers(len(choices)))]
 
 
 def make_exogenous(

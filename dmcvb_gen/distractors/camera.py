@@ -112,11 +112,26 @@ def _clip(coordinates: np.ndarray, bounds: CameraRange) -> np.ndarray:
     return np.clip(np.column_stack([coordinates[:, :2], azimuth]), bounds.low, bounds.high)
 
 
-def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Camera matrices that look at the agent, then roll about the line of sight.
+def nominal_target(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """The point that a nominal camera looks at, as far along its line of sight as the agent is away.
+
+    The Distracting Control Suite looks there, which is a little beside the agent's centre of mass.
 
     Args:
-      offset: (..., 3) from the agent to the camera.
+      offset: (3,) from the centre of mass to the nominal camera, meters.
+      rotation: (3, 3) that camera's axes in the world frame; tracking cameras do not turn.
+
+    Returns:
+      (3,) from the centre of mass, meters.
+    """
+    return np.asarray(offset) - np.linalg.norm(offset) * np.asarray(rotation)[:, 2]
+
+
+def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Camera matrices that look at a point, then roll about the line of sight.
+
+    Args:
+      offset: (..., 3) from that point to the camera.
       roll: (...,) radians.
 
     Returns:

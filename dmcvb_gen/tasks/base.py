@@ -56,10 +56,13 @@ class Task(abc.ABC):
       family: "locomotion" or "ant-maze" (`names.FAMILIES`): which settings it takes.
       model: the compiled MuJoCo model. Never change it: renderers and batches share it.
       state_fields: name -> size of each part of the state, in the state's order.
-      max_steps: agent steps at which the time limit ends an episode.
+      max_steps: agent steps at which the time limit ends an episode of data.
+      evaluation_steps: the same for the online evaluation of agents.
       substeps: physics steps a control step.
       views: the names of the pictures made of each frame; ("pixels",) for a task with one.
-      return_range: (lowest, highest) return an episode can have.
+      return_range: (lowest, highest) return an episode of data can have.
+      observation: the name of what behaviour policies see, `EpisodeBatch.behaviour_observation`; policy files hold it.
+      behaviour_size: how many numbers that are.
     """
 
     id: str
@@ -67,9 +70,11 @@ class Task(abc.ABC):
     model: mujoco.MjModel
     state_fields: Mapping[str, int]
     max_steps: int
+    evaluation_steps: int
     substeps: int
     views: tuple[str, ...] = ("pixels",)
     return_range: tuple[float, float] = (0.0, 1000.0)
+    observation: str = "state"
 
     cameras: tuple[int | str, ...] = (0,)
     """The model's camera behind each of `views`."""
@@ -79,11 +84,15 @@ class Task(abc.ABC):
     unstored_fields: tuple[str, ...] = ()
     """Fields of the state that a physics state alone does not give."""
 
-    def looks(self, style: int) -> tuple[int, ...]:
-        """The visual looks of a style (labels `style`); none where a task has no styles."""
+    def styles(self, split: str) -> tuple[int, ...]:
+        """The visual styles of data ("train") or of evaluation ("val"); none where a task has no styles."""
         return ()
 
-    def style_geom_matid(self, style: int) -> np.ndarray | None:
+    def looks(self, style: int) -> tuple[int, ...]:
+        """The visual looks of a style (labels `style`), all as likely; none where a task has no styles."""
+        return ()
+
+    def style_geom_matid(self, look: int) -> np.ndarray | None:
         """(geom,) int: material of every geom under a visual look; None where a task has no styles."""
         return None
 
@@ -106,13 +115,8 @@ class Task(abc.ABC):
         }
 
     @property
-    def behaviour_indices(self) -> np.ndarray:
-        """(observation,) int: the entries of the state that behaviour policies see (all, by default)."""
-        return np.arange(self.state_size)
-
-    @property
     def behaviour_size(self) -> int:
-        return len(self.behaviour_indices)
+        return self.state_size
 
     @property
     def physics_size(self) -> int:
@@ -152,6 +156,10 @@ class EpisodeBatch(abc.ABC):
     @abc.abstractmethod
     def state(self) -> np.ndarray:
         """(size, state) float64: the current states, fields as in `task.state_fields`."""
+
+    def behaviour_observation(self) -> np.ndarray:
+        """(size, task.behaviour_size) float32: what behaviour policies see (`task.observation`); the state by default."""
+        return self.state().astype(np.float32)
 
     @abc.abstractmethod
     def _control_reward(self) -> np.ndarray:

@@ -39,7 +39,7 @@ class LocomotionTask(Task):
 
     domain: str
     batch_class: type[EpisodeBatch]
-    max_steps = EPISODE_STEPS
+    max_steps = evaluation_steps = EPISODE_STEPS
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:

@@ -1,4 +1,4 @@
-"""Training episodes side by side: a run's task and settings in; states, restarts and what resumes them out."""
+"""Training episodes side by side: a run's task and settings in; observations, restarts and what resumes them out."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Episodes:
         self.elapsed = (np.arange(self.size) * self._limit) // self.size
 
     def start(self, ids: np.ndarray) -> np.ndarray:
-        """Begin new episodes; (size, state) of all."""
+        """Begin new episodes; (size, observation) of all, what policies see."""
         run = self._run
         numbers = run.step * self.size + ids  # never the same stream twice in a run
         names = (self._task.id, "training")
@@ -66,24 +66,24 @@ class Episodes:
         standing = ids[self._rng.random(len(ids)) < getattr(run.settings, "standing_starts", 0.0)]
         if len(standing):
             self.batch.set_physics(standing_states(self._task, self._rng, len(standing)), standing)
-        return self.batch.state()
+        return self.batch.behaviour_observation()
 
-    def restart_ended(self, state: np.ndarray, terminated: np.ndarray) -> np.ndarray:
+    def restart_ended(self, observation: np.ndarray, terminated: np.ndarray) -> np.ndarray:
         """Count a step; begin anew where the task, or the limit, ended an episode."""
         self.elapsed += 1
         ended = np.flatnonzero(terminated | (self.elapsed >= self._limit))
         if len(ended):
-            state = self.start(ended)
+            observation = self.start(ended)
             self.elapsed[ended] = 0
-        return state
+        return observation
 
-    def saved(self, state: np.ndarray) -> dict[str, torch.Tensor]:
-        """The episodes where they are; `state` too, as touch sensors do not follow from the physics."""
-        parts = {"physics": self.batch.physics(), "elapsed": self.elapsed, "state": state}
+    def saved(self, observation: np.ndarray) -> dict[str, torch.Tensor]:
+        """The episodes where they are; what is seen too, as touch sensors do not follow from the physics."""
+        parts = {"physics": self.batch.physics(), "elapsed": self.elapsed, "observation": observation}
         return {name: torch.from_numpy(part.copy()) for name, part in parts.items()}
 
     def restore(self, saved: dict[str, torch.Tensor]) -> np.ndarray:
-        """Put the episodes where they were; gives the state."""
+        """Put the episodes where they were; gives what policies see."""
         self.elapsed = saved["elapsed"].numpy().copy()
         self.batch.set_physics(saved["physics"].numpy())
-        return saved["state"].numpy().copy()
+        return saved["observation"].numpy().copy()

@@ -119,12 +119,12 @@ class GuidedRun(Run):
             owed, next_evaluation, updates = saved["owed"], saved["next_evaluation"], saved["updates"]
         episodes = Episodes(self, rng)
         if saved:
-            state = episodes.restore(saved["episodes"])
+            observation = episodes.restore(saved["episodes"])
             guided = saved["guided"].numpy().copy()
         else:
-            state = episodes.start(np.arange(settings.simulations))
+            observation = episodes.start(np.arange(settings.simulations))
             guided = rng.random(settings.simulations) < settings.guided_share
-        columns, last_saved = task.behaviour_indices, self._started
+        last_saved = self._started
 
         def save() -> None:
             buffer.flush()
@@ -136,7 +136,7 @@ class GuidedRun(Run):
                     "torch_rng": torch.get_rng_state(),
                     "rng": json.dumps(rng.bit_generator.state),
                     "buffer": {"position": buffer.position, "full": buffer.full, "rows": buffer.size},
-                    "episodes": episodes.saved(state),
+                    "episodes": episodes.saved(observation),
                     "guided": torch.from_numpy(guided.copy()),
                     "owed": owed,
                     "next_evaluation": next_evaluation,
@@ -145,17 +145,16 @@ class GuidedRun(Run):
             )
 
         while self.step < config.steps:
-            observation = torch.from_numpy(state[:, columns].astype(np.float32))
-            shown = torch.from_numpy(episodes.batch.guided_state(settings.ahead)[:, columns].astype(np.float32))
+            shown = torch.from_numpy(episodes.batch.guided_observation(settings.ahead))
             with torch.no_grad():
-                (own_mean, own_std), (mean, std) = student(observation), guide(shown)
+                (own_mean, own_std), (mean, std) = student(torch.from_numpy(observation)), guide(shown)
                 walks = torch.from_numpy(guided)[:, None]
                 chosen = torch.where(walks, mean, own_mean), torch.where(walks, std, own_std)
                 action = torch.tanh(chosen[0] + chosen[1] * torch.randn_like(mean)).numpy()
-            buffer.add(observation=observation.numpy(), mean=mean.numpy(), std=std.numpy())
+            buffer.add(observation=observation, mean=mean.numpy(), std=std.numpy())
             result = episodes.batch.step(action)
             self.step += settings.simulations
-            state = episodes.restart_ended(result.state, result.terminated)
+            observation = episodes.restart_ended(episodes.batch.behaviour_observation(), result.terminated)
             ended = episodes.elapsed == 0
             guided[ended] = rng.random(ended.sum()) < settings.guided_share
             if len(buffer) >= settings.batch_size:

@@ -154,6 +154,7 @@ class Run(abc.ABC):
         self.settings = check_settings(config.algorithm, config.settings)
         self.header = PolicyHeader(
             task=self.task.id,
+            observation=self.task.observation,
             observation_size=self.task.behaviour_size,
             action_size=self.task.action_size,
             algorithm=config.algorithm,

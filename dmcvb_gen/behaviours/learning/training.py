@@ -64,10 +64,10 @@ class SacRun(Run):
             _start_from(learner, config.init_from)
         episodes = Episodes(self, rng)
         if saved and "episodes" in saved:
-            state = episodes.restore(saved["episodes"])
+            observation = episodes.restore(saved["episodes"])
         else:
-            state = episodes.start(np.arange(settings.simulations))
-        columns, shaping = task.behaviour_indices, shaping_of(task)
+            observation = episodes.start(np.arange(settings.simulations))
+        shaping = shaping_of(task)
         last_saved = self._started
 
         def save() -> None:
@@ -77,14 +77,13 @@ class SacRun(Run):
                     "learner": learner.state(),
                     "buffer": {"position": buffer.position, "full": buffer.full, "size": buffer.size},
                     "rng": json.dumps(rng.bit_generator.state),
-                    "episodes": episodes.saved(state),
+                    "episodes": episodes.saved(observation),
                     "owed": owed,
                     "next_evaluation": next_evaluation,
                 }
             )
 
         while self.step < config.steps:
-            observation = state[:, columns].astype(np.float32)
             learner.norm.update(observation)
             if len(buffer) < settings.warmup_steps and not config.init_from:
                 action = rng.uniform(-1, 1, (settings.simulations, task.action_size)).astype(np.float32)
@@ -97,15 +96,16 @@ class SacRun(Run):
                 reward = reward + settings.progress * (before - episodes.batch.path_length())
             if settings.shaping:
                 reward = reward + settings.shaping * shaping(result.state)
+            reached = episodes.batch.behaviour_observation()
             buffer.add(
                 observation=observation,
-                next_observation=result.state[:, columns].astype(np.float32),
+                next_observation=reached,
                 action=action,
                 reward=reward,
                 terminated=result.terminated,
             )
             self.step += settings.simulations
-            state = episodes.restart_ended(result.state, result.terminated)
+            observation = episodes.restart_ended(reached, result.terminated)
             learner.sync_norm()
             learner.sharpen(self.step)
             if len(buffer) >= settings.warmup_steps:

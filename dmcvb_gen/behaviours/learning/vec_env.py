@@ -47,15 +47,12 @@ class TaskVecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         self._length, self._return = np.zeros(size, int), np.zeros(size)
 
-    def _start(self, ids: np.ndarray) -> np.ndarray:
+    def _start(self, ids: np.ndarray) -> None:
         names, first = (self.task.id, "training"), self._started
         generators = [episode_stream(self._seed, names, first + k, "initial_state") for k in range(len(ids))]
         self._started += len(ids)
         self._length[ids], self._return[ids] = 0, 0.0
-        return self.batch.reset(generators, ids)
-
-    def _observe(self, state: np.ndarray) -> np.ndarray:
-        return state[:, self.task.behaviour_indices].astype(np.float32)
+        self.batch.reset(generators, ids)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Take the streams of `seed` from the next reset on."""
@@ -67,14 +64,15 @@ class TaskVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return self._observe(self._start(np.arange(self.num_envs)))
+        self._start(np.arange(self.num_envs))
+        return self.batch.behaviour_observation()
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         result = self.batch.step(self._actions)
-        observation = self._observe(result.state)
+        observation = self.batch.behaviour_observation()
         self._length += 1
         self._return += result.reward
         truncated = (self._length >= self.task.max_steps) & ~result.terminated
@@ -85,7 +83,8 @@ class TaskVecEnv(VecEnv):
             infos[i]["terminal_observation"] = observation[i].copy()
             infos[i]["episode"] = {"r": float(self._return[i]), "l": int(self._length[i])}
         if len(ended):
-            observation[ended] = self._observe(self._start(ended))[ended]
+            self._start(ended)
+            observation[ended] = self.batch.behaviour_observation()[ended]
         return observation, result.reward.astype(np.float32), done, infos
 
     def saved(self) -> dict[str, Any]:
@@ -130,12 +129,12 @@ class TaskEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         super().reset(seed=seed)
         self._length = 0
-        return self.batch.reset([self.np_random])[0, self.task.behaviour_indices].astype(np.float32), {}
+        self.batch.reset([self.np_random])
+        return self.batch.behaviour_observation()[0], {}
 
     def step(self, action: np.ndarray):
         result = self.batch.step(np.asarray(action)[None])
         self._length += 1
         terminated = bool(result.terminated[0])
         truncated = self._length >= self.task.max_steps and not terminated
-        observation = result.state[0, self.task.behaviour_indices].astype(np.float32)
-        return observation, float(result.reward[0]), terminated, truncated, {}
+        return self.batch.behaviour_observation()[0], float(result.reward[0]), terminated, truncated, {}

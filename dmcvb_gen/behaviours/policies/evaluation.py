@@ -49,10 +49,10 @@ def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float
     Speed is the straight distance to the goal at the start over the time it took, in m/s, as in the benchmarks;
     None where no episode got there, both None for a task without a goal.
     """
-    part = task.state_slices.get("distance_to_target")
+    part = task.state_slices.get("target_vector")
     if part is None:
         return None, None
     reached = simulation.terminated
     seconds = simulation.length * ACTION_REPEAT * task.control_timestep
-    speed = simulation.state[:, 0, part.start] / seconds
+    speed = np.linalg.norm(simulation.state[:, 0, part], axis=1) / seconds
     return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None

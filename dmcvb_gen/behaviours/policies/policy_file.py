@@ -58,6 +58,7 @@ class PolicyHeader(_Model):
 
     Attributes:
       task: the task's id.
+      observation: the name of what it sees, `task.observation`.
       algorithm: what trained it, e.g. "sac".
       agent_step: environment steps (at action repeat 2) it was trained for.
       hidden: widths of the hidden layers.
@@ -72,6 +73,7 @@ class PolicyHeader(_Model):
     format: Literal["dmcvb-gen policy"] = "dmcvb-gen policy"
     format_version: int = FORMAT_VERSION
     task: str
+    observation: str | None = None
     observation_size: int = pydantic.Field(gt=0)
     action_size: int = pydantic.Field(gt=0)
     algorithm: str
@@ -157,7 +159,7 @@ class Policy:
         """Actions for a batch.
 
         Args:
-          observation: (n, observation), the entries `task.behaviour_indices` of the states.
+          observation: (n, observation), an episode batch's `behaviour_observation`.
           generators: one a row, the source of its noise; needed unless deterministic.
           deterministic: take the mean action.
 
@@ -257,6 +259,10 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
         raise PolicyFileError(
             f"{path} maps {header.observation_size} observations to {header.action_size} actions, "
             f"{task.id} has {asked[0]} and {asked[1]}; train it again for this task"
+        )
+    if header.observation not in (None, task.observation):
+        raise PolicyFileError(
+            f"{path} sees {header.observation!r}, {task.id} shows {task.observation!r}; train it again for this task"
         )
     actor = Actor(header)
     wanted = {name: tuple(value.shape) for name, value in actor.state_dict().items()}

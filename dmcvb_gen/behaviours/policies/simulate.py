@@ -30,10 +30,10 @@ class Simulation:
 
     Attributes:
       episodes: (episode,) indices in the subset.
-      state: (episode, max_steps + 1, state) float32.
-      action: (episode, max_steps + 1, action) float32, zero in the last row.
-      reward, discount: (episode, max_steps + 1) float32, likewise.
-      physics: (episode, max_steps + 1, physics) float64.
+      state: (episode, row, state) float32; one row more than the longest episode may have steps.
+      action: (episode, row, action) float32, zero in the last row.
+      reward, discount: (episode, row) float32, likewise.
+      physics: (episode, row, physics) float64.
       length: (episode,) int32, transitions.
       terminated: (episode,) bool, ended by the task.
       seed: (episode,) uint64, label of the episode's streams.
@@ -137,7 +137,7 @@ def simulate(
       seed, names: the recipe's seed and the names of the streams (see `seeding`).
       deterministic: mean actions instead of samples.
       goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
-      max_steps: stop earlier than the task's time limit (for estimates).
+      max_steps: agent steps at which an episode ends, if not the task's time limit.
     """
     episodes = np.asarray(episodes, int)
     size, limit = len(episodes), max_steps or task.max_steps
@@ -157,7 +157,7 @@ def simulate(
         state = batch.reset_fixed(streams["initial_state"], [goal_pairs[k] for k in pair])
     seconds["physics"] += time.perf_counter() - started
 
-    rows = task.max_steps + 1
+    rows = max(limit, task.max_steps) + 1
     out = Simulation(
         episodes=episodes,
         state=np.zeros((size, rows, task.state_size), np.float32),
@@ -172,7 +172,7 @@ def simulate(
         goal_pair=pair,
         seconds=seconds,
     )
-    columns, active = task.behaviour_indices, np.ones(size, bool)
+    active = np.ones(size, bool)
     for step in range(limit + 1):
         out.state[active, step] = state[active]
         out.physics[active, step] = batch.physics()[active]
@@ -180,7 +180,7 @@ def simulate(
         if step == limit or not active.any():
             break
         started = time.perf_counter()
-        actions = actor.act(state[:, columns].astype(np.float32), size, task.action_size)
+        actions = actor.act(batch.behaviour_observation(), size, task.action_size)
         acted = time.perf_counter()
         result = batch.step(actions, active)
         seconds["policy"] += acted - started

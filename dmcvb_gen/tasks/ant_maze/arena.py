@@ -20,13 +20,14 @@ from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 WALL_HEIGHT = 2.0
 """Meters."""
-GOAL_RADIUS, GOAL_HEIGHT = 0.5, 0.5
-"""Meters; the sphere rests on the floor."""
+GOAL_RADIUS, GOAL_HEIGHT = 0.5, 1.0
+"""Meters; the height is that of the sphere's center."""
+TOP_HEIGHT = 100.0
+"""Meters of the top camera above the floor."""
 PHYSICS_STEP = 0.001
 SKY = "sky_02"
-STYLES = (1, 2, 3, 4, 5)
-TEXTURES_PER_STYLE = 2
-"""Wall textures and floor textures taken of each labmaze style (the first by name that are not alike)."""
+STYLES = {"train": (2, 3, 4, 5), "val": (1,)}
+"""Labmaze's styles of data and of evaluation (paper, section 3.1: unseen distractors)."""
 CAMERAS = {
     "top": "top_camera",
     "egocentric": "walker/egocentric",
@@ -51,16 +52,25 @@ class Arena:
     goal_geom: int
 
 
+@functools.cache
+def textures(style: int) -> dict[str, tuple[str, ...]]:
+    """The files of all "wall" and all "floor" textures of a labmaze style, in the order of their names."""
+    from labmaze import assets
+
+    walls, floors = (
+        find(f"style_{style:02}") for find in (assets.get_wall_texture_paths, assets.get_floor_texture_paths)
+    )
+    return {kind: tuple(paths[name] for name in sorted(paths)) for kind, paths in (("wall", walls), ("floor", floors))}
+
+
 def look_numbers(style: int) -> tuple[int, ...]:
-    """All looks of a style."""
-    each = range(TEXTURES_PER_STYLE)
-    return tuple(style * 100 + wall * 10 + floor for wall in each for floor in each)
-
-
-def _textures(paths: dict[str, str]) -> list[str]:
-    """The files of a style's textures, one brightness of a color each."""
-    names = [name for name in sorted(paths) if not name.endswith(("_bright", "_team"))]
-    return [paths[name] for name in names[-TEXTURES_PER_STYLE:]]
+    """All looks of a style: every wall texture with every floor texture."""
+    walls, floors = (len(paths) for paths in textures(style).values())
+    if max(walls, floors) > 10:
+        raise ValueError(
+            f"style {style} has {walls} walls and {floors} floors; a look's number has room for 10 of each"
+        )
+    return tuple(style * 100 + wall * 10 + floor for wall in range(walls) for floor in range(floors))
 
 
 @contextlib.contextmanager
@@ -80,7 +90,6 @@ def _quiet_renderer_choice():
 def build_arena(layout: Layout) -> Arena:
     """The arena of a layout, with the ant and the goal."""
     import labmaze
-    from labmaze import assets
 
     with _quiet_renderer_choice():
         from dm_control.locomotion.arenas import labmaze_textures, mazes
@@ -98,9 +107,11 @@ def build_arena(layout: Layout) -> Arena:
     _ = observables.bodies_pos, observables.bodies_quats, observables.end_effectors_pos  # each adds its sensors
     for sensor in walker.mjcf_model.sensor.get_children("rangefinder"):
         sensor.remove()  # costly rays that no state holds
-    torso = walker.root_body
-    torso.add("camera", name="follow", pos=[-1, 0, 2], xyaxes=[0, -1, 0, 2, 0, 1])
-    torso.add("camera", name="overhead", pos=[0, 0, 3], xyaxes=[0, -1, 0, 1, 0, 0])
+    frame = walker.mjcf_model.worldbody  # the root frame, below the torso; forward is to the right in both pictures
+    frame.add("camera", name="follow", pos=[-1, 0, 2], zaxis=[-1, 0, 2])
+    frame.add("camera", name="overhead", pos=[0, 0, 3])
+    half = max(layout.shape) * CELL / 2
+    arena.top_camera.set_attributes(pos=[0, 0, TOP_HEIGHT], fovy=np.degrees(2 * np.arctan(half / TOP_HEIGHT)))
     goal = target_sphere.TargetSphere(radius=GOAL_RADIUS, height_above_ground=GOAL_HEIGHT)
     arena.attach(goal).mocap = "true"
 
@@ -114,12 +125,9 @@ def build_arena(layout: Layout) -> Arena:
     for geom in root.find("body", "maze_body").geom:
         geom.rgba = [0, 0, 0, 0]  # their faces are drawn by textured planes
     names: dict[tuple, str] = {}
-    for style in STYLES:
-        files = {
-            "wall": _textures(assets.get_wall_texture_paths(f"style_{style:02}")),
-            "floor": _textures(assets.get_floor_texture_paths(f"style_{style:02}")),
-        }
-        for kind, paths in files.items():
+    styles = sorted(sum(STYLES.values(), ()))
+    for style in styles:
+        for kind, paths in textures(style).items():
             for number, path in enumerate(paths):
                 texture = root.asset.add("texture", type="2d", name=f"{kind}_{style}_{number}", file=path)
                 for repeat in sorted({value for value in repeats.values() if value[0] == kind}):
@@ -129,7 +137,7 @@ def build_arena(layout: Layout) -> Arena:
 
     model = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
     looks = {}
-    for style in STYLES:
+    for style in styles:
         for look in look_numbers(style):
             materials = np.array(model.geom_matid)
             for geom, repeat in repeats.items():

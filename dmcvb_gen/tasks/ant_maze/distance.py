@@ -1,7 +1,7 @@
 """How far it is to the goal: layout and goal in, fields of shortest-path distance out (scikit-fmm).
 
 Two measures. "saturated" is DMC-VB's: travel times of a wave from the whole goal cell, on a grid of 10
-pixels a cell, as fast as the distance to the nearest wall up to half a cell (the "saturated fast marching
+pixels a cell, as fast as another wave's travel time from the walls, up to 5 pixels (the "saturated fast marching
 square"), looked up at the ant's pixel. "geodesic" is the shortest path itself: unit speed, from the goal's
 exact position, interpolated between pixels.
 """
@@ -19,6 +19,8 @@ from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 PIXELS = 10
 """Pixels a cell's side."""
+SATURATION = 5
+"""Travel time from the walls, in pixels, from which on the wave is as fast as it gets."""
 REWARDS = ("saturated", "geodesic")
 
 
@@ -39,15 +41,20 @@ class DistanceField:
 def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Floor pixels (bool), the saturated speed there, and for every pixel the index of the nearest floor pixel."""
     floor = np.kron(~layout.walls, np.ones((PIXELS, PIXELS), bool))
-    to_wall = ndimage.distance_transform_edt(floor)
+    from_walls = np.asarray(skfmm.travel_time(floor.astype(float), np.ones(floor.shape), dx=1.0))
     nearest = ndimage.distance_transform_edt(~floor, return_distances=False, return_indices=True)
-    return floor, np.minimum(to_wall / (PIXELS / 2), 1.0), nearest
+    return floor, np.minimum(from_walls, SATURATION) / SATURATION, nearest
 
 
 def floor_pixels(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """(row, column) bool, the floor; (2, row, column) int, row and column of the floor pixel nearest to each."""
     floor, _, nearest = _floor(layout)
     return floor, nearest
+
+
+def floor_speed(layout: Layout) -> np.ndarray:
+    """(row, column) float64 in [0, 1]: how fast the saturated measure's wave is, 0 in walls."""
+    return _floor(layout)[1]
 
 
 def _finish(times: np.ndarray, layout: Layout) -> DistanceField:

@@ -11,20 +11,28 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dmcvb_gen.names import ANT_MAZE
-from dmcvb_gen.tasks.ant_maze.arena import CAMERAS, GOAL_HEIGHT, GOAL_RADIUS, PHYSICS_STEP, build_arena, look_numbers
+from dmcvb_gen.tasks.ant_maze.arena import (
+    CAMERAS,
+    GOAL_HEIGHT,
+    GOAL_RADIUS,
+    PHYSICS_STEP,
+    STYLES,
+    TOP_HEIGHT,
+    build_arena,
+    look_numbers,
+)
 from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 from dmcvb_gen.tasks.ant_maze.waypoints import headings
-from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, Task
+from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
 
-EPISODE_STEPS = 1200
-"""Agent steps of 60 seconds."""
+EPISODE_STEPS, EVALUATION_STEPS = 600, 1200
+"""Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
 SPAWN_NOISE, GOAL_NOISE = 0.25, 0.5
-"""Meters that spawn and goal lie off their cells' centers at most, along x and along y."""
-JOINT_NOISE = 0.1
-"""Radians of noise on the ant's joints in episodes with a fixed start and goal (benchmark B3)."""
+"""Meters that the spawn lies off its place at most, along x, y and z, and the goal off its cell's center, along x and y."""
 REACH = 2.0
 """Meters between torso and goal within which a touch is possible during a control step: the ant spans 1.3."""
 TOUCH_THRESHOLD = 1e-3
@@ -64,7 +72,10 @@ BEHAVIOUR_FIELDS = (
     "world_zaxis",
     "walker_position",
 )
-"""What behaviour policies see; what is left out follows from the joints, or is noise (the accelerometer)."""
+"""What behaviour policies see: parts of the state, but for the vectors to the goal, which are true ones in meters.
+
+What is left out follows from the joints, or is noise (the accelerometer).
+"""
 
 
 class AntMazeBatch(EpisodeBatch):
@@ -97,24 +108,17 @@ class AntMazeBatch(EpisodeBatch):
     # -- starting -----------------------------------------------------------------------------
 
     def _initialize(self, ids, generators):
-        layout = self.task.layout
+        free = self.task.layout.free
         for sim, rng in zip(ids, generators, strict=True):
-            start = int(rng.integers(len(layout.free)))
-            goal = int(rng.integers(len(layout.free) - 1))
-            goal += goal >= start
-            offsets = rng.uniform(-1, 1, 4)
-            self._place(
-                sim,
-                layout.world(layout.free[start]) + SPAWN_NOISE * offsets[:2],
-                layout.world(layout.free[goal]) + GOAL_NOISE * offsets[2:],
-                rng.uniform(0, 2 * np.pi),
-            )
+            start = int(rng.integers(len(free)))
+            goal = int(rng.integers(len(free) - 1))
+            self._place(sim, rng, free[start], free[goal + (goal >= start)])
         self._refresh(ids)
 
     def reset_fixed(
         self, generators: Sequence[np.random.Generator], pairs: Sequence[tuple], ids: np.ndarray | None = None
     ) -> np.ndarray:
-        """Start episodes at given (start, goal) cells; noise is on the ant's joints alone.
+        """Start episodes at given (start, goal) cells; offsets and yaw are drawn as ever.
 
         Returns:
           (size, state) float64.
@@ -127,24 +131,16 @@ class AntMazeBatch(EpisodeBatch):
         for sim, rng, (start, goal) in zip(ids, generators, pairs, strict=True):
             layout.check_cell(start, "start")
             layout.check_cell(goal, "goal")
-            # The same for all episodes of a pair: yaw and offsets come from the cells alone.
-            own = np.random.default_rng([*start, *goal])
-            offsets = own.uniform(-1, 1, 4)
-            self._place(
-                sim,
-                layout.world(start) + SPAWN_NOISE * offsets[:2],
-                layout.world(goal) + GOAL_NOISE * offsets[2:],
-                own.uniform(0, 2 * np.pi),
-            )
-            self._qpos[sim, 7:] = rng.uniform(-JOINT_NOISE, JOINT_NOISE, self._qpos.shape[1] - 7)
+            self._place(sim, rng, start, goal)
         self._refresh(ids)
         return self.state()
 
-    def _place(self, sim: int, start: np.ndarray, goal: np.ndarray, yaw: float) -> None:
-        self._qpos[sim] = 0
-        self._qpos[sim, :2] = start
+    def _place(self, sim: int, rng: np.random.Generator, start: tuple[int, int], goal: tuple[int, int]) -> None:
+        layout, offsets, yaw = self.task.layout, rng.uniform(-1, 1, 5), rng.uniform(0, 2 * np.pi)
+        self._qpos[sim] = 0  # joints too
+        self._qpos[sim, :3] = np.append(layout.world(start), 0) + SPAWN_NOISE * offsets[:3]
         self._qpos[sim, 3], self._qpos[sim, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
-        self._mocap[sim, 0] = *goal, 0
+        self._mocap[sim, 0] = *(layout.world(goal) + GOAL_NOISE * offsets[3:]), 0
 
     def _refresh(self, ids):
         # Accelerometer and touch are of the last stage; dm_control's reset computes them without actuation.
@@ -162,7 +158,7 @@ class AntMazeBatch(EpisodeBatch):
 
     def _advance(self, ids):
         ids = self._all if ids is None else ids
-        away = np.linalg.norm(self._mocap[ids, 0] + [0, 0, GOAL_HEIGHT] - self._xpos[ids, self._torso], axis=1)
+        away = np.linalg.norm(self.goal()[ids] - self._xpos[ids, self._torso], axis=1)
         near = ids[away < REACH]
         if len(near) < len(ids):
             super()._advance(ids[away >= REACH])
@@ -175,7 +171,7 @@ class AntMazeBatch(EpisodeBatch):
         """(len(ids),) bool: whether a geom of the ant overlaps the goal's sphere."""
         centers = self._geom_xpos[np.ix_(ids, self._ant)]
         axes = self._geom_xmat[np.ix_(ids, self._ant)].reshape(len(ids), -1, 3, 3)[..., 2]
-        to_goal = (self._mocap[ids, 0] + [0, 0, GOAL_HEIGHT])[:, None] - centers
+        to_goal = self.goal()[ids, None] - centers
         along = np.clip((to_goal * axes).sum(axis=-1), -self._half, self._half)
         gap = np.linalg.norm(to_goal - along[..., None] * axes, axis=-1) - self._radius - GOAL_RADIUS
         return (gap < 0).any(axis=1)
@@ -186,19 +182,34 @@ class AntMazeBatch(EpisodeBatch):
         """(size, 3): center of the goal's sphere, meters."""
         return self._mocap[:, 0] + [0, 0, GOAL_HEIGHT]
 
-    def guided_state(self, ahead: float) -> np.ndarray:
-        """(size, state) float64: as if the ant stood in the middle of an open maze, its goal where `headings` point."""
+    def behaviour_observation(self):
+        position, goal = self._xpos[:, self._torso], self.goal()
+        return self._observation(position, goal, goal - position)
+
+    def guided_observation(self, ahead: float) -> np.ndarray:
+        """(size, behaviour_size) float32: as if the ant stood in the middle of an open maze, its goal where `headings`
+        point."""
         position, goal = self._xpos[:, self._torso], self.goal()
         vector = headings(self.task.layout, position[:, :2], goal[:, :2], ahead)
-        state = self.state(np.concatenate([position[:, :2] + vector, goal[:, 2:]], axis=1))
-        for name, xy in {"walker_position": 0.0, "target_position": vector}.items():
-            state[:, self.task.state_slices[name]][:, :2] = xy
-        return state
+        height, goal_height = position[:, 2:], goal[:, 2:]
+        return self._observation(
+            np.concatenate([np.zeros_like(vector), height], axis=1),
+            np.concatenate([vector, goal_height], axis=1),
+            np.concatenate([vector, goal_height - height], axis=1),
+        )
+
+    def _observation(self, position: np.ndarray, goal: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        values = self._proprioception() | {
+            "target_position": goal,
+            "target_vector": vector,
+            "egocentric_target_vector": self._egocentric(vector),
+            "walker_position": position,
+        }
+        return np.concatenate([values[name] for name in BEHAVIOUR_FIELDS], axis=1, dtype=np.float32)
 
     def distance(self) -> np.ndarray:
-        """(size,): distance to the goal over its maximum in the maze, in [0, 1]."""
-        position = self._xpos[:, self._torso, :2]
-        return look_up(self.task.reward, self.task.layout, self._fields, position) / self._largest
+        """(size,): meters to the goal as the reward measures them."""
+        return look_up(self.task.reward, self.task.layout, self._fields, self._xpos[:, self._torso, :2])
 
     def track_paths(self) -> None:
         """Keep fields of the shortest path for `path_length`, from the next reset on."""
@@ -209,30 +220,38 @@ class AntMazeBatch(EpisodeBatch):
         position = self._xpos[:, self._torso, :2]
         return np.where(self._touched, 0.0, look_up("geodesic", self.task.layout, self._paths, position))
 
-    def state(self, goal: np.ndarray | None = None):
-        """(size, state) float64; as if the goal's center were at `goal`, (size, 3), where that is given."""
-        position, goal = self._xpos[:, self._torso], self.goal() if goal is None else goal
-        rotation = self._xmat[:, self._torso].reshape(self.size, 3, 3)
-        vector = goal - position
-        values = {name: self._sensors[:, columns] for name, columns in self._columns_of.items()}
+    def state(self):
+        position, goal = self._xpos[:, self._torso], self.goal()
+        values = self._proprioception()
         values |= {
-            "distance_to_target": np.linalg.norm(vector, axis=1, keepdims=True),
+            "distance_to_target": self.distance()[:, None],
             "target_position": goal,
-            "target_vector": vector,
+            "target_vector": goal - position,
             "target_activated": self._touched[:, None],
             "appendages_pos": values["end_effectors_pos"],
-            "body_height": position[:, 2:],
-            "egocentric_target_vector": np.einsum("ni,nij->nj", vector, rotation),
-            "joints_pos": self._qpos[:, 7:],
-            "joints_vel": self._qvel[:, 6:],
-            "sensors_touch": values["sensors_touch"] > TOUCH_THRESHOLD,
-            "world_zaxis": self._xmat[:, self._torso, 6:],
+            # As released: not to the goal, but to a point above the middle of the maze (SPEC, section 3).
+            "egocentric_target_vector": self._egocentric(np.array([0, 0, GOAL_HEIGHT]) - position),
             "walker_position": position,
         }
         return np.concatenate([np.asarray(values[name], np.float64) for name in FIELDS], axis=1)
 
+    def _proprioception(self) -> dict[str, np.ndarray]:
+        """The state's fields that know neither place nor goal."""
+        values = {name: self._sensors[:, columns] for name, columns in self._columns_of.items()}
+        return values | {
+            "body_height": self._xpos[:, self._torso, 2:],
+            "joints_pos": self._qpos[:, 7:],
+            "joints_vel": self._qvel[:, 6:],
+            "sensors_touch": values["sensors_touch"] > TOUCH_THRESHOLD,
+            "world_zaxis": self._xmat[:, self._torso, 6:],
+        }
+
+    def _egocentric(self, vector: np.ndarray) -> np.ndarray:
+        """(size, 3) of the world -> the same in the torso's frame."""
+        return np.einsum("ni,nij->nj", vector, self._xmat[:, self._torso].reshape(self.size, 3, 3))
+
     def _control_reward(self):
-        return -np.clip(self.distance(), 0.0, 1.0)
+        return -np.clip(self.distance() / self._largest, 0.0, 1.0)
 
     def _control_terminated(self):
         return self._touched.copy()
@@ -258,7 +277,9 @@ class AntMaze(Task):
 
     family = ANT_MAZE
     state_fields = FIELDS
-    max_steps = EPISODE_STEPS
+    observation = "proprioception and true goal vectors"
+    behaviour_size = sum(FIELDS[name] for name in BEHAVIOUR_FIELDS)
+    max_steps, evaluation_steps = EPISODE_STEPS, EVALUATION_STEPS
     substeps = 25  # 1 ms physics, 25 ms control
     views = tuple(CAMERAS)
     cameras = tuple(CAMERAS.values())
@@ -278,17 +299,15 @@ class AntMaze(Task):
     def goal_geoms(self):
         return (build_arena(self.layout).goal_geom,)
 
-    @property
-    def behaviour_indices(self):
-        slices = self.state_slices
-        return np.concatenate([np.arange(slices[name].start, slices[name].stop) for name in BEHAVIOUR_FIELDS])
+    def styles(self, split):
+        return STYLES[split]
 
     def looks(self, style: int) -> tuple[int, ...]:
         """The looks of a labmaze style: combinations of its wall and floor textures."""
         return look_numbers(style)
 
-    def style_geom_matid(self, style):
-        return build_arena(self.layout).looks.get(style)
+    def style_geom_matid(self, look):
+        return build_arena(self.layout).looks.get(look)
 
     def goal_in_sight(self, view: str, physics: np.ndarray, exogenous) -> np.ndarray:
         """(frame,) bool: whether the goal's sphere reaches into the picture (walls may still hide it).
@@ -297,13 +316,11 @@ class AntMaze(Task):
           physics: (frame, physics) float64.
           exogenous: labels with leading shape (frame,).
         """
-        from dmcvb_gen.tasks.cameras import matrices
-
         index = self.views.index(view)
         fovy = np.radians(self.model.cam_fovy[self.model.camera(self.cameras[index]).id])
         goal = physics[:, _mocap_columns(self.model)] + [0, 0, GOAL_HEIGHT]
-        rotation = matrices(exogenous.camera_quaternion[:, index].astype(np.float64))
-        seen = np.einsum("ni,nij->nj", goal - exogenous.camera_position[:, index], rotation)
+        rotation = Rotation.from_quat(exogenous.camera_quaternion[:, index].astype(np.float64), scalar_first=True)
+        seen = rotation.apply(goal - exogenous.camera_position[:, index], inverse=True)
         depth, aside = -seen[:, 2], np.linalg.norm(seen[:, :2], axis=1)
         angle = np.arctan(np.sqrt(2) * np.tan(fovy / 2))  # of the picture's corners
         outside = aside * np.cos(angle) - depth * np.sin(angle)  # distance from the cone around the picture
@@ -318,7 +335,7 @@ class AntMaze(Task):
         goal = physics[:, _mocap_columns(self.model)][:, :2]
         away = np.linalg.norm(physics[:, 1:3] - goal, axis=1)  # time is first, then x and y of the torso
         extent = max(self.layout.shape) * CELL
-        leaning = 2 * extent / 100  # the camera is 100 m up, ant and goal at most about 1 m high
+        leaning = 2 * extent / TOP_HEIGHT  # ant and goal reach about 1.5 m up
         return away > REACH + leaning + 2 * extent / size
 
     def batch(self, size: int, threads: int = 1) -> AntMazeBatch:
@@ -327,8 +344,6 @@ class AntMaze(Task):
 
 def _mocap_columns(model: mujoco.MjModel) -> slice:
     """Where the goal's position lies in a physics state (`PHYSICS_SPEC`)."""
-    from dmcvb_gen.tasks.base import PHYSICS_SPEC
-
     before = PHYSICS_SPEC & (int(mujoco.mjtState.mjSTATE_MOCAP_POS) - 1)
     start = mujoco.mj_stateSize(model, before)
     return slice(start, start + 3)
