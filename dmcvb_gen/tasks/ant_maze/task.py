@@ -32,7 +32,7 @@ from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
 EPISODE_STEPS, EVALUATION_STEPS = 600, 1200
 """Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
 SPAWN_NOISE, GOAL_NOISE = 0.25, 0.5
-"""Meters that the spawn lies off its place at most, along x, y and z, and the goal off its cell's center, along x and y."""
+"""Meters that the spawn lies off its place at most, along x, y and z, and the goal off its cell's center in x and y."""
 REACH = 2.0
 """Meters between torso and goal within which a touch is possible during a control step: the ant spans 1.3."""
 TOUCH_THRESHOLD = 1e-3
