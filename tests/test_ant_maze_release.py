@@ -134,7 +134,8 @@ def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(nam
         pytest.skip(reason)
     task = get_task("ant-maze-empty7x7")
     policy = load_policy(bundled_policies(task.id, "expert")[0], task)
-    run = simulate(task, [policy], range(3), 4, (task.id,), max_steps=80)
+    near = [((3, 2), (3, 4))]
+    run = simulate(task, [policy], range(3), 4, (task.id,), max_steps=80, goal_pairs=near, episodes_per_goal=3)
     assert run.terminated.any()  # the goal is reached in one of them, so the ant is beside it too
     physics, length = run.physics[:, :81], run.length
     generators = {"style": [np.random.default_rng(i) for i in range(3)]}
