@@ -134,10 +134,10 @@ def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(nam
         pytest.skip(reason)
     task = get_task("ant-maze-empty7x7")
     policy = load_policy(bundled_policies(task.id, "expert")[0], task)
-    near = [((3, 2), (3, 4))]
-    run = simulate(task, [policy], range(3), 4, (task.id,), max_steps=80, goal_pairs=near, episodes_per_goal=3)
-    assert run.terminated.any()  # the goal is reached in one of them, so the ant is beside it too
-    physics, length = run.physics[:, :81], run.length
+    far = [((2, 1), (4, 5))]
+    run = simulate(task, [policy], range(3), 4, (task.id,), max_steps=200, goal_pairs=far, episodes_per_goal=3)
+    assert run.terminated.any()  # the goal is reached in one of them, so the ant is far from it and beside it
+    physics, length = run.physics[:, :201], run.length
     generators = {"style": [np.random.default_rng(i) for i in range(3)]}
     labels = make_exogenous(task, DistractorSetting(), filled(physics, length), generators)
     renderer, asked = make_renderer(name, task, 32), []
@@ -149,8 +149,8 @@ def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(nam
         return render(physics, exogenous, views=views, hide_goal=hide_goal)
 
     renderer.render = counting
-    painted = {name: picture.copy() for name, picture in paint(task, renderer, physics, labels, length, 81)}
-    episode, row = np.nonzero(np.arange(81)[None] <= length[:, None])
+    painted = {name: picture.copy() for name, picture in paint(task, renderer, physics, labels, length, 201)}
+    episode, row = np.nonzero(np.arange(201)[None] <= length[:, None])
     every = render(physics[episode, row], labels[episode, row], hide_goal=True)
     renderer.close()
     for column, view in enumerate(task.views):

@@ -158,7 +158,7 @@ class EpisodeBatch(abc.ABC):
         """(size, state) float64: the current states, fields as in `task.state_fields`."""
 
     def behaviour_observation(self) -> np.ndarray:
-        """(size, task.behaviour_size) float32: what behaviour policies see, `task.observation`; by default the state."""
+        """(size, behaviour_size) float32: what behaviour policies see, `task.observation`; the state by default."""
         return self.state().astype(np.float32)
 
     @abc.abstractmethod
