@@ -93,7 +93,7 @@ class _Stage:
         self.task, self.count, self.size, self.split = get_task(scene.task), count, scene.size, scene.split
         self.setting = distractor_of(scene.task, setting)
         self.pictures = Pictures(self.task.views, hides_goal(setting)).select(scene.views)
-        self.max_steps = scene.max_steps or self.task.max_steps
+        self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if setting == FIXED else None
         check_size(scene.size)
         check_renderer(scene.renderer)
