@@ -2,36 +2,54 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from dmcvb_gen.agents.data import Normalization, Source, load_data, normalize_pixels, training_views
+from dmcvb_gen.agents.catalog import parse_agent
+from dmcvb_gen.agents.data import (
+    Normalization,
+    Source,
+    default_memory,
+    load_data,
+    normalize_pixels,
+    training_views,
+)
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
-from dmcvb_gen.benchmarks.run import Setup, pretraining_of, run_cells
-from dmcvb_gen.benchmarks.tables import BENCHMARKS, plan_benchmark
+from dmcvb_gen.benchmarks.report import compare
+from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
+from dmcvb_gen.benchmarks.setup import Setup, fingerprint, pretraining_of
+from dmcvb_gen.benchmarks.tables import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.distractors import ExogenousWalk
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import Manifest, SubsetRecord
+from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.store.reader import Release, Subset
 from dmcvb_gen.tasks import get_task
 
 
-def release_of(*names, episodes=100):
-    """A release of subsets without data, enough to plan with."""
-    records = []
+def release_of(*names, episodes=100, committed=None, **facts):
+    """A release of subsets without data, enough to plan with; its shards of ten are committed, or the first few."""
+    subsets = {}
     for name in names:
         task, level, setting = name.split("/")
-        records.append(
-            SubsetRecord(
-                name=name, task=task, level=level, setting=setting, episodes=episodes, episodes_per_shard=50, size=64
-            )
-        )
-    manifest = Manifest(name="x", version="1", license="x", recipe={"seed": 0}, subsets=tuple(records))
-    return Release("nowhere", manifest, {record.name: Subset("nowhere", record, {}, {}) for record in records})
+        own = facts if setting == "fixed" else {}
+        own = own | dict(task=task, level=level, setting=setting, episodes=episodes, episodes_per_shard=10, size=64)
+        record = SubsetRecord(name=name, **own)
+        shards = range((committed or episodes) // 10)
+        commits = {
+            shard: CommitRecord(subset=name, shard=shard, episodes=(10 * shard, 10 * shard + 10), steps=0, files=())
+            for shard in shards
+        }
+        subsets[name] = Subset("nowhere", record, commits, {})
+    records = tuple(subset.record for subset in subsets.values())
+    manifest = Manifest(name="x", version="1", license="x", recipe={"seed": 0}, subsets=records)
+    return Release("nowhere", manifest, subsets)
 
 
 WALKER = [f"walker-walk/{level}/{s}" for level in ("expert", "medium", "mixed", "random") for s in ("none", "dynamic")]
@@ -86,15 +104,35 @@ def test_subsets_that_the_user_left_out_are_not_said_to_be_missing():
     assert (missing.subsets, missing.command, missing.left_out) == ((), "", ("walker-walk/mixed/none",))
 
 
-def test_b3_has_a_policy_for_each_fixed_goal_and_names_what_is_missing():
-    maze = "ant-maze-empty7x7"
-    cells, _ = plan_benchmark("b3", release_of(f"{maze}/expert/hidden", f"{maze}/expert/fixed", episodes=50))
-    assert {cell.policy[0].goal_pair for cell in cells} == set(range(5))
+MAZE = "ant-maze-empty7x7"
+
+
+def b3_of(per_goal=10, committed=None):
+    names, facts = (f"{MAZE}/expert/hidden", f"{MAZE}/expert/fixed"), dict(fixed_goals=5, episodes_per_goal=per_goal)
+    return plan_benchmark("b3", release_of(*names, episodes=5 * per_goal, committed=committed, **facts))
+
+
+@pytest.mark.parametrize("per_goal", [10, 20])
+def test_b3_has_a_policy_for_each_fixed_goal_and_names_what_is_missing(per_goal):
+    cells, missing = b3_of(per_goal)
+    assert not missing and {cell.policy[0].goal_pair for cell in cells} == set(range(5))
     assert {(cell.agent.name, bool(cell.pretrain)) for cell in cells} == {
         ("bc", False), ("bc+bc", True), ("id+bc", True)
     }  # fmt: skip
     none, [missing] = plan_benchmark("b3", release_of("walker-walk/expert/none"))
     assert not none and "--fixed-goals 5" in missing.command and "--goal hidden" in missing.command
+
+
+def test_b3_of_a_part_of_a_release_has_the_goals_that_are_whole_and_says_which_are_not():
+    cells, [missing] = b3_of(per_goal=20, committed=50)
+    assert {cell.policy[0].goal_pair for cell in cells} == {0, 1}
+    assert missing.subsets == (f"{MAZE}/expert/fixed, episodes of goal pairs 2, 3, 4",)
+
+
+def test_mazes_have_the_papers_two_levels_in_b1_and_others_where_they_are_there():
+    cells, [missing] = plan_benchmark("b1", release_of(f"{MAZE}/expert/visible", f"{MAZE}/random/visible"), ["bc"])
+    assert {cell.policy_label for cell in cells} == {"expert", "random"}
+    assert missing.subsets == (f"{MAZE}/medium/visible",)
 
 
 def test_ablations_vary_frames_k_and_the_share_of_the_data():
@@ -208,7 +246,7 @@ def test_evaluation_episodes_are_no_releases_episodes(small_release):
 
 
 def test_mazes_are_scored_by_success_and_start_where_the_pair_says():
-    subset = release_of("ant-maze-empty7x7/expert/fixed").subsets["ant-maze-empty7x7/expert/fixed"]
+    subset = release_of(f"{MAZE}/expert/fixed")[f"{MAZE}/expert/fixed"]
     task = get_task("ant-maze-empty7x7")
     normalization = Normalization(torch.zeros(task.state_size), torch.ones(task.state_size))
     evaluator = Evaluator(
@@ -225,6 +263,7 @@ def test_agents_see_three_of_a_mazes_views_with_the_goal_hidden_where_the_settin
     task = get_task("ant-maze-empty7x7")
     everything = tuple(f"{root}/{view}" for root in ("pixels", "pixels_hidden_goal") for view in task.views)
     monkeypatch.setattr(Subset, "pixel_arrays", property(lambda self: everything))
+    monkeypatch.setattr(Subset, "attrs", property(lambda self: {"views": list(task.views)}))
     for setting, root in (("visible", "pixels"), ("hidden", "pixels_hidden_goal"), ("fixed", "pixels_hidden_goal")):
         subset = release_of(f"ant-maze-empty7x7/expert/{setting}").subsets[f"ant-maze-empty7x7/expert/{setting}"]
         assert training_views(subset) == tuple(f"{root}/{view}" for view in ("top", "egocentric", "follow"))
@@ -255,14 +294,17 @@ def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path
 def test_processes_train_each_encoder_before_its_cells(small_release, tmp_path):
     cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc", "id+bc"])[0]]
     cells = [c for c in cells if c.setting in ("none", "static") and c.policy_label == cells[0].policy_label]
-    done = []
+    steps = []
     setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
-    results = {cell: result for cell, result in run_cells(setup, cells, 2, lambda what, steps: done.append(what))}
+    results = dict(run_cells(setup, cells, 2, lambda what, made: steps.append(made)))
     assert results.keys() == set(cells) and not any("error" in result for result in results.values())
-    encoders = {pretraining_of(cell).id: cell for cell in cells if cell.agent.pretrain}
+    encoders = {pretraining_of(cell) for cell in cells if cell.agent.pretrain}
     assert len(encoders) == 2
-    for name, cell in encoders.items():
-        assert done.index(f"encoder {name}") < done.index(cell.id)
+    for cell in cells:
+        if cell.agent.pretrain:
+            trained = (tmp_path / "encoders" / f"{pretraining_of(cell).id}.json").stat().st_mtime_ns
+            assert trained < (tmp_path / "cells" / f"{cell.id}.json").stat().st_mtime_ns
+    assert sum(steps) == planned_steps(setup.profile, cells)
 
 
 def test_a_result_of_another_seed_or_profile_is_not_taken_for_this_one(small_release, tmp_path):
@@ -276,3 +318,64 @@ def test_a_result_of_another_seed_or_profile_is_not_taken_for_this_one(small_rel
     assert made == [20, 0, 20]
     with pytest.raises(DmcvbError, match="committed|release"):
         open_release(tmp_path)
+
+
+def test_what_a_score_hangs_on_besides_the_data_is_in_its_fingerprint(small_release, tmp_path):
+    from safetensors.torch import save_file
+
+    release, weights = open_release(small_release), tmp_path / "dino.safetensors"
+    cells = plan_benchmark("b1", release, ["dino+bc", "bc", "state-bc"])[0]
+    by_agent = {cell.agent.name: cell for cell in cells if cell.setting == "dynamic"}
+    own = tmp_path / "clips" / "val" / "one"
+    own.mkdir(parents=True)
+    Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(own / "0.png")
+    save_file({"x": torch.zeros(1)}, str(weights))
+    plain = Setup(str(small_release), str(tmp_path), PROFILES["smoke"], dino_weights=str(weights))
+    moved = dataclasses.replace(plain, backgrounds=str(tmp_path / "clips"))
+    assert fingerprint(plain, release, by_agent["bc"]) != fingerprint(moved, release, by_agent["bc"])
+    [by_state] = [cell for cell in cells if cell.agent.sees_state]
+    assert fingerprint(plain, release, by_state) == fingerprint(moved, release, by_state)  # states show no videos
+    before = fingerprint(plain, release, by_agent["dino+bc"]), fingerprint(plain, release, by_agent["bc"])
+    save_file({"x": torch.ones(1)}, str(weights))
+    after = fingerprint(plain, release, by_agent["dino+bc"]), fingerprint(plain, release, by_agent["bc"])
+    assert before[0] != after[0] and before[1] == after[1]
+
+
+def test_workers_share_the_memory_for_pictures(small_release):
+    setup = Setup(str(small_release), "out", PROFILES["smoke"], memory=1000)
+    assert share_memory(setup, 4).memory == 250
+    with_default = share_memory(dataclasses.replace(setup, memory=None), 4).memory
+    assert with_default == pytest.approx(default_memory() / 4, rel=0.2)
+
+
+def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
+    cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc"])[0]][:1]
+    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+
+    def out_of_memory(*_, **__):
+        raise MemoryError("no room for 7 GB")
+
+    monkeypatch.setattr("dmcvb_gen.benchmarks.cells.load_data", out_of_memory)
+    [(cell, result)] = list(run_cells(setup, cells))
+    log = tmp_path / "cells" / f"{cell.id}.log"
+    assert result["error"] == f"MemoryError: no room for 7 GB (all of it in {log})"
+    assert "out_of_memory" in log.read_text()
+    monkeypatch.undo()
+    [(_, result)] = list(run_cells(setup, cells))
+    assert "error" not in result and not log.exists()
+
+
+def compared(task, pairs, benchmark="b1"):
+    """What `compare` says of agents' mean scores."""
+    part = (Part(f"{task}/expert/x"),)
+    results = [(Cell(benchmark, task, "x", parse_agent(name), part), {"score": {"mean": mean}}) for name, mean in pairs]
+    return {cell.agent.name: compare(cell, results) for cell, _ in results}
+
+
+def test_a_negative_return_is_set_beside_its_reference_by_the_difference():
+    maze = compared(MAZE, [("state-bc", -40.0), ("bc", -800.0)])["bc"]
+    assert maze["share"] is None and maze["difference"] == -760.0 and maze["reference"] == "BC(state)"
+    walker = compared("walker-walk", [("state-bc", 800.0), ("bc", 400.0)])["bc"]
+    assert walker["share"] == 0.5
+    fixed = compared(MAZE, [("bc", -60.0), ("id+bc", -45.0)], "b3")["id+bc"]
+    assert fixed["difference"] == 15.0 and fixed["reference"] == "BC on these episodes"

@@ -17,9 +17,10 @@ from click.testing import CliRunner
 
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.cli import main
+from dmcvb_gen.files import sha256_file, write_json
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
-from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
+from dmcvb_gen.store.writer import commit_path, finish_release
 from tests.conftest import roll_out, small_recipe
 
 NAME = "walker-walk/expert/dynamic"
@@ -159,6 +160,39 @@ def test_a_damaged_release_ends_with_1_names_the_place_and_is_not_trained_on(cop
     assert f"FAIL finite: {NAME}, episode 1, step 123" in result.output
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Not sound" in page and "0 of 1 benchmark cells run" in page
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_any_work(release, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("dmcvb_gen.benchmarks.validate.check_structure", lambda *_: pytest.fail("work was done"))
+    result = run("validate", release, "--out", tmp_path / "file" / "report")
+    assert result.exit_code == 2 and "choose another --out" in result.output
+
+
+def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
+    part = tmp_path / "part"
+    shutil.copytree(small_release, part)
+    manifest = open_release(part).manifest
+    write_json(part / "manifest.json", manifest.model_copy(update={"complete": False}))
+    subset = open_release(part)["walker-walk/random/none"]
+    (part / commit_path(subset.name, 1)).unlink()
+    shutil.rmtree(part / "commits" / "walker-walk" / "random" / "dynamic")
+    result = run("validate", part, "--checks-only", "--out", tmp_path / "out")
+    assert result.exit_code == 1, result.output
+    assert "incomplete: 5 of 9 episodes; what is there is sound" in result.output
+    facts = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert facts["sound"] and not facts["complete"]
+    assert facts["incomplete"] == {"walker-walk/random/none": [2, 3], "walker-walk/random/dynamic": [0, 3]}
+    assert "Incomplete: 5 of 9 episodes" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_names_are_text_on_the_page(report, release):
+    from dmcvb_gen.benchmarks.report import render_page
+
+    facts = json.loads((report[1] / "report.json").read_text())
+    facts["release"]["name"], facts["results"] = "<script>alert(1)</script>", []
+    page = render_page(facts, open_release(release), [], None)
+    assert "<script>" not in page and "&lt;script&gt;alert(1)" in page
 
 
 # -- damage ---------------------------------------------------------------------------------------

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from dmcvb_gen.benchmarks.checks import check_labels, check_structure
+from dmcvb_gen.benchmarks.checks import check_labels, check_policy_returns, check_structure
+from dmcvb_gen.benchmarks.goals import goal_cells
+from dmcvb_gen.cli import main
 from dmcvb_gen.rollout.recipe import make_recipe
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import PolicyRecord
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from tests.conftest import roll_out
 
 TINY = "ant-maze-tiny:****/*..*/****"
@@ -42,3 +50,61 @@ def test_a_look_that_is_no_look_of_the_maze_is_found(release):
 
     subset.episode = wrong
     assert {(finding.check, finding.step) for finding in check_labels(subset)} == {("labels", 0)}
+
+
+def test_episodes_of_fixed_goals_are_not_held_to_returns_over_random_ones(release):
+    said = {"mean": -1.0, "std": 0.1, "episodes": 100, "mode": "sampled"}
+    policy = PolicyRecord(name="other", digest="x", header={"evaluation": said})
+    found = {}
+    for setting in ("visible", "fixed"):
+        subset = open_release(release)[f"{NAME}/{setting}"]
+        subset.record = subset.record.model_copy(update={"policies": (policy,), "deterministic": False})
+        found[setting] = len(list(check_policy_returns(subset)))
+    assert found == {"visible": 1, "fixed": 0}
+
+
+def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(release):
+    subset, layout = open_release(release)[f"{NAME}/fixed"], get_task(TINY).layout
+    assert [goal_cells(subset, pair) for pair in range(2)] == fixed_pairs(layout, 2, seed=0)
+
+
+# -- B1 and B3 ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def report(release, tmp_path_factory):
+    out = tmp_path_factory.mktemp("maze-report")
+    command = ["validate", str(release), "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
+    return out, CliRunner().invoke(main, [*command, "--threads", "1", "--out", str(out)])
+
+
+def test_a_maze_release_goes_through_b1_and_b3(report):
+    out, result = report
+    assert result.exit_code == 0, result.output
+    facts = json.loads((out / "report.json").read_text())
+    ran = [(r["cell"]["benchmark"], r["cell"]["agent_name"], r["cell"]["policy_label"]) for r in facts["results"]]
+    assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {
+        ("b3", agent, f"random goal {pair}") for agent in ("bc", "id+bc") for pair in range(2)
+    }
+    by_id = {r["id"]: r for r in facts["results"]}
+    pretrained = next(r for name, r in by_id.items() if name.startswith("b3") and "id-bc" in name.replace("+", "-"))
+    assert [part["subset"] for part in pretrained["cell"]["pretrain"]] == [f"{NAME}/hidden"]
+    assert not facts["failed"] and not any(r["share"] for r in facts["results"])
+    assert "ant-maze-tiny/expert/visible" in result.output  # B1 would have the paper's levels too
+
+
+def test_maze_scores_have_reward_success_and_speed_beside_the_datas_own(report, release):
+    facts = json.loads((report[0] / "report.json").read_text())
+    [score] = [r for r in facts["results"] if r["cell"]["agent_name"] == "state-bc"]
+    subset, task = open_release(release)[f"{NAME}/visible"], get_task(TINY)
+    reached = subset.read("terminated")
+    assert score["data"]["success"] == reached.mean() and score["data"]["limit"] == subset.record.max_steps
+    if reached.any():
+        away = subset.read("state")[:, 0, task.state_slices["distance_to_target"]][:, 0]
+        speed = (away / (subset.lengths * 2 * task.control_timestep))[reached].mean()
+        assert score["data"]["speed"] == pytest.approx(speed, rel=1e-4)
+    else:
+        assert score["data"]["speed"] is None
+    assert score["score"]["success"] is not None and score["score"]["limit"] == 10  # smoke's
+    page = (report[0] / "report.html").read_text()
+    assert "success" in page and "Evaluations are cut at 10 agent steps" in page

@@ -117,7 +117,7 @@ def make_encoder(
     if agent.sees_state:
         return state_encoder(data.state.shape[1])
     if agent.pretrain == "dino":
-        return load_dino(dino_weights, data.channels)
+        return load_dino(dino_weights, data.channels, data.frames.size)
     return observation_encoder(data.channels, data.frames.size, architecture)
 
 

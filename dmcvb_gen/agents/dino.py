@@ -6,6 +6,7 @@ whose names are those of the DINO release (Caron et al. 2021) and of timm.
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import sha256_file
 
 INPUT = 224
 """Pixels a side that DINO was trained on; smaller pictures are padded (paper, section 4.2)."""
@@ -80,14 +82,39 @@ class DinoEncoder(nn.Module):
         return self.vit((pictures + 0.5 - self.mean) / self.std).reshape(len(observation), -1)
 
 
-def load_dino(path: str | Path | None, channels: int) -> DinoEncoder:
-    """A DINO encoder from a local file.
+def dino_digest(path: str | Path | None) -> str:
+    """SHA-256 of the file of weights; read anew only where the file has changed.
 
     Raises:
-      DmcvbError: no file is given, or it does not hold the weights of a DINO ViT.
+      DmcvbError: no file is given, or it cannot be read.
     """
     if path is None:
         raise DmcvbError(MISSING)
+    try:
+        facts = Path(path).stat()
+        return _digest(str(path), facts.st_mtime_ns, facts.st_size)
+    except OSError as error:
+        raise DmcvbError(f"cannot read DINO weights {path} ({error}); give a safetensors file") from None
+
+
+@functools.lru_cache(maxsize=4)
+def _digest(path: str, modified: int, size: int) -> str:
+    return sha256_file(path)
+
+
+def load_dino(path: str | Path | None, channels: int, size: int = 64) -> DinoEncoder:
+    """A DINO encoder from a local file.
+
+    Args:
+      channels, size: of the observations, 3 channels a picture, pixels a side.
+
+    Raises:
+      DmcvbError: no file is given, or it does not hold the weights of a DINO ViT, or pictures are too large for it.
+    """
+    if path is None:
+        raise DmcvbError(MISSING)
+    if size > INPUT:
+        raise DmcvbError(f"DINO sees {INPUT} pixels a side at most, these pictures have {size}; repaint them smaller")
     try:
         weights = load_file(str(path))
     except (OSError, SafetensorError) as error:

@@ -44,6 +44,7 @@ class TrainSettings:
       half: bfloat16 autocast. Pays for pictures, not for states.
       compile: torch.compile of the losses.
       workers: threads that draw batches ahead; 0 draws them in turn (data read from shards have two in any case).
+      rate: times the learner's own learning rate (1e-3, the paper's).
       decay: the learning rate falls linearly to zero over the steps; the paper keeps it, short trainings gain by it.
     """
 
@@ -54,6 +55,7 @@ class TrainSettings:
     half: bool = True
     compile: bool = False
     workers: int = 0
+    rate: float = 1.0
     decay: bool = False
 
 
@@ -123,42 +125,74 @@ def train(
             setattr(learner, name, torch.compile(getattr(learner, name)))
     log_every = max(1, settings.steps // settings.points)
     started = saved = time.perf_counter()
-    sums: dict[str, torch.Tensor] = {}
-    counts: dict[str, int] = {}
+    means = _Means()
 
     def make(step: int, reuse: Batch | None) -> Batch:
         return draw(learner, data, settings.batch_size, seed, step, reuse=reuse)
 
-    groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
-    rates = [group["lr"] for group in groups]
+    schedule = _Schedule(learner, settings)
     workers = max(settings.workers, 2 if isinstance(data.frames, StoredFrames) else 0)
     for step, batch in batches(make, first, settings.steps, workers):
         torch.manual_seed((seed << 32) + step)
-        if settings.decay:
-            for group, rate in zip(groups, rates, strict=True):
-                group["lr"] = rate * (1 - step / settings.steps)
-        for name, value in learner.update(batch).items():
-            sums[name] = sums.get(name, 0.0) + value
-            counts[name] = counts.get(name, 0) + 1
+        schedule.at(step)
+        means.add(learner.update(batch))
         done = step + 1
         tick(1)
         evaluating = done % settings.evaluate_every == 0 or done == settings.steps
         if evaluating or done % log_every == 0:
-            point = {"step": done, **{name: float(value) / counts[name] for name, value in sums.items()}}
-            bad = [name for name, value in point.items() if not np.isfinite(value)]
-            if bad:
-                raise DmcvbError(
-                    f"{bad[0]} is no longer finite at step {done}; look at the data with `dmcvb-gen verify`"
-                )
-            sums, counts = {}, {}
-            point |= hold_out_losses(learner, data, settings.batch_size)
+            point = {"step": done, **means.take(done), **hold_out_losses(learner, data, settings.batch_size)}
             if evaluating and evaluate:
                 point |= evaluate(learner)
             curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})
         if path is not None and time.perf_counter() - saved > SAVE_SECONDS:  # the end too: its evaluation may be long
             _save_state(learner, path, done, curve, spent + time.perf_counter() - started)
             saved = time.perf_counter()
+    schedule.restore()
     return curve
+
+
+class _Schedule:
+    """The learning rates of a learner's optimizers, step by step."""
+
+    def __init__(self, learner: Learner, settings: TrainSettings):
+        self._groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
+        self._own = [group["lr"] for group in self._groups]
+        self._settings = settings
+
+    def at(self, step: int) -> None:
+        factor = self._settings.rate * (1 - step / self._settings.steps if self._settings.decay else 1.0)
+        for group, rate in zip(self._groups, self._own, strict=True):
+            group["lr"] = rate * factor
+
+    def restore(self) -> None:
+        for group, rate in zip(self._groups, self._own, strict=True):
+            group["lr"] = rate
+
+
+class _Means:
+    """Means of named losses since they were last taken."""
+
+    def __init__(self):
+        self._sums: dict[str, torch.Tensor] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, losses: dict[str, torch.Tensor]) -> None:
+        for name, value in losses.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+            self._counts[name] = self._counts.get(name, 0) + 1
+
+    def take(self, step: int) -> dict[str, float]:
+        """The means, as numbers.
+
+        Raises:
+          DmcvbError: one is no longer finite.
+        """
+        means = {name: float(value) / self._counts[name] for name, value in self._sums.items()}
+        for name, value in means.items():
+            if not np.isfinite(value):
+                raise DmcvbError(f"{name} is no longer finite at step {step}; look at the data with `dmcvb-gen verify`")
+        self._sums, self._counts = {}, {}
+        return means
 
 
 def forget(folder: Path) -> None:

@@ -1,7 +1,8 @@
 """Online evaluation: a policy and the subset it learned from in, scores of fresh episodes out, all in one batch.
 
 The episodes are those of the subset's task, painted by its renderer at its size, with its kind of distractors: unseen
-`val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5).
+`val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). Mazes give an
+agent twice the time that their data had (`Task.evaluation_steps`), as the paper's evaluation does.
 """
 
 from __future__ import annotations
@@ -16,16 +17,21 @@ import torch
 
 from dmcvb_gen.agents.data import Normalization, normalize_pixels
 from dmcvb_gen.agents.learners import Policy
-from dmcvb_gen.distractors import ExogenousWalk
+from dmcvb_gen.distractors import ExogenousWalk, load_backgrounds
+from dmcvb_gen.names import distractor_of
+from dmcvb_gen.release.verify import is_imported
 from dmcvb_gen.rollout.plan import renderer_for
-from dmcvb_gen.rollout.recipe import distractor_of
+from dmcvb_gen.rollout.recipe import RendererChoice
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store import Subset
 from dmcvb_gen.store.pictures import training_pictures
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.tasks.base import Task
 
 STREAM_NAME = "validate"
 """Of the evaluation's streams: no release is made from it."""
+SPLIT = "val"
+"""Of videos and maze styles: none of them is in data."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,8 @@ class Score:
       mean, stderr: of the returns; the standard error is std / sqrt(episodes), std with n - 1.
       returns: of each episode.
       success: share of the episodes that the task ended (mazes), else None.
-      speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None.
+      speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_speed`).
+      limit: agent steps after which an episode was cut.
       seconds: that it took.
       pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
     """
@@ -46,13 +53,63 @@ class Score:
     returns: tuple[float, ...]
     success: float | None = None
     speed: float | None = None
+    limit: int | None = None
     seconds: float = 0.0
     pictures: np.ndarray | None = field(default=None, repr=False)
 
     def facts(self) -> dict[str, Any]:
         """Everything but the pictures, as plain values."""
-        names = ("mean", "stderr", "returns", "success", "speed", "seconds")
+        names = ("mean", "stderr", "returns", "success", "speed", "limit", "seconds")
         return {name: getattr(self, name) for name in names}
+
+
+def evaluation_steps(task: Task, max_steps: int | None = None) -> int:
+    """Agent steps after which an evaluation's episode is cut, by its task and (for smoke runs) `max_steps`."""
+    return min(max_steps or task.evaluation_steps, task.evaluation_steps)
+
+
+def protocol(
+    subset: Subset,
+    pair: tuple | None = None,
+    backgrounds: str | None = None,
+    pictures: bool = True,
+    max_steps: int | None = None,
+) -> dict[str, Any]:
+    """All that decides an evaluation's episodes but the policy, as plain values; arguments as for `Evaluator`.
+
+    Raises:
+      BackgroundError: there are no `val` videos.
+    """
+    facts: dict[str, Any] = {"steps": evaluation_steps(get_task(subset.task), max_steps), "goals": pair}
+    if pictures:
+        facts |= {"size": subset.record.size, "renderer": _renderer_choice(subset), "backgrounds": None}
+        if distractor_of(subset.task, subset.setting).kind != "none":
+            facts["backgrounds"] = load_backgrounds(_video_source(subset, backgrounds), SPLIT).digest
+    return facts
+
+
+def _video_source(subset: Subset, backgrounds: str | None) -> str:
+    recorded = subset.record.backgrounds
+    return backgrounds or (recorded["source"] if recorded else "builtin")
+
+
+def _renderer_choice(subset: Subset) -> dict[str, Any]:
+    """Name and samples of the renderer: the data's own, or the default one where they were painted elsewhere."""
+    if is_imported(subset):
+        default = RendererChoice()
+        return {"name": default.backend, "samples": default.samples}
+    return {"name": subset.record.renderer["name"], "samples": subset.record.renderer.get("samples")}
+
+
+def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
+    """Mean speed towards the goal of the episodes that reached it, m/s; None where none did.
+
+    Args:
+      distance: (episode,) to the goal at the start, as the task measures it, meters.
+      length: (episode,) agent steps. reached: (episode,) bool.
+    """
+    seconds = length * ACTION_REPEAT * task.control_timestep
+    return float((distance / seconds)[reached].mean()) if reached.any() else None
 
 
 class Evaluator:
@@ -93,14 +150,13 @@ class Evaluator:
         self.subset, self.task = subset, get_task(subset.task)
         self.setting = distractor_of(subset.task, subset.setting)
         self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
-        self.steps = min(max_steps or self.task.evaluation_steps, self.task.evaluation_steps)
+        self.steps = evaluation_steps(self.task, max_steps)
         self.device, self.normalization, self.stack = torch.device(device), normalization, stack
         self.pair, self.renderer = pair, None
         if pixels:
-            recorded = subset.record.backgrounds
-            source = backgrounds or (recorded["source"] if recorded else "builtin")
-            on = "cuda" if self.device.type == "cuda" and subset.record.renderer["name"] == "warp" else "cpu"
-            self.renderer, self._videos = renderer_for(subset.record, source, "val", on)
+            choice, source = _renderer_choice(subset), _video_source(subset, backgrounds)
+            on = "cuda" if self.device.type == "cuda" and choice["name"] == "warp" else "cpu"
+            self.renderer, self._videos = renderer_for(subset.record, source, SPLIT, on, **choice)
             if hasattr(self.renderer, "worlds"):
                 self.renderer.worlds = episodes  # frames a launch: more would only be padding
             pictures = training_pictures(subset)
@@ -124,14 +180,9 @@ class Evaluator:
         starts = self.streams("initial_state")
         state = batch.reset(starts) if self.pair is None else batch.reset_fixed(starts, [self.pair] * count)
         distance = _distance(task, state)
-        walk = None
-        if self.renderer is not None:
-            generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
-            walk = ExogenousWalk(task, self.setting, self.steps + 1, generators, self._videos, split="val")
+        walk, stack, pictures = self._walk(), None, []
         returns, length = np.zeros(count), np.full(count, self.steps)
         active, ended = np.ones(count, bool), np.zeros(count, bool)
-        stack: np.ndarray | None = None
-        pictures = []
         for step in range(self.steps):
             if walk is None:
                 observation = self.normalization(torch.from_numpy(state).float()).to(self.device)
@@ -150,20 +201,23 @@ class Evaluator:
             active &= ~result.terminated
             if not active.any():
                 break
-        success = speed = None
-        if distance is not None:
-            success = float(ended.mean())
-            seconds = length * ACTION_REPEAT * task.control_timestep
-            speed = float((distance / seconds)[ended].mean()) if ended.any() else None
         return Score(
             mean=float(returns.mean()),
             stderr=float(returns.std(ddof=1) / math.sqrt(count)) if count > 1 else 0.0,
             returns=tuple(float(value) for value in returns),
-            success=success,
-            speed=speed,
+            success=None if distance is None else float(ended.mean()),
+            speed=None if distance is None else goal_speed(distance, length, ended, task),
+            limit=self.steps,
             seconds=time.perf_counter() - started,
             pictures=np.stack(pictures) if pictures else None,
         )
+
+    def _walk(self) -> ExogenousWalk | None:
+        """The distractors of the episodes; None for policies that see states."""
+        if self.renderer is None:
+            return None
+        generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
+        return ExogenousWalk(self.task, self.setting, self.steps + 1, generators, self._videos, split=SPLIT)
 
     def _see(self, stack, physics, walk: ExogenousWalk, step: int, active: np.ndarray) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""

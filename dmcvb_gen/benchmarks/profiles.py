@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from dmcvb_gen.agents.networks import PAPER, Architecture
 from dmcvb_gen.errors import UnknownNameError
 
 
@@ -21,6 +22,8 @@ class Profile:
       episodes: of each evaluation.
       episode_steps: agent steps an evaluation's episode is cut to; None: whole episodes.
       batch_size: transitions an Adam step.
+      network: the convolutions of every encoder and decoder.
+      rate: times the paper's learning rate of 1e-3.
       decay: the learning rate falls to zero over each training, instead of staying as the paper's.
       scores: whether its scores mean anything.
       note: printed wherever a score stands.
@@ -35,6 +38,8 @@ class Profile:
     evaluations: int
     episodes: int
     batch_size: int = 256
+    network: Architecture = PAPER
+    rate: float = 1.0
     decay: bool = False
     episode_steps: int | None = None
     scores: bool = True

@@ -1,32 +1,34 @@
 """The report of a validation: results in, one self-contained HTML page and a JSON file out.
 
-Wherever a score stands, the profile that made it stands beside it.
+Wherever a score stands, the profile that made it stands beside it. The page's text lies in data/report.html.jinja;
+here is what it shows.
 """
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import html
-import io
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from dmcvb_gen import __version__
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
+from dmcvb_gen.benchmarks.figures import curve_figure, data_url, figure_url, label_of, return_figure
 from dmcvb_gen.benchmarks.paper import paper_score
-from dmcvb_gen.benchmarks.run import Setup
-from dmcvb_gen.benchmarks.tables import Cell, Missing
+from dmcvb_gen.benchmarks.setup import Setup
+from dmcvb_gen.benchmarks.tables import Cell, Missing, Part
+from dmcvb_gen.files import write_json, write_text
+from dmcvb_gen.names import FIXED
 from dmcvb_gen.release.verify import Finding
 from dmcvb_gen.rollout.info import return_statistics
 from dmcvb_gen.store import Release
-from dmcvb_gen.store.manifest import environment, write_json_atomically
+from dmcvb_gen.store.manifest import environment
+from dmcvb_gen.tasks import get_task
 
 CHECKS = {
     "files": "every file has its bytes and digest",
@@ -44,18 +46,16 @@ CHECKS = {
     "labels": "distractor labels fit their setting",
 }
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
+TITLES = {
+    "b1": "B1: policies on every level and distractor",
+    "b2": "B2: encoders from mixed data, policies from few expert episodes",
+    "b3": "B3: encoders from hidden random goals, policies from the episodes of one fixed goal",
+    "ablations": "Ablations",
+}
 SHOWN = 200
 """Findings on the page; the JSON file has all."""
-_STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;max-width:1200px;margin:2em auto;padding:0 1em;color:#1a1a1a}
-h1{font-size:1.5em} h2{font-size:1.2em;margin-top:2em;border-bottom:1px solid #ccc}
-table{border-collapse:collapse;margin:.5em 0} td,th{border:1px solid #ccc;padding:.3em .6em;text-align:left;
-vertical-align:top} th{background:#f4f4f4;font-weight:600} .verdict{padding:.8em 1em;border-radius:6px;color:#fff;
-font-weight:600} .sound{background:#1b7f4b} .unsound{background:#b3261e} .note{background:#fff4d6;padding:.5em 1em;
-border-radius:6px} .tag{font-size:.75em;background:#fff4d6;padding:0 .4em;border-radius:3px;white-space:nowrap}
-.paper{color:#666;font-size:.9em} .bad{color:#b3261e} .ok{color:#1b7f4b} img{max-width:100%}
-.pixel{image-rendering:pixelated;width:100%} code{background:#f4f4f4;padding:0 .3em} .scroll{overflow-x:auto}
-"""
+STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
+Results = Sequence[tuple[Cell, dict[str, Any]]]
 
 
 def write_report(
@@ -64,30 +64,33 @@ def write_report(
     release: Release,
     structure: Structure,
     cells: Sequence[Cell],
-    results: Sequence[tuple[Cell, dict[str, Any]]],
+    results: Results,
     missing: Sequence[Missing],
     warnings: Sequence[Finding],
     seconds: float,
 ) -> tuple[Path, Path]:
     """Write report.html and report.json into the setup's folder; gives both paths."""
     folder = Path(setup.out)
-    folder.mkdir(parents=True, exist_ok=True)
     facts = report_facts(setup, release, structure, cells, results, missing, warnings, seconds)
-    write_json_atomically(folder / "report.json", facts)
-    page = folder / "report.html"
-    page.write_text(_page(facts, release, results, setup), encoding="utf-8")
-    return page, folder / "report.json"
+    write_json(folder / "report.json", facts)
+    good = [(cell, result) for cell, result in results if "error" not in result]
+    write_text(folder / "report.html", render_page(facts, release, good, setup))
+    return folder / "report.html", folder / "report.json"
 
 
 def report_facts(setup, release, structure, cells, results, missing, warnings, seconds) -> dict[str, Any]:
     """Everything that the page says, as plain values."""
     failed = [{"cell": cell.id, "error": result["error"]} for cell, result in results if "error" in result]
+    there, asked = release_episodes(release)
     return {
         "format": "dmcvb-gen validation",
         "generator": f"dmcvb-gen {__version__}",
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "release": {"name": release.manifest.name, "version": release.manifest.version, "path": release.root},
         "sound": structure.sound and not failed,
+        "complete": there == asked,
+        "episodes": {"there": sum(there.values()), "asked": sum(asked.values())},
+        "incomplete": {name: [there[name], asked[name]] for name in asked if there[name] < asked[name]},
         "profile": dataclasses.asdict(setup.profile),
         "structure": {
             "sound": structure.sound,
@@ -97,12 +100,13 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
         },
         "warnings": [dataclasses.asdict(finding) for finding in warnings],
         "returns": {
-            name: return_statistics(subset.returns) | {"paper": paper_returns(subset.task, subset.level)}
+            name: return_statistics(subset.returns)
+            | {"paper": None if subset.setting == FIXED else paper_returns(subset.task, subset.level)}
             for name, subset in release.subsets.items()
         },
         "cells_planned": len(cells),
         "failed": failed,
-        "results": [result | _shares(cell, results) for cell, result in results if "error" not in result],
+        "results": [result | compare(cell, results) for cell, result in results if "error" not in result],
         "missing": [dataclasses.asdict(entry) for entry in missing],
         "settings": {
             key: value for key, value in dataclasses.asdict(setup).items() if key not in ("profile", "root", "out")
@@ -112,251 +116,252 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
     }
 
 
-def _shares(cell: Cell, results) -> dict[str, Any]:
-    """A score as a share of BC(state) on the same data, ours and the paper's (B2: of BC on all of expert/none)."""
-    ours = None
-    for other, result in results:
-        if "error" in result or (other.benchmark, other.task) != (cell.benchmark, cell.task):
-            continue
-        if cell.benchmark == "b2":
-            whole = other.setting == "none" and other.agent.name == "bc" and other.policy_label == "expert"
-        else:
-            whole = other.agent.name == "state-bc" and other.policy_label == cell.policy_label
-        if whole:
-            ours = result["score"]["mean"]
-    mean = dict((c, r) for c, r in results)[cell]["score"]["mean"]
-    published = paper_score(cell.task, cell.policy_label, cell.setting, cell.agent.paper_name)
-    reference = paper_score(cell.task, cell.policy_label, cell.setting, "bc(state)")
-    by_paper = published[0] / reference[0] if published and reference and cell.benchmark == "b1" else None
-    return {
-        "share": mean / ours if ours else None,
-        "paper_share": by_paper,
-        "share_of": "BC on all of expert/none" if cell.benchmark == "b2" else "BC(state)",
-    }
+def release_episodes(release: Release) -> tuple[dict[str, int], dict[str, int]]:
+    """Subset -> episodes that are committed, and that the manifest asks for."""
+    asked = {record.name: record.episodes for record in release.manifest.subsets}
+    return {name: len(release.subsets[name].episodes) if name in release.subsets else 0 for name in asked}, asked
+
+
+def compare(cell: Cell, results: Results) -> dict[str, Any]:
+    """A score beside that of the cell's reference on the same data.
+
+    B1 and ablations refer to BC(state), B2 to BC on all of expert/none, B3 to BC on the same episodes of one goal.
+    A share means something where 0 is the least that an episode can return; elsewhere (mazes: -800 is not "twenty
+    times" -40) the difference stands.
+
+    Returns:
+      share, paper_share: of the reference's score, ours and the paper's; None where there is none.
+      difference: from the reference's score; None where there is none.
+      reference: what it refers to.
+    """
+    scores = {other: result["score"]["mean"] for other, result in results if "error" not in result}
+    reference = {"b2": "BC on all of expert/none", "b3": "BC on these episodes"}.get(cell.benchmark, "BC(state)")
+    found = [mean for other, mean in scores.items() if _is_reference(other, cell)]
+    shares = get_task(cell.task).return_range[0] >= 0
+    ours = paper = difference = None
+    if found:
+        difference = scores[cell] - found[0]
+        ours = scores[cell] / found[0] if shares and found[0] > 0 else None
+    if shares and cell.benchmark == "b1":
+        published = paper_score(cell.task, cell.policy_label, cell.setting, cell.agent.paper_name)
+        whole = paper_score(cell.task, cell.policy_label, cell.setting, "bc(state)")
+        paper = published[0] / whole[0] if published and whole else None
+    return {"share": ours, "paper_share": paper, "difference": difference, "reference": reference}
+
+
+def _is_reference(other: Cell, cell: Cell) -> bool:
+    if (other.benchmark, other.task) != (cell.benchmark, cell.task):
+        return False
+    if cell.benchmark == "b2":
+        return other.setting == "none" and other.agent.name == "bc" and other.policy_label == "expert"
+    if cell.benchmark == "b3":
+        return other.agent.name == "bc" and other.policy == cell.policy
+    return other.agent.name == "state-bc" and other.policy_label == cell.policy_label
 
 
 # -- the page -------------------------------------------------------------------------------------
 
 
-def _page(facts: dict[str, Any], release: Release, results, setup: Setup) -> str:
-    good = [(cell, result) for cell, result in results if "error" not in result]
-    parts = [
-        f"<h1>Validation of {_text(facts['release']['name'])} {_text(facts['release']['version'])}</h1>",
-        _verdict(facts),
-        f"<p class=note>Profile <b>{_text(facts['profile']['note'])}</b></p>",
-        _structure(facts),
-        "<h2>Episode returns</h2>",
-        _returns(facts, release),
-    ]
-    if facts["results"]:
-        parts += ["<h2>Scores</h2>", _scores(facts), "<h2>Learning curves</h2>", _image(_curves(good, facts))]
-        parts += ["<h2>Evaluation episodes</h2>", _sheets(good, setup, "rollout", facts)]
-        parts += ["<h2>What decoders see through the encoders</h2>", _inspection(good, facts)]
-        parts += ["<p>Above what the agent saw, below what the decoder made of its 64 numbers.</p>"]
-        parts += [_sheets(good, setup, "decoder", facts)]
-    if facts["missing"]:
-        rows = [
-            (m["benchmark"], ", ".join(m["subsets"]), f"<code>{_text(m['command'])}</code>")
-            for m in facts["missing"]
-            if m["subsets"]
-        ]
-        rows += [
-            (m["benchmark"], ", ".join(m["left_out"]), "in the release, left out by --only")
-            for m in facts["missing"]
-            if m["left_out"]
-        ]
-        parts += ["<h2>What the benchmarks would need besides</h2>"]
-        parts += [_table(("benchmark", "missing subsets", "how to roll them out"), rows, raw=(2,))]
-    parts += ["<h2>Time, settings, versions</h2>", _times(facts)]
-    settings = {"profile": facts["profile"]["name"], **facts["profile"], **facts["settings"], **facts["versions"]}
-    del settings["name"], settings["note"]  # said above
-    parts += [_table(("setting", "value"), ((key, str(value)) for key, value in settings.items()))]
-    body = "\n".join(parts)
-    title = f"Validation of {_text(facts['release']['name'])}"
-    return (
-        f"<!doctype html><html lang=en><head><meta charset=utf-8><title>{title}</title>"
-        f"<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n"
+def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup: Setup) -> str:
+    """The page of a report, self-contained.
+
+    Args:
+      good: results of cells that did not fail.
+    """
+    loader = PackageLoader("dmcvb_gen.benchmarks", "data")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    profile = facts["profile"]
+    figures = {"returns": figure_url(return_figure(release))}
+    if good:
+        figures["curves"] = figure_url(curve_figure(good, profile["name"]))
+    return environment.get_template("report.html.jinja").render(
+        release=facts["release"],
+        profile=profile,
+        verdict=_verdict(facts),
+        checks=_checks(facts["structure"]["findings"]),
+        incomplete=[(name, *counts) for name, counts in facts["incomplete"].items()],
+        findings=_listed(facts["structure"]["findings"]),
+        warnings=_listed(facts["warnings"]),
+        failed=[(entry["cell"], entry["error"]) for entry in facts["failed"]],
+        returns=_returns(facts["returns"]),
+        scores=[_scores(name, facts) for name in dict.fromkeys(r["cell"]["benchmark"] for r in facts["results"])],
+        notes=_notes(facts["results"]),
+        figures=figures,
+        rollouts=_sheets(good, setup, "rollout"),
+        decoders=_sheets(good, setup, "decoder"),
+        inspection=_inspection(good, profile["name"]),
+        missing=_missing(facts["missing"]),
+        times=_times(facts),
+        settings=_settings(facts),
     )
 
 
-def _verdict(facts: dict[str, Any]) -> str:
+def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
     found, failed = len(facts["structure"]["findings"]), len(facts["failed"])
     checked = ", ".join(f"{count:,} {what}" for what, count in facts["structure"]["checked"].items())
-    if facts["sound"]:
-        text = f"Sound: {checked}."
-    else:
+    there, asked = facts["episodes"]["there"], facts["episodes"]["asked"]
+    if not facts["sound"]:
+        kind = "unsound"
         text = f"Not sound: {found} findings" + (f", {failed} cells failed" if failed else "") + f" in {checked}."
+    elif not facts["complete"]:
+        kind, text = "incomplete", f"Incomplete: {there:,} of {asked:,} episodes. Sound is what is there: {checked}."
+    else:
+        kind, text = "sound", f"Sound: {checked}."
+    if kind == "unsound" and not facts["complete"]:
+        text += f" Incomplete: {there:,} of {asked:,} episodes."
     done = len(facts["results"])
     text += f" {done} of {facts['cells_planned']} benchmark cells run [{facts['profile']['name']}]."
     text += f" {len(facts['warnings'])} warnings." if facts["warnings"] else ""
-    return f"<p class='verdict {'sound' if facts['sound'] else 'unsound'}'>{_text(text)}</p>"
+    return {"kind": kind, "text": text}
 
 
-def _structure(facts: dict[str, Any]) -> str:
-    findings = facts["structure"]["findings"]
-    by_check: dict[str, int] = {}
-    for finding in findings:
-        by_check[finding["check"]] = by_check.get(finding["check"], 0) + 1
-    names = dict.fromkeys([*CHECKS, *by_check])
-    rows = (
-        (name, CHECKS.get(name, name), f"<span class=bad>{by_check[name]} findings</span>" if name in by_check else
-         "<span class=ok>passes</span>")
-        for name in names
-    )  # fmt: skip
-    parts = ["<h2>Structure</h2>", _table(("check", "says", "result"), rows, raw=(2,))]
-    columns = ("check", "subset", "episode", "step", "what")
+def _checks(findings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    counts = Counter(finding["check"] for finding in findings)
+    names = dict.fromkeys([*CHECKS, *counts])
+    return [{"name": name, "says": CHECKS.get(name, name), "findings": counts[name]} for name in names]
+
+
+def _listed(findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     keys = ("check", "subset", "episode", "step", "message")
-    for title, entries in (("Findings", findings), ("Warnings", facts["warnings"])):
-        if entries:
-            shown = ([_plain(entry[key]) for key in keys] for entry in entries[:SHOWN])
-            parts += [f"<h3>{title}</h3>", _table(columns, shown)]
-            parts += [f"<p>and {len(entries) - SHOWN} more in report.json</p>"] if len(entries) > SHOWN else []
-    if facts["failed"]:
-        parts += ["<h3>Cells that failed</h3>"]
-        parts += [_table(("cell", "why"), ((entry["cell"], entry["error"]) for entry in facts["failed"]))]
-    return "\n".join(parts)
+    rows = [[finding[key] for key in keys] for finding in findings[:SHOWN]]
+    return {"rows": rows, "more": max(0, len(findings) - SHOWN)}
 
 
-def _returns(facts: dict[str, Any], release: Release) -> str:
-    keys = ("mean", "std", "min", "p25", "median", "p75", "max")
+def _returns(returns: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     rows = []
-    for name, values in facts["returns"].items():
-        rows.append([name, *(f"{values[key]:.1f}" for key in keys)])
+    for name, values in returns.items():
+        rows.append([name, *(f"{values[key]:.1f}" for key in STATISTICS)])
         if values["paper"]:
-            rows.append(["the paper", *(f"{values['paper'][key]:.1f}" for key in keys)])
-    return _table(("subset", *keys), rows) + _image(_return_figure(release))
+            rows.append(["the paper", *(f"{values['paper'][key]:.1f}" for key in STATISTICS)])
+    return {"head": ("subset", *STATISTICS), "rows": rows}
 
 
-def _return_figure(release: Release) -> Figure:
-    """Histograms of returns, the paper's quartiles and range as a box under each."""
-    names = list(release.subsets)
-    columns = min(3, len(names))
-    lines = -(-len(names) // columns)
-    figure = Figure(figsize=(4 * columns, 2.4 * lines), layout="constrained")
-    for index, name in enumerate(names):
-        axis = figure.add_subplot(lines, columns, index + 1)
-        subset = release.subsets[name]
-        axis.hist(subset.returns, bins=30, color="#4477aa")
-        axis.set_title(name, fontsize=9)
-        axis.set(xlabel="return", ylabel="episodes")
-        axis.yaxis.set_major_locator(MaxNLocator(integer=True))
-        paper = paper_returns(subset.task, subset.level)
-        if paper:
-            low = -0.12 * axis.get_ylim()[1]
-            axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)
-            axis.plot([paper["p25"], paper["p75"]], [low, low], color="#cc6677", linewidth=6, solid_capstyle="butt")
-            axis.plot([paper["median"]], [low], "|", color="black", markersize=9)
-            axis.set_yticks([tick for tick in axis.get_yticks() if tick >= 0])
-            axis.set_title(f"{name}\nbelow: the paper's range, quartiles, median", fontsize=8)
-    return figure
+def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """One benchmark's table: a row a task, policy set and setting, a column an agent."""
+    results = [result for result in facts["results"] if result["cell"]["benchmark"] == benchmark]
+    agents = list(dict.fromkeys(result["cell"]["agent_name"] for result in results))
+    rows: dict[tuple, dict[str, Any]] = {}
+    by_state: dict[tuple, dict[str, Any]] = {}
+    data: dict[tuple, list[str]] = {}
+    for result in results:
+        cell = result["cell"]
+        source = "+".join(_label(part) for part in cell["pretrain"])
+        policy = cell["policy_label"] + (f" (encoder: {source})" if source else "")
+        key = (cell["task"], policy, cell["setting"])
+        data[key] = _data_lines(result["data"])
+        rows.setdefault(key, {})[cell["agent_name"]] = entry = _score(result)
+        if cell["agent"]["sees_state"] and benchmark == "b1":
+            by_state.setdefault(key[:2], {})[cell["agent_name"]] = entry
+    for key, row in rows.items():  # states know of no distractors: one score stands beside those of every setting
+        row |= by_state.get(key[:2], {})
+    return {
+        "title": TITLES.get(benchmark, benchmark),
+        "head": ("task", "policy learns from", "setting", "the data's own", *agents),
+        "rows": [
+            {"facts": key, "data": data[key], "scores": [row.get(agent) for agent in agents]}
+            for key, row in rows.items()
+        ],
+    }
 
 
-def _scores(facts: dict[str, Any]) -> str:
-    tag = f"<span class=tag>{_text(facts['profile']['name'])}</span>"
-    tables = []
-    for benchmark in dict.fromkeys(result["cell"]["benchmark"] for result in facts["results"]):
-        results = [result for result in facts["results"] if result["cell"]["benchmark"] == benchmark]
-        agents = list(dict.fromkeys(result["cell"]["agent_name"] for result in results))
-        rows: dict[tuple, dict[str, str]] = {}
-        by_state: dict[tuple, dict[str, str]] = {}
-        for result in results:
-            cell = result["cell"]
-            source = "+".join(_label(part) for part in cell["pretrain"])
-            policy = cell["policy_label"] + (f" (encoder: {source})" if source else "")
-            key = (cell["task"], policy, cell["setting"], f"{result['data_return']:.0f}")
-            rows.setdefault(key, {})[cell["agent_name"]] = _score(result, tag)
-            if cell["agent"]["sees_state"] and benchmark == "b1":
-                by_state.setdefault(key[:2], {})[cell["agent_name"]] = _score(result, tag)
-        for key, row in rows.items():  # states know of no distractors: one score stands beside those of every setting
-            row |= by_state.get(key[:2], {})
-        head = ("task", "policy learns from", "setting", "data's mean return", *agents)
-        body = ([*key, *(row.get(agent, "") for agent in agents)] for key, row in rows.items())
-        tables += [f"<h3>{benchmark}</h3>", _table(head, body, raw=range(4, 4 + len(agents)))]
-    note = "" if facts["profile"]["scores"] else "<p class=note>This profile claims no score.</p>"
-    return note + "\n".join(tables)
-
-
-def _label(part: dict[str, Any]) -> str:
-    from dmcvb_gen.benchmarks.tables import Part
-
+def _label(part: Mapping[str, Any]) -> str:
     return Part(**part).label
 
 
-def _score(result: dict[str, Any], tag: str) -> str:
+def _score(result: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry of a score table: mean and standard error, further lines, and the paper's."""
     score, paper = result["score"], result["paper"]
-    text = f"<b>{score['mean']:.0f} &plusmn; {score['stderr']:.0f}</b> {tag}"
+    lines = _goal_lines(score)
     if result["share"] is not None and result["profile"]["scores"]:
-        text += f"<br>{100 * result['share']:.0f} % of {_text(result['share_of'])}"
-    if score["success"] is not None:
-        text += f"<br>success {100 * score['success']:.0f} %"
-        text += f", {score['speed']:.2f} m/s" if score["speed"] is not None else ""
+        lines.insert(0, f"{100 * result['share']:.0f} % of {result['reference']}")
+    elif result["difference"] and result["profile"]["scores"]:  # 0 is the reference itself
+        side = "above" if result["difference"] > 0 else "below"
+        lines.insert(0, f"{abs(result['difference']):.0f} {side} {result['reference']}")
     if paper:
-        text += f"<br><span class=paper>paper {paper['mean']:.0f} &plusmn; {paper['stderr']:.0f}"
-        text += f", {100 * result['paper_share']:.0f} %" if result["paper_share"] is not None else ""
-        text += "</span>"
-    return text
+        share = f", {100 * result['paper_share']:.0f} %" if result["paper_share"] is not None else ""
+        paper = {"mean": f"{paper['mean']:.0f}", "stderr": f"{paper['stderr']:.0f}", "share": share}
+    return {"mean": f"{score['mean']:.0f}", "stderr": f"{score['stderr']:.0f}", "lines": lines, "paper": paper}
 
 
-def _curves(good, facts: dict[str, Any]) -> Figure:
-    """A row a group of cells (task, policy set, setting): losses on the left, online scores on the right."""
-    groups: dict[tuple, list] = {}
-    for cell, result in good:
-        groups.setdefault((cell.benchmark, cell.task, cell.policy_label, cell.setting), []).append((cell, result))
-    agents = list(dict.fromkeys(cell.agent.name for cell, _ in good))
-    figure = Figure(figsize=(11, 2.8 * len(groups)), layout="constrained")
-    for line, (key, members) in enumerate(groups.items()):
-        loss, score = figure.add_subplot(len(groups), 2, 2 * line + 1), figure.add_subplot(len(groups), 2, 2 * line + 2)
-        for cell, result in members:
-            color, curve = f"C{agents.index(cell.agent.name)}", result["curve"]
-            for name, style in (("loss", ":"), ("test_loss", "-")):
-                points = [(point["step"], point[name]) for point in curve if name in point]
-                if points:
-                    shown = cell.agent.name if name == "test_loss" else None
-                    loss.plot(*zip(*points, strict=True), style, color=color, label=shown, linewidth=1)
-            points = [(p["step"], p["score"]["mean"], p["score"]["stderr"]) for p in curve if "score" in p]
-            steps, means, errors = zip(*points, strict=True)
-            score.errorbar(steps, means, errors, marker="o", markersize=3, color=color, label=cell.agent.name)
-        score.axhline(members[0][1]["data_return"], color="gray", linestyle="--", linewidth=1, label="data")
-        title = "/".join(key[1:])
-        loss.set(title=f"{title}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log")
-        score.set(title=f"online return [{facts['profile']['name']}]", xlabel="Adam step")
-        if members[0][1]["data_return"] > 0:
-            score.set_ylim(bottom=0)
-        for axis in (loss, score):
-            axis.title.set_fontsize(9)
-            axis.set_xlim(left=0)
-        score.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
-    return figure
+def _goal_lines(score: Mapping[str, Any]) -> list[str]:
+    """Success and speed, where a task has a goal."""
+    if score["success"] is None:
+        return []
+    lines = [f"success {100 * score['success']:.0f} %"]
+    return lines + [f"{score['speed']:.2f} m/s to the goal"] if score["speed"] is not None else lines
 
 
-def _inspection(good, facts: dict[str, Any]) -> str:
-    rows = [
-        (cell.agent.name, f"{cell.task}/{cell.policy_label}/{cell.setting}", *(
-            "-" if result["inspection"][key] is None else f"{result['inspection'][key]:.4f}"
-            for key in ("observation_mse", "state_mse")
-        ), facts["profile"]["name"])
-        for cell, result in good if result["inspection"]
-    ]  # fmt: skip
-    head = ("encoder of", "data", "test MSE of pixels in [-0.5, 0.5]", "test MSE of normalized states", "profile")
-    return _table(head, rows) if rows else "<p>No agent with pictures was inspected.</p>"
+def _data_lines(data: Mapping[str, Any]) -> list[str]:
+    return [f"{data['mean']:.0f}", *_goal_lines(data)]
 
 
-def _sheets(good, setup: Setup, kind: str, facts: dict[str, Any]) -> str:
-    parts = []
+def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What must be known to read the scores."""
+    notes = ["A score is the best of a training's online evaluations, mean and standard error over its episodes."]
+    for evaluated, data in sorted({(r["score"]["limit"], r["data"]["limit"]) for r in results}):
+        if evaluated == data:
+            notes.append(f"Evaluations are cut at {evaluated:,} agent steps, as the data are.")
+        else:
+            notes.append(
+                f"Evaluations are cut at {evaluated:,} agent steps, the data at {data:,}: their returns cannot be "
+                "compared where the end is not reached before."
+            )
+    if any(result["score"]["success"] is not None for result in results):
+        notes.append(
+            "Success is the share of episodes that reach the goal; the speed is the distance to the goal at the start "
+            "over the time to reach it, of those episodes."
+        )
+    return notes
+
+
+def _inspection(good: Results, profile: str) -> list[tuple]:
+    return [
+        (
+            label_of(cell),
+            f"{cell.task}/{cell.policy_label}/{cell.setting}",
+            *(
+                "-" if result["inspection"][key] is None else f"{result['inspection'][key]:.4f}"
+                for key in ("observation_mse", "state_mse")
+            ),
+            profile,
+        )
+        for cell, result in good
+        if result["inspection"]
+    ]
+
+
+def _sheets(good: Results, setup: Setup, kind: str) -> list[dict[str, str]]:
+    """Pictures that cells left: "rollout" or "decoder"."""
+    found = []
     for cell, result in good:
         path = setup.cells / f"{cell.id}.{kind}.png"
         if not path.exists() or cell.agent.sees_state:
             continue
-        caption = f"{cell.agent.name}, {cell.task} {cell.policy_label}/{cell.setting}"
+        caption = f"{label_of(cell)}, {cell.task} {cell.policy_label}/{cell.setting}"
         if kind == "rollout":
             score = result["final"]
             caption += f": first of {len(score['returns'])} episodes of the last evaluation, return "
-            caption += f"{score['returns'][0]:.0f} [{facts['profile']['name']}]"
-        parts += [f"<p>{_text(caption)}</p><img class=pixel alt='{_text(caption)}' src='{_data(path.read_bytes())}'>"]
-    return "\n".join(parts) or "<p>No agent that sees pictures was run.</p>"
+            caption += f"{score['returns'][0]:.0f} [{setup.profile.name}]"
+        found.append({"caption": caption, "source": data_url(path.read_bytes())})
+    return found
 
 
-def _times(facts: dict[str, Any]) -> str:
+def _missing(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    rows = []
+    for entry in entries:
+        command = entry["command"].startswith("dmcvb-gen")
+        if entry["subsets"]:
+            subsets = ", ".join(entry["subsets"])
+            rows.append(dict(benchmark=entry["benchmark"], subsets=subsets, how=entry["command"], command=command))
+        if entry["left_out"]:
+            subsets, how = ", ".join(entry["left_out"]), "in the release, left out by --only"
+            rows.append(dict(benchmark=entry["benchmark"], subsets=subsets, how=how, command=False))
+    return rows
+
+
+def _times(facts: Mapping[str, Any]) -> dict[str, Any]:
     rows = [
         (
             result["id"],
@@ -367,40 +372,16 @@ def _times(facts: dict[str, Any]) -> str:
         )
         for result in facts["results"]
     ]
-    head = ("cell", "training s", "evaluation s", "inspection s", "all s", "encoder s", "Adam steps/s", "peak GB")
-    total = f"<p>{facts['seconds']:.0f} s in all, of which {facts['structure']['seconds']:.0f} s for the structure."
-    total += " Cells that were done before took their time then.</p>"
-    return total + (_table(head, rows) if rows else "")
+    return {"rows": rows, "total": f"{facts['seconds']:.0f}", "structure": f"{facts['structure']['seconds']:.0f}"}
 
 
-# -- pieces ---------------------------------------------------------------------------------------
+def _settings(facts: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    profile = {key: value for key, value in facts["profile"].items() if key not in ("name", "note")}
+    network = profile["network"]
+    profile["network"] = "channels {}, strides {}".format(
+        *(" ".join(map(str, network[key])) for key in ("channels", "strides"))
+    )
+    return list({"profile": facts["profile"]["name"], **profile, **facts["settings"], **facts["versions"]}.items())
 
 
-def _text(value: object) -> str:
-    return html.escape(str(value))
-
-
-def _plain(value: object) -> str:
-    return "" if value is None else str(value)
-
-
-def _table(head: Iterable[str], rows: Iterable[Sequence[str]], raw: Iterable[int] = ()) -> str:
-    raw = set(raw)
-    lines = ["<tr>" + "".join(f"<th>{_text(name)}</th>" for name in head) + "</tr>"]
-    for row in rows:
-        entries = (value if index in raw else _text(value) for index, value in enumerate(row))
-        lines.append("<tr>" + "".join(f"<td>{entry}</td>" for entry in entries) + "</tr>")
-    return "<div class=scroll><table>" + "\n".join(lines) + "</table></div>"
-
-
-def _image(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return f"<img alt='figure' src='{_data(buffer.getvalue())}'>"
-
-
-def _data(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
-
-
-__all__ = ["CHECKS", "report_facts", "write_report"]
+__all__ = ["CHECKS", "compare", "release_episodes", "render_page", "report_facts", "write_report"]

@@ -15,16 +15,31 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from dmcvb_gen.agents.catalog import Agent, parse_agent
+from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.rollout.recipe import is_maze
+from dmcvb_gen.names import (
+    ANT_MAZE,
+    DISTRACTOR_KINDS,
+    FIXED,
+    HIDDEN,
+    LEVELS,
+    MAZE_TRAINED_LEVELS,
+    VISIBLE,
+    family_of,
+    subset_name,
+)
 from dmcvb_gen.store import Release
 
 BENCHMARKS = ("b1", "b2", "b3", "ablations")
 POLICY_SETS = (("expert",), ("medium",), ("expert", "medium"), ("mixed",), ("random",))
-"""Levels of the data that a policy learns from, B1; mazes have the first two."""
-SETTINGS = ("none", "static", "dynamic")
+"""Levels of the data that a policy learns from, B1; mazes have the first two, and others where a release has them."""
 B1_AGENTS = ("state-bc", "bc", "td3-bc", "id+bc", "lfd+bc", "ae+bc", "state+bc")
 """The paper's columns; DINO's needs weights, so it is asked for by name."""
+B3_LEVEL = "expert"
+B3_PAIRS = 5
+"""Fixed (start, goal) pairs a layout, as the paper made them."""
+DEFAULT_EPISODES = 100
+"""That a command asks for where the release has none to go by."""
 FEW_EPISODES = 20
 """B2: 1 % of the paper's expert subset of 2,000 episodes."""
 B2_AGENTS = ("id+bc", "bc+bc", "lfd+bc", "ae+bc")
@@ -98,7 +113,7 @@ class Missing:
 
     Attributes:
       subsets: those that the release lacks.
-      command: how to roll those out.
+      command: how to get those.
       left_out: those that the release has and the user left out.
     """
 
@@ -140,15 +155,22 @@ class _Shelf:
     """The subsets of a release by (task, level, setting); remembers what was asked for in vain."""
 
     def __init__(self, release: Release):
+        self.release = release
         self._names = {(s.task, s.level, s.setting): name for name, s in release.subsets.items()}
         self._records = {name: subset.record for name, subset in release.subsets.items()}
         self.tasks = tuple(dict.fromkeys(subset.task for subset in release.subsets.values()))
         self._asked: dict[str, list[tuple[str, str]]] = {}
+        self._partial: dict[str, tuple[int, ...]] = {}
 
     def settings(self, task: str) -> list[str]:
         """Settings of a task: those there are, in the paper's order, other difficulties last."""
         have = dict.fromkeys(setting for t, _, setting in self._names if t == task)
-        return sorted(have, key=lambda s: (SETTINGS.index(s) if s in SETTINGS else 9, s))
+        order = {setting: index for index, setting in enumerate(DISTRACTOR_KINDS)}
+        return sorted(have, key=lambda s: (order.get(s, len(order)), s))
+
+    def levels(self, task: str, setting: str) -> list[str]:
+        """Levels that there are of a task and setting, best first."""
+        return [level for level in LEVELS if (task, level, setting) in self._names]
 
     def find(self, task: str, levels: Iterable[str], setting: str) -> tuple[str, ...] | None:
         """Names of the subsets, or None where one is missing (which is then noted)."""
@@ -162,44 +184,54 @@ class _Shelf:
         names = self.find(task, levels, setting)
         return names and tuple(Part(name, **share) for name in names)
 
-    def episodes(self, name: str) -> int:
-        return self._records[name].episodes
+    def pairs(self, name: str) -> tuple[int, ...]:
+        """The goal pairs of a fixed-goal subset whose episodes are all there; the others are noted."""
+        pairs = goal_pairs(self.release[name])
+        if pairs.partial:
+            self._partial[name] = pairs.partial
+        return pairs.whole
 
     def missing(self, benchmark: str, left_out: Collection[str]) -> list[Missing]:
         found = []
         for task, asked in self._asked.items():
-            names = {f"{task}/{level}/{setting}": (level, setting) for level, setting in asked}
+            names = {subset_name(task, level, setting): (level, setting) for level, setting in asked}
             excluded = tuple(name for name in names if name in left_out)
             names = {name: where for name, where in names.items() if name not in left_out}
-            if not names:
-                found.append(Missing(benchmark, task, (), "", excluded))
-                continue
-            lacking = list(names.values())
-            have = [(level, setting) for t, level, setting in self._names if t == task]
-            levels = dict.fromkeys(level for level, _ in have + lacking)
-            settings = dict.fromkeys(setting for _, setting in have + lacking)
-            count = max(
-                (self._records[self._names[task, level, setting]].episodes for level, setting in have), default=100
-            )
-            command = f"dmcvb-gen rollout {task} " + " ".join(f"--level {level}" for level in levels)
-            if is_maze(task):
-                goals = [setting for setting in settings if setting != "fixed"]
-                lines = [f"{command} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}"] if goals else []
-                lines += [f"{command} --fixed-goals 5"] if "fixed" in settings else []
-                command = "; ".join(f"{line} --out releases/{slug(benchmark)}-{i}" for i, line in enumerate(lines))
-            else:
-                command += "".join(f" --distractor {s}" for s in settings)
-                command += f" --episodes {count} --out releases/{slug(benchmark)}"
+            command = self._command(benchmark, task, list(names.values())) if names else ""
             found.append(Missing(benchmark, task, tuple(names), command, excluded))
+        for name, pairs in self._partial.items():
+            lacking = f"{name}, episodes of goal pairs {', '.join(map(str, pairs))}"
+            task = self._records[name].task
+            found.append(Missing(benchmark, task, (lacking,), "fetch them, or run the release's rollout again"))
         return found
+
+    def _command(self, benchmark: str, task: str, lacking: list[tuple[str, str]]) -> str:
+        """How to roll out a task with what is lacking, and with what the release has of it."""
+        have = [(level, setting) for t, level, setting in self._names if t == task]
+        levels = dict.fromkeys(level for level, _ in have + lacking)
+        settings = dict.fromkeys(setting for _, setting in have + lacking)
+        counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
+        count = max(counts, default=DEFAULT_EPISODES)
+        rollout = f"dmcvb-gen rollout {task} " + " ".join(f"--level {level}" for level in levels)
+        out = f"--out releases/{slug(benchmark)}"
+        if family_of(task) != ANT_MAZE:
+            return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count} {out}"
+        goals = [setting for setting in settings if setting != FIXED]
+        lines = [f"{rollout} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}"] if goals else []
+        lines += [f"{rollout} --fixed-goals {B3_PAIRS}"] if FIXED in settings else []
+        return "; ".join(f"{line} {out}-{number}" for number, line in enumerate(lines))
 
 
 def _b1(shelf: _Shelf, agents: list[Agent]):
     agents = agents or [parse_agent(name) for name in B1_AGENTS]
     for task in shelf.tasks:
-        maze = is_maze(task)
-        settings = ["visible"] if maze else list(dict.fromkeys([*SETTINGS, *shelf.settings(task)]))
-        for levels in POLICY_SETS[:2] if maze else POLICY_SETS:
+        if family_of(task) == ANT_MAZE:
+            settings = [VISIBLE]
+            others = [(level,) for level in shelf.levels(task, VISIBLE) if level not in MAZE_TRAINED_LEVELS]
+            sets = [*((level,) for level in MAZE_TRAINED_LEVELS), *others]
+        else:
+            settings, sets = list(dict.fromkeys([*DISTRACTOR_KINDS, *shelf.settings(task)])), list(POLICY_SETS)
+        for levels in sets:
             state_done = False
             for setting in settings:
                 parts = shelf.parts(task, levels, setting)
@@ -215,7 +247,7 @@ def _b1(shelf: _Shelf, agents: list[Agent]):
 def _b2(shelf: _Shelf, agents: list[Agent]):
     encoders = [agent for agent in agents or map(parse_agent, B2_AGENTS) if agent.pretrain]
     bc, reference = parse_agent("bc"), parse_agent("bc")
-    for task in [task for task in shelf.tasks if not is_maze(task)]:
+    for task in [task for task in shelf.tasks if family_of(task) != ANT_MAZE]:
         full = shelf.parts(task, ["expert"], "none")
         if full:
             yield Cell("b2", task, "none", reference, full)  # scores are shares of this one
@@ -233,25 +265,23 @@ def _b2(shelf: _Shelf, agents: list[Agent]):
 
 def _b3(shelf: _Shelf, agents: list[Agent]):
     encoders = [agent for agent in agents or map(parse_agent, B3_AGENTS) if agent.pretrain]
-    mazes = [task for task in shelf.tasks if is_maze(task)]
-    if not mazes:
-        shelf.find("ant-maze-empty7x7", ["expert"], "hidden")
-        shelf.find("ant-maze-empty7x7", ["expert"], "fixed")
-    for task in mazes:
-        fixed, hidden = shelf.find(task, ["expert"], "fixed"), shelf.parts(task, ["expert"], "hidden")
-        if not fixed:
-            continue
-        for pair in range(max(1, shelf.episodes(fixed[0]) // 10)):
-            ten = (Part(fixed[0], goal_pair=pair),)
-            yield Cell("b3", task, "fixed", parse_agent("bc"), ten)
-            for agent in encoders if hidden else ():
-                yield Cell("b3", task, "fixed", agent, ten, hidden)
+    mazes = [task for task in shelf.tasks if family_of(task) == ANT_MAZE]
+    for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
+        for level in shelf.levels(task, FIXED) or [B3_LEVEL]:
+            fixed, hidden = shelf.find(task, [level], FIXED), shelf.parts(task, [level], HIDDEN)
+            if not fixed:
+                continue
+            for pair in shelf.pairs(fixed[0]):
+                ten = (Part(fixed[0], goal_pair=pair),)
+                yield Cell("b3", task, FIXED, parse_agent("bc"), ten)
+                for agent in encoders if hidden else ():
+                    yield Cell("b3", task, FIXED, agent, ten, hidden)
 
 
 def _ablations(shelf: _Shelf, agents: list[Agent]):
     agents = agents or [parse_agent(name) for name in ABLATION_AGENTS]
     for task in shelf.tasks:
-        for setting in ["visible"] if is_maze(task) else shelf.settings(task):
+        for setting in [VISIBLE] if family_of(task) == ANT_MAZE else shelf.settings(task):
             parts = shelf.parts(task, ["expert"], setting)
             if not parts:
                 continue

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
-from dmcvb_gen.benchmarks.report import write_report
-from dmcvb_gen.benchmarks.run import Setup, default_threads, planned_steps, run_cells
+from dmcvb_gen.benchmarks.report import release_episodes, write_report
+from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
+from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.tables import Cell, Missing, plan_benchmark
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import select
 from dmcvb_gen.release.verify import Finding
-from dmcvb_gen.rollout.recipe import select
 from dmcvb_gen.store import Release, open_release
 
 STATE_BC_SHARE = 0.9
-"""Of the data's mean return that BC(state) should reach on expert data; less draws a warning."""
+"""Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class Validation:
       structure: of the release.
       results: (cell, result) of every cell; a result of {"error": ...} failed.
       missing: what the benchmarks would need besides.
+      episodes: committed, and asked for by the manifest.
       report: the page. facts: the JSON file beside it.
     """
 
@@ -36,6 +39,7 @@ class Validation:
     results: tuple[tuple[Cell, dict[str, Any]], ...]
     missing: tuple[Missing, ...]
     warnings: tuple[Finding, ...]
+    episodes: tuple[int, int]
     report: Path
     facts: Path
 
@@ -45,7 +49,13 @@ class Validation:
 
     @property
     def sound(self) -> bool:
+        """Whether what is there is right, and every cell could be run."""
         return self.structure.sound and not self.failed
+
+    @property
+    def complete(self) -> bool:
+        """Whether every episode is there."""
+        return self.episodes[0] == self.episodes[1]
 
 
 @dataclass(frozen=True)
@@ -100,25 +110,16 @@ def validate(
       train_unsound: run the benchmarks even where a structure check fails.
 
     Raises:
-      DmcvbError: there is no release, or a name is unknown, or the release has no data for any benchmark asked for.
+      DmcvbError: there is no release, or a name is unknown, or the release has no data for a benchmark asked for, or
+        the report's folder cannot be written.
     """
     started, progress = time.perf_counter(), progress or Progress()
     release = open_release(path)
     chosen = only(release, patterns)
     if not chosen.subsets:
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
-    left_out = release.subsets.keys() - chosen.subsets.keys()
-    cells: list[Cell] = []
-    missing: list[Missing] = []
-    for name in benchmarks:
-        found, lacking = plan_benchmark(name, chosen, agents, left_out)
-        if not found:
-            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
-            needs += [f"let --only take {', '.join(m.left_out[:4])}" for m in lacking if m.left_out]
-            cure = "; ".join(needs) or "roll out a locomotion task"
-            raise DmcvbError(f"benchmark {name} has no data in {path}; {cure}")
-        cells += found
-        missing += lacking
+    cells, missing = _plan(chosen, benchmarks, agents, release.subsets.keys() - chosen.subsets.keys())
+    check_writable(setup.out)
     structure = check_structure(chosen, setup.backgrounds, progress.checking)
     results = []
     if structure.sound or train_unsound:
@@ -139,7 +140,40 @@ def validate(
         warnings=warnings,
         seconds=time.perf_counter() - started,
     )
-    return Validation(structure, tuple(results), tuple(missing), warnings, report, facts)
+    there, asked = (sum(counts.values()) for counts in release_episodes(chosen))
+    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), report, facts)
+
+
+def _plan(
+    chosen: Release, benchmarks: Sequence[str], agents: Sequence[str], left_out: Collection[str]
+) -> tuple[list[Cell], list[Missing]]:
+    """Cells of all benchmarks, and what is missing for others."""
+    cells: list[Cell] = []
+    missing: list[Missing] = []
+    for name in benchmarks:
+        found, lacking = plan_benchmark(name, chosen, agents, left_out)
+        if not found:
+            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
+            needs += [f"let --only take {', '.join(m.left_out[:4])}" for m in lacking if m.left_out]
+            cure = "; ".join(needs) or "roll out a locomotion task"
+            raise DmcvbError(f"benchmark {name} has no data in {chosen.root}; {cure}")
+        cells += found
+        missing += lacking
+    return cells, missing
+
+
+def check_writable(folder: str | Path) -> None:
+    """Make the report's folder and see that it takes files, before any work.
+
+    Raises:
+      DmcvbError: it does not.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
 
 
 def _learning_warnings(setup: Setup, results) -> list[Finding]:
@@ -148,17 +182,17 @@ def _learning_warnings(setup: Setup, results) -> list[Finding]:
     for cell, result in results:
         if not setup.profile.scores or "error" in result or cell.agent.name != "state-bc":
             continue
-        score, data = result["score"]["mean"], result["data_return"]
-        if cell.policy_label == "expert" and data > 0 and score < STATE_BC_SHARE * data:
-            found.append(
-                Finding(
-                    "learning",
-                    cell.policy[0].subset,
-                    f"BC(state) returns {score:.0f}, {100 * score / data:.0f} % of the data's {data:.0f} "
-                    f"[{setup.profile.name}]",
-                )
-            )
+        score, data = result["score"], result["data"]
+        if cell.policy_label != "expert":
+            continue
+        if data["success"] is not None:
+            reached, wanted, what = 100 * score["success"], 100 * data["success"], "% of its goals, the data"
+        else:
+            reached, wanted, what = score["mean"], data["mean"], "a return, the data"
+        if reached < STATE_BC_SHARE * wanted:
+            message = f"BC(state) reaches {reached:.0f} {what} {wanted:.0f} [{setup.profile.name}]"
+            found.append(Finding("learning", cell.policy[0].subset, message))
     return found
 
 
-__all__ = ["Progress", "Setup", "Validation", "default_threads", "only", "validate"]
+__all__ = ["Progress", "Setup", "Validation", "check_writable", "default_threads", "only", "validate"]

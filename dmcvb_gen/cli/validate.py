@@ -26,7 +26,7 @@ from dmcvb_gen.cli.common import json_option, print_json
 @click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True)
 @click.option("--compile", is_flag=True, help="torch.compile the losses (pays on CUDA and in long runs).")
-@click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Pictures held at most.  [default: half free]")
+@click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Held by all workers.  [default: half free]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
 @click.option("--dino-weights", type=click.Path(path_type=Path), help="A safetensors file, for dino+bc.")
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
@@ -35,14 +35,16 @@ from dmcvb_gen.cli.common import json_option, print_json
 def validate(context, path, out, profile, scale, benchmarks, agents, only, checks_only, strict, as_json, **options):
     """Check a release and run the paper's benchmarks on it, scores set beside the paper's.
 
-    Exit code 0 when sound, 1 when a check fails, 2 on bad usage. The same command goes on where it stopped.
+    Exit code 0 when sound and complete, 1 when a check or a cell fails or episodes are missing, 2 on bad usage. The
+    same command goes on where it stopped.
 
     \b
     dmcvb-gen validate releases/mini --profile smoke
     dmcvb-gen validate releases/mini --profile quick --benchmark b1 --agents bc,state-bc,id+bc --out reports/mini
     """
     from dmcvb_gen.benchmarks.profiles import get_profile
-    from dmcvb_gen.benchmarks.run import Setup, default_threads
+    from dmcvb_gen.benchmarks.run import default_threads
+    from dmcvb_gen.benchmarks.setup import Setup
     from dmcvb_gen.benchmarks.validate import Progress
     from dmcvb_gen.benchmarks.validate import validate as run
     from dmcvb_gen.errors import DmcvbError
@@ -82,7 +84,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
         print_json(json.loads(result.facts.read_text()))
     else:
         _show(result, setup.profile)
-    context.exit(0 if result.sound and not (strict and result.warnings) else 1)
+    context.exit(0 if result.sound and result.complete and not (strict and result.warnings) else 1)
 
 
 def _show(result, profile) -> None:
@@ -98,14 +100,24 @@ def _show(result, profile) -> None:
         score, paper = facts["score"], facts["paper"]
         beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if paper else ""
         where = f"{cell.task} {cell.policy_label}/{cell.setting}"
-        click.echo(f"{where} {cell.agent.name}: {score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]{beside}")
+        goal = "" if score["success"] is None else f", success {100 * score['success']:.0f} %"
+        goal += "" if score["speed"] is None else f" at {score['speed']:.2f} m/s"
+        score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]"
+        click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
     for entry in result.missing:
         if entry.subsets:
             names = ", ".join(entry.subsets)
-            click.echo(f"{entry.benchmark}: not in the release: {names}; make them with: {entry.command}")
+            click.echo(f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}")
         if entry.left_out:
             click.echo(f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}")
     checked = ", ".join(f"{count:,} {name}" for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
-    click.echo(f"{'sound' if result.sound else f'{found} findings'} ({checked}); {profile.note}")
+    verdict = ["sound" if result.sound else f"{found} findings"]
+    if not result.complete:
+        there, asked = result.episodes
+        verdict = [
+            f"incomplete: {there:,} of {asked:,} episodes",
+            "what is there is sound" if result.sound else verdict[0],
+        ]
+    click.echo(f"{'; '.join(verdict)} ({checked}); {profile.note}")
     click.echo(f"Report: {result.report}")

@@ -1,0 +1,98 @@
+"""Figures of a validation's page: returns, results and pictures in, PNGs as data URLs out."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.benchmarks.tables import Cell
+from dmcvb_gen.store import Release
+
+DPI = 110
+COLUMNS = 3
+"""Histograms side by side."""
+NAME_BREAK = 26
+"""Characters of a subset's name beyond which it stands on two lines."""
+
+
+def data_url(png: bytes) -> str:
+    """A PNG as a URL that holds it."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def figure_url(figure: Figure) -> str:
+    """A figure as a PNG in a URL."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return data_url(buffer.getvalue())
+
+
+def return_figure(release: Release) -> Figure:
+    """Histograms of returns, the paper's quartiles and range as a box under each."""
+    names = list(release.subsets)
+    columns = min(COLUMNS, len(names))
+    lines = -(-len(names) // columns)
+    figure = Figure(figsize=(4 * columns, 2.4 * lines), layout="constrained")
+    for index, name in enumerate(names):
+        axis = figure.add_subplot(lines, columns, index + 1)
+        subset = release.subsets[name]
+        axis.hist(subset.returns, bins=30, color="#4477aa")
+        shown = name if len(name) <= NAME_BREAK else name.replace("/", "\n", 1)
+        axis.set_title(shown, fontsize=9)
+        axis.set(xlabel="return", ylabel="episodes")
+        axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+        paper = paper_returns(subset.task, subset.level)
+        if paper:
+            low = -0.12 * axis.get_ylim()[1]
+            axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)
+            axis.plot([paper["p25"], paper["p75"]], [low, low], color="#cc6677", linewidth=6, solid_capstyle="butt")
+            axis.plot([paper["median"]], [low], "|", color="black", markersize=9)
+            axis.set_yticks([tick for tick in axis.get_yticks() if tick >= 0])
+            axis.set_title(f"{shown}\nbelow: the paper's range, quartiles, median", fontsize=8)
+    return figure
+
+
+def curve_figure(results: Sequence[tuple[Cell, dict[str, Any]]], profile: str) -> Figure:
+    """A row a group of cells (task, policy set, setting): losses on the left, online scores on the right."""
+    groups: dict[tuple, list] = {}
+    for cell, result in results:
+        groups.setdefault((cell.benchmark, cell.task, cell.policy_label, cell.setting), []).append((cell, result))
+    colors = {name: f"C{index}" for index, name in enumerate(dict.fromkeys(label_of(cell) for cell, _ in results))}
+    figure = Figure(figsize=(11, 2.8 * len(groups)), layout="constrained")
+    for line, (key, members) in enumerate(groups.items()):
+        loss, score = (figure.add_subplot(len(groups), 2, 2 * line + column) for column in (1, 2))
+        for cell, result in members:
+            _draw_curve(loss, score, label_of(cell), colors[label_of(cell)], result["curve"])
+        data = members[0][1]["data"]["mean"]
+        score.axhline(data, color="gray", linestyle="--", linewidth=1, label="data")
+        loss.set(title=f"{'/'.join(key[1:])}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log")
+        score.set(title=f"online return [{profile}]", xlabel="Adam step")
+        if data > 0:
+            score.set_ylim(bottom=0)
+        for axis in (loss, score):
+            axis.title.set_fontsize(9)
+            axis.set_xlim(left=0)
+        score.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+def label_of(cell: Cell) -> str:
+    """A cell among those of its task and policy set: its agent, and what else its encoder learned from."""
+    source = "+".join(part.label for part in cell.pretrain)
+    return f"{cell.agent.name} (encoder: {source})" if source else cell.agent.name
+
+
+def _draw_curve(loss, score, label: str, color: str, curve: list[dict[str, Any]]) -> None:
+    for name, style in (("loss", ":"), ("test_loss", "-")):
+        points = [(point["step"], point[name]) for point in curve if name in point]
+        if points:
+            loss.plot(*zip(*points, strict=True), style, color=color, linewidth=1)
+    points = [(p["step"], p["score"]["mean"], p["score"]["stderr"]) for p in curve if "score" in p]
+    steps, means, errors = zip(*points, strict=True)
+    score.errorbar(steps, means, errors, marker="o", markersize=3, color=color, label=label)

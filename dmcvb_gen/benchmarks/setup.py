@@ -1,0 +1,128 @@
+"""What all cells of a validation share, and what decides a result: setup and cell in, file names and fingerprints out.
+
+    <out>/encoders/<id>.safetensors, .json   a pre-trained encoder and its learning curve, shared by cells
+    <out>/cells/<id>.json                    a cell's scores, curve, settings, times
+    <out>/cells/<id>.rollout.png             frames of an evaluation episode
+    <out>/cells/<id>.decoder.png             what decoders see through the encoder
+    <out>/cells/<id>.log, encoders/<id>.log  the traceback of one that failed
+
+A result carries the fingerprint of all that decides it (cell, profile, digests of data, backgrounds and weights, seed);
+one with another fingerprint is made again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen.agents.catalog import Agent
+from dmcvb_gen.agents.dino import dino_digest
+from dmcvb_gen.benchmarks.evaluate import protocol
+from dmcvb_gen.benchmarks.goals import goal_cells
+from dmcvb_gen.benchmarks.profiles import Profile
+from dmcvb_gen.benchmarks.tables import Cell, Part, slug
+from dmcvb_gen.store import Release
+from dmcvb_gen.store.writer import subset_digest
+
+RESULT_VERSION = 2
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all cells of a run share.
+
+    Attributes:
+      root: the release's folder. out: the report's folder.
+      device: "cpu" or "cuda". threads: of torch and physics in one process.
+      compile: torch.compile the losses.
+      memory: bytes of pictures held at most, over all workers; None: half of what is free.
+    """
+
+    root: str
+    out: str
+    profile: Profile
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 1
+    compile: bool = False
+    dino_weights: str | None = None
+    backgrounds: str | None = None
+    memory: int | None = None
+
+    @property
+    def cells(self) -> Path:
+        return Path(self.out) / "cells"
+
+    @property
+    def encoders(self) -> Path:
+        return Path(self.out) / "encoders"
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """An encoder to pre-train; cells that ask for the same one share it."""
+
+    task: str
+    setting: str
+    agent: Agent
+    parts: tuple[Part, ...]
+
+    @property
+    def id(self) -> str:
+        options = self.agent.name.partition(":")[2]
+        labels = "+".join(part.label for part in self.parts)
+        return "_".join(slug(p) for p in (self.task, self.setting, self.agent.pretrain, options, labels) if p)
+
+
+def pretraining_of(cell: Cell) -> Pretraining | None:
+    """What a cell's encoder needs; None where it is trained with the policy, or is DINO's."""
+    agent = cell.agent
+    if agent.pretrain in (None, "dino"):
+        return None
+    encoder_agent = dataclasses.replace(agent, policy="bc")  # the policy has no part in it
+    setting = cell.pretrain_parts[0].subset.split("/")[-1]
+    return Pretraining(cell.task, setting, encoder_agent, cell.pretrain_parts)
+
+
+def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str:
+    """SHA-256 of everything that decides a result, the machine aside.
+
+    Raises:
+      DmcvbError: DINO's weights or background videos are needed and not there.
+    """
+    subsets = {part.subset for part in (work.parts if isinstance(work, Pretraining) else ())}
+    subsets |= set(work.subsets if isinstance(work, Cell) else ())
+    facts = {
+        "version": RESULT_VERSION,
+        "work": dataclasses.asdict(work),
+        "profile": dataclasses.asdict(setup.profile),
+        "seed": setup.seed,
+        "data": {name: subset_digest(release[name].commits) for name in sorted(subsets)},
+    }
+    if isinstance(work, Cell):
+        subset, pair = release[work.policy[0].subset], work.policy[0].goal_pair
+        facts["evaluation"] = protocol(
+            subset,
+            None if pair is None else goal_cells(subset, pair),
+            setup.backgrounds,
+            pictures=not work.agent.sees_state,
+            max_steps=setup.profile.episode_steps,
+        )
+        if work.agent.pretrain == "dino":
+            facts["dino"] = dino_digest(setup.dino_weights)
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def read_result(path: Path, wanted: str | None = None) -> dict[str, Any] | None:
+    """A result file, or None where there is none with that fingerprint."""
+    try:
+        result = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    if not isinstance(result, dict):
+        return None
+    return result if wanted is None or result.get("fingerprint") == wanted else None
