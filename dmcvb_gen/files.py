@@ -1,7 +1,8 @@
 """Files that are whole or not there: bytes, text or JSON in, a file put in place at once, flushed to the disk.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
-disturb each other and whatever has that ending may be deleted once its writer is gone.
+disturb each other. The name says whose it is (machine and process), so what a killed writer left can be told from what
+a living one is at.
 """
 
 from __future__ import annotations
@@ -10,6 +11,9 @@ import contextlib
 import hashlib
 import json
 import os
+import re
+import shutil
+import socket
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +21,7 @@ from typing import Any
 
 PARTIAL = ".partial"
 """Ending of files in the making."""
+_OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)\.[^.]+{re.escape(PARTIAL)}")
 
 
 @contextlib.contextmanager
@@ -30,7 +35,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=PARTIAL)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.{_owner()}.", suffix=PARTIAL)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -43,6 +48,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _owner() -> str:
+    return f"{_machine()}@{os.getpid()}"
+
+
+def _machine() -> str:
+    return re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()) or "unknown"
 
 
 def _umask() -> int:
@@ -104,11 +117,46 @@ def copy_file(source: str | Path, target: str | Path) -> None:
             file.write(piece)
 
 
-def remove_partial(folder: str | Path) -> None:
-    """Delete what killed writers left in a folder (and below); call it only where no writer is at work."""
-    for path in Path(folder).rglob(f"*{PARTIAL}"):
-        if path.is_file():
+@contextlib.contextmanager
+def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
+    """A fresh folder in `parent` for files that will be moved to where they belong; it is gone when the block ends.
+
+    Raises:
+      OSError: it cannot be made.
+    """
+    made = Path(tempfile.mkdtemp(dir=parent, prefix=f".{name}.{_owner()}.", suffix=PARTIAL))
+    try:
+        yield made
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = True) -> None:
+    """Delete what killed processes of this machine left in the making in a folder.
+
+    Args:
+      foreign: delete also what does not say whose it is (other libraries' partial files), for folders where no writer
+        can be at work.
+      below: look in the folders below, too.
+    """
+    for path in list(Path(folder).glob(f"**/*{PARTIAL}" if below else f"*{PARTIAL}")):
+        owner = _OWNED.fullmatch(path.name)
+        if not (owner[1] == _machine() and not _alive(int(owner[2])) if owner else foreign):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def sha256_file(path: str | Path) -> str:

@@ -14,18 +14,22 @@ from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import DISTRACTOR_KINDS as SETTINGS
+from dmcvb_gen.readers.blocks import stack_channels
 from dmcvb_gen.readers.dm import DmEnv
-from dmcvb_gen.readers.envs import DistractedEnv
-from dmcvb_gen.readers.register import MAZES, SETTINGS, TASKS, environment_ids
+from dmcvb_gen.readers.envs import FIXED_GOALS, DistractedEnv, DistractedVectorEnv
+from dmcvb_gen.readers.layout import data_layout
+from dmcvb_gen.readers.register import MAZES, TASKS, environment_ids
 from dmcvb_gen.store import open_release
 from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks.ant_maze import fixed_pairs
 
 SMALL = dict(size=16, samples=1)
 
 
 def test_every_task_and_distractor_is_registered():
     assert TASKS == LOCOMOTION_TASKS and MAZES == ANT_MAZE_TASKS
-    assert len(environment_ids()) == len(TASKS) * len(SETTINGS) + 2 * len(MAZES)
+    assert len(environment_ids()) == len(TASKS) * len(SETTINGS) + 3 * len(MAZES)
     assert set(environment_ids()) <= set(gymnasium.registry)
 
 
@@ -133,6 +137,54 @@ def test_a_maze_shows_its_views_and_hides_its_goal():
         DistractedEnv("ant-maze-empty7x7", "dynamic")
 
 
+def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
+    maze, views = "ant-maze-empty7x7", ["top"]
+    env = gymnasium.make(f"dmcvb_gen/{maze}-fixed-v0", views=views, goal_seed=3, size=48, samples=2)
+    task = get_task(maze)
+    pairs, cells = fixed_pairs(task.layout, FIXED_GOALS, 3), []
+    for _ in range(FIXED_GOALS + 1):
+        observation, info = env.reset(seed=5 if not cells else None)
+        places = (
+            observation["state"][task.state_slices[field]][:2] for field in ("walker_position", "target_position")
+        )
+        cells.append(tuple(tuple(int(x) for x in np.rint(task.layout.grid(place[None])[0])) for place in places))
+        assert pairs[info["goal_pair"]] == cells[-1]
+    assert cells == [*pairs, pairs[0]]
+    env.unwrapped._stage.pictures = env.unwrapped._stage.pictures.__class__(("top",), hide_goal=False)
+    assert (env.unwrapped._stage.observe()["pixels"][0] != observation["pixels"]).any()  # it was hidden
+    vector = gymnasium.make_vec(f"dmcvb_gen/{maze}-fixed-v0", 2, goal_pair=1, goal_seed=3, views=views, **SMALL)
+    states, _ = vector.reset(seed=0)
+    for state in states["state"]:
+        goal = task.layout.grid(state[task.state_slices["target_position"]][None, :2])[0]
+        assert tuple(int(x) for x in np.rint(goal)) == pairs[1][1]
+    with pytest.raises(DmcvbError, match="give 0 for the first"):
+        DistractedEnv(maze, "fixed", goal_pair=-1)
+
+
+@pytest.mark.parametrize("name", ["walker-walk-dynamic", "ant-maze-empty7x7-hidden"])
+def test_the_data_layout_stacks_frames_as_the_readers_do(name):
+    plain, env = gymnasium.make(f"dmcvb_gen/{name}-v0", **SMALL), gymnasium.make(f"dmcvb_gen/{name}-v0", **SMALL)
+    env = data_layout(env)
+    vector = data_layout(gymnasium.make_vec(f"dmcvb_gen/{name}-v0", num_envs=2, **SMALL))
+    views = len(plain.unwrapped.task.views)
+    frames = [plain.reset(seed=1)[0]["pixels"]]
+    found, many = env.reset(seed=1)[0], vector.reset(seed=[1, 7])[0]
+    for step in range(4):
+        stack = np.stack([frames[max(step - back, 0)].reshape(16, 16, views, 3) for back in (2, 1, 0)])
+        expected = stack_channels(np.moveaxis(stack, 3, 1))
+        assert env.observation_space.contains(found) and vector.observation_space.contains(many)
+        np.testing.assert_array_equal(found["pixels"], expected)
+        np.testing.assert_array_equal(many["pixels"][0], expected)
+        action = np.random.default_rng(step).uniform(-1, 1, plain.action_space.shape).astype(np.float32)
+        frames.append(plain.step(action)[0]["pixels"])
+        found, many = env.step(action)[0], vector.step(np.stack([action, action]))[0]
+    vector.unwrapped._stage.frame[1] = vector.unwrapped._stage.max_steps - 1
+    for _ in range(2):
+        many = vector.step(np.zeros((2, *action.shape), np.float32))[0]
+    parts = many["pixels"].reshape(2, 3, -1, 16, 16)
+    assert (parts[1] == parts[1, :1]).all() and not (parts[0] == parts[0, :1]).all()  # a new episode began in place 1
+
+
 def test_evaluation_shows_videos_that_training_does_not():
     val, train = (DistractedEnv("walker-walk", "static", split=split, **SMALL) for split in ("val", "train"))
     assert val._stage.backgrounds.digest != train._stage.backgrounds.digest
@@ -147,6 +199,8 @@ def test_mistakes_are_answered():
         DistractedEnv("walker-walk", render_mode="human")
     with pytest.raises(DmcvbError, match="call reset"):
         DistractedEnv("walker-walk").step(np.zeros(6))
+    with pytest.raises(DmcvbError, match="at least 1"):
+        DistractedVectorEnv(0, "walker-walk")
 
 
 class TestDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):

@@ -25,9 +25,9 @@ from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.release import transfer
 from dmcvb_gen.release.publish import CLAIM, INDEX, fetch, publish
 from dmcvb_gen.release.regenerate import check
-from dmcvb_gen.release.remote import public, reason
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.remote import public, reason
 from tests.conftest import roll_out, small_recipe
 
 pytest.importorskip("s3fs")

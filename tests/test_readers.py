@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 
 import dmcvb_gen
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.readers import source as source_module
 from dmcvb_gen.store import open_release
 
 NAME = "walker-walk/random/dynamic"
@@ -41,7 +42,7 @@ def test_open_gives_subsets_and_episodes(small_release):
 
 def test_xarray_is_lazy_and_holds_every_array(subset):
     data = subset.xarray([0, 2])
-    assert dict(data.sizes).items() >= {"episode": 2, "step": 501, "height": 16, "state": 24}.items()
+    assert dict(data.sizes).items() >= {"episode": 2, "step": 501, "height": 16, "state_dim": 24}.items()
     assert list(data.episode.values) == [0, 2] and data.attrs["task"] == "walker-walk"
     np.testing.assert_array_equal(data["action"].sel(episode=2), subset.read("action", [2])[0])
     position = data["exogenous_camera_position"].sel(episode=2, step=7).values
@@ -73,6 +74,49 @@ def test_a_transition_leads_to_the_next_observation(subset, in_memory):
     np.testing.assert_array_equal(item["next_pixels"][-3:], episode["pixels"][500].transpose(2, 0, 1))
     np.testing.assert_array_equal(item["next_pixels"][:3], item["pixels"][-3:])
     assert item["discount"] == 1
+
+
+def test_every_mode_gives_the_same_shapes(subset):
+    """Rewards of (64, 1) in one mode and (64,) in another broadcast silently in a loss."""
+    kinds = {
+        "held": DataLoader(subset.torch("steps", in_memory=True), batch_size=8),
+        "read": DataLoader(subset.torch("steps", in_memory=False), batch_size=8),
+        "singles": DataLoader(subset.torch("stream", buffer=1), batch_size=8),
+        "batches": DataLoader(subset.torch("stream", batch_size=8, buffer=1), batch_size=None),
+    }
+    shapes = {kind: {k: (v.shape, v.dtype) for k, v in next(iter(loader)).items()} for kind, loader in kinds.items()}
+    assert all(found == shapes["held"] for found in shapes.values()), shapes
+    assert shapes["held"]["reward"][0] == shapes["held"]["episode"][0] == (8,)
+
+
+def test_a_loader_takes_whole_batches_from_steps_that_are_held_by_default(subset, monkeypatch):
+    data, asked = subset.torch("steps"), []
+    gather = data.source.gather
+    monkeypatch.setattr(data.source, "gather", lambda indices: asked.append(len(indices)) or gather(indices))
+    assert data.source.in_memory and len(list(DataLoader(data, batch_size=64, shuffle=True))) == 24
+    assert asked == [64] * 23 + [28]
+    monkeypatch.setattr(source_module, "free_memory", lambda: 1000)
+    assert not subset.torch("steps").source.in_memory and subset.torch("steps", pictures=()).source.in_memory
+
+
+def test_the_source_is_numpy_alone_and_takes_any_index(subset):
+    held, read = subset.source(in_memory=True, next_step=True), subset.source(in_memory=False, next_step=True)
+    rows = [-1, 0, 499, 500, 1234]
+    for index in rows:
+        one, other = held[index], read[index]
+        assert one.keys() == other.keys() == {*held.gather([0])} and "next_pixels" in one
+        for name in one:
+            assert isinstance(one[name], np.ndarray | np.generic) and np.shape(one[name]) == np.shape(other[name])
+            np.testing.assert_array_equal(one[name], other[name])
+            np.testing.assert_array_equal(held.gather(rows)[name][rows.index(index)], one[name])
+    again = pickle.loads(pickle.dumps(held))
+    assert "block" not in vars(again)
+    np.testing.assert_array_equal(again[7]["pixels"], held[7]["pixels"])
+    for outside in (1500, -1501):
+        with pytest.raises(IndexError):
+            held[outside]
+        with pytest.raises(IndexError):
+            held.gather([0, outside])
 
 
 def test_whole_episodes_have_one_observation_more_than_actions(subset):
@@ -110,6 +154,17 @@ def test_loader_workers_share_the_episodes(subset):
     assert loaded == again
     data.set_epoch(1)
     assert keys(DataLoader(data, batch_size=None, num_workers=2)) != loaded
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_persistent_workers_see_the_epoch(subset, context):
+    data = subset.torch("stream", batch_size=100, pictures=(), seed=3, buffer=1)
+    options = dict(num_workers=1, persistent_workers=True, multiprocessing_context=context)
+    loader, orders = DataLoader(data, batch_size=None, **options), []
+    for epoch in (0, 1, 0):
+        data.set_epoch(epoch)
+        orders.append(keys(loader))
+    assert orders[0] == orders[2] != orders[1] and set(orders[0]) == set(orders[1])
 
 
 def test_ranks_get_equally_many_episodes_and_share_none(subset):

@@ -196,7 +196,7 @@ def publish(path, url, options, take_over, workers, as_json):
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     """
     from dmcvb_gen.release.publish import publish as run
-    from dmcvb_gen.release.remote import public
+    from dmcvb_gen.store.remote import public
 
     with tqdm(unit=" files", disable=as_json or None) as bar:
         moved = run(path, url, options=options, take_over=take_over, workers=workers, tick=bar.update)

@@ -11,11 +11,13 @@ _HOMES = {
     "ReleaseReader": "release",
     "SubsetReader": "release",
     "open_for_reading": "release",
+    "StepSource": "source",
     "EpisodeDataset": "torch_data",
     "StepDataset": "torch_data",
     "StreamDataset": "torch_data",
     "DistractedEnv": "envs",
     "DistractedVectorEnv": "envs",
+    "data_layout": "layout",
     "DmEnv": "dm",
 }
 

@@ -6,12 +6,26 @@ shuffled order, holds `buffer` of them in memory, and mixes their steps.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.store import Subset
+from dmcvb_gen.store.pictures import shown
+
+
+def choose(subset: Subset, episodes: Iterable[int] | None) -> np.ndarray:
+    """(episode,) int: indices of committed episodes, all by default.
+
+    Raises:
+      StoreError: one of them is not there.
+    """
+    chosen = subset.episodes if episodes is None else np.asarray(list(episodes), int)
+    missing = np.setdiff1d(chosen, subset.episodes)
+    if len(missing):
+        raise StoreError(f"{subset.name} has no episode {missing[0]}; it has {len(subset.episodes)} episodes")
+    return chosen
 
 
 def stack_channels(frames: np.ndarray) -> np.ndarray:
@@ -24,7 +38,7 @@ class Block:
     """Episodes in memory, their rows one after the other.
 
     Args:
-      pictures: names of picture arrays; none: states alone.
+      pictures: names of picture arrays, in the order of the channels; none: states alone.
       stack: frames a stack; the first frame of an episode is repeated before it (paper, section 4).
       next_step: give what comes next, too.
     """
@@ -111,16 +125,14 @@ def stream(
     Args:
       batch_size: steps a batch (see `Block.gather`); None gives single steps, without the leading axis.
       episodes: indices of committed episodes, all by default.
-      pictures: picture arrays, all visible views by default; () reads states alone.
+      pictures: views (or their arrays), in this order; by default all that the subset shows; () reads states alone.
       shuffle: mix episodes, and steps among the `buffer` episodes in memory; the same for the same seed, epoch and
         number of workers.
       rank, world, worker, workers: this process's share of the episodes.
       drop_last: leave out a batch that is not full.
     """
-    from dmcvb_gen.readers.release import picture_names
-
-    chosen = subset.choose(episodes)
-    names = picture_names(subset, pictures)
+    chosen = choose(subset, episodes)
+    names = shown(subset, pictures).arrays
     order = np.random.default_rng([seed, epoch, 0]).permutation(chosen) if shuffle else chosen
     order = share(order, rank, world, worker, workers)
     mixer = np.random.default_rng([seed, epoch, 1 + rank * workers + worker])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.release.remote import file_system, is_url, public, reason
+from dmcvb_gen.readers.blocks import choose, stream
+from dmcvb_gen.readers.source import StepSource
 from dmcvb_gen.store import Release, Subset, open_release
+from dmcvb_gen.store.remote import file_system, is_url, public, reason
 
 if TYPE_CHECKING:
     import xarray
@@ -32,7 +34,7 @@ class SubsetReader(Subset):
         """
         import xarray
 
-        chosen = self.choose(episodes)
+        chosen = choose(self, episodes)
         options = {"storage_options": self._storage_options} if "://" in self.root else {}
         path = f"{self.root}/{self.name}.zarr"
         parts = []
@@ -68,19 +70,13 @@ class SubsetReader(Subset):
             return torch_data.StreamDataset(self, **options)
         raise UnknownNameError("kind of data set", kind, KINDS)
 
+    def source(self, **options: Any) -> StepSource:
+        """Any step at random, numpy alone: for Grain, tf.data or torch; `options` as for `StepSource`."""
+        return StepSource(self, **options)
+
     def batches(self, batch_size: int, **options: Any) -> Iterator[dict[str, np.ndarray]]:
         """One pass over the steps in shuffled numpy batches; `options` as for `StreamDataset`."""
-        from dmcvb_gen.readers.blocks import stream
-
         yield from stream(self, batch_size=batch_size, **options)
-
-    def choose(self, episodes: Iterable[int] | None) -> np.ndarray:
-        """Indices of committed episodes, all by default; raises StoreError for one that is not there."""
-        chosen = self.episodes if episodes is None else np.asarray(list(episodes), int)
-        missing = np.setdiff1d(chosen, self.episodes)
-        if len(missing):
-            raise StoreError(f"{self.name} has no episode {missing[0]}; it has {len(self.episodes)} episodes")
-        return chosen
 
 
 class ReleaseReader(Release):
@@ -103,16 +99,3 @@ def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseR
         for name, subset in release.subsets.items()
     }
     return ReleaseReader(release.root, release.manifest, subsets)
-
-
-def picture_names(subset: Subset, views: Sequence[str] | None) -> list[str]:
-    """Picture arrays of a subset to read: all visible ones by default.
-
-    Raises:
-      UnknownNameError: there is no such picture array.
-    """
-    names = [name for name in subset.pixel_arrays if not name.startswith("pixels_hidden_goal")]
-    for view in views or ():
-        if view not in subset.pixel_arrays:
-            raise UnknownNameError(f"picture array of {subset.name}", view, subset.pixel_arrays)
-    return list(views) if views is not None else names

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.release.remote import reason
 from dmcvb_gen.release.transfer import is_refusal, refused
 from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest
+from dmcvb_gen.store.remote import reason
 from dmcvb_gen.store.writer import sha256_file
 
 BATCH = 200

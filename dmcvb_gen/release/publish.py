@@ -19,7 +19,6 @@ import pydantic
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.regenerate import load_manifest
-from dmcvb_gen.release.remote import file_system, public, reason
 from dmcvb_gen.release.shards import ShardKey, chosen_shards
 from dmcvb_gen.release.transfer import (
     OBJECT_STORES,
@@ -40,6 +39,7 @@ from dmcvb_gen.store.manifest import (
     parse_manifest,
     write_json_atomically,
 )
+from dmcvb_gen.store.remote import file_system, public, reason
 from dmcvb_gen.store.writer import commit_path, read_commits, sha256_file, shard_count, subset_path
 
 INDEX, CLAIM = "files.json", "publishing.json"

@@ -6,10 +6,10 @@ takes only shards that came out with the very bytes that the manifest promises; 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import folder_in_the_making, remove_partial
 from dmcvb_gen.pool import Tick, ignore
 from dmcvb_gen.release.shards import ShardKey, chosen_shards, damage, make_jobs, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
@@ -194,17 +195,20 @@ class _Workshop:
         self._root, self._manifest, self._records = root, manifest, records
 
     def __enter__(self) -> Path:
-        try:
-            self._folder = Path(tempfile.mkdtemp(prefix=".regenerate-", dir=self._root))
-        except OSError as error:
-            raise StoreError(f"cannot write to {self._root}: {error.strerror or error}; give --out") from None
-        create_groups(self._folder, self._manifest, self._records)
-        for record in self._records:
-            _take_metadata(self._root, self._folder, record)
-        return self._folder
+        with contextlib.ExitStack() as stack:
+            try:
+                remove_partial(self._root, below=False)  # the workshop of a run that was killed
+                folder = stack.enter_context(folder_in_the_making(self._root, "regenerate"))
+            except OSError as error:
+                raise StoreError(f"cannot write to {self._root}: {error.strerror or error}; give --out") from None
+            create_groups(folder, self._manifest, self._records)
+            for record in self._records:
+                _take_metadata(self._root, folder, record)
+            self._stack = stack.pop_all()
+        return folder
 
     def __exit__(self, *_):
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._stack.close()
 
 
 def _run(jobs: Sequence[Job], workers: int, tick: Tick) -> Iterator[CommitRecord]:

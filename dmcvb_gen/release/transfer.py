@@ -14,8 +14,8 @@ from typing import Any
 import fsspec
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.release.remote import reason
 from dmcvb_gen.store.manifest import FileRecord
+from dmcvb_gen.store.remote import reason
 from dmcvb_gen.store.writer import sha256_file
 
 ATTEMPTS = 4

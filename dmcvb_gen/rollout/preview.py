@@ -9,8 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.rollout.recipe import select
+from dmcvb_gen.names import ANT_MAZE, select
 from dmcvb_gen.store import Subset, open_release
+from dmcvb_gen.store.pictures import shown
 
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
@@ -30,15 +31,8 @@ def _label(text: str, width: int) -> np.ndarray:
     return np.asarray(picture)
 
 
-def _views(subset: Subset) -> list[str]:
-    """Picture arrays to show: all visible views, and the hidden ones where the release is about those."""
-    visible = [name for name in subset.pixel_arrays if not name.startswith("pixels_hidden_goal")]
-    hidden = [name for name in subset.pixel_arrays if name.startswith("pixels_hidden_goal")]
-    return hidden if hidden and subset.setting in ("hidden", "fixed") else visible
-
-
-MAP_SCALE = 1.1
-"""Width of the top view over the maze's (dm_control's arena)."""
+def _top(subset: Subset) -> str:
+    return shown(subset, ["top"]).arrays[0]
 
 
 def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale: int) -> np.ndarray:
@@ -47,10 +41,11 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
 
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.tasks.ant_maze.distance import look_up, make_field
+    from dmcvb_gen.tasks.ant_maze.layouts import CELL
 
     task = get_task(subset.task)
-    frames = _enlarge(values["pixels/top"][steps], scale)
-    size, reach = frames.shape[1], MAP_SCALE * max(task.layout.shape) * 2.5 / 2
+    frames = _enlarge(values[_top(subset)][steps], scale)
+    size, reach = frames.shape[1], max(task.layout.shape) * CELL / 2  # the outer walls end at the edge
     place = (np.arange(size) + 0.5) / size * 2 * reach - reach
     x, y = (part.ravel() for part in np.meshgrid(place, -place))
     where = np.stack([x, y], axis=1)
@@ -78,8 +73,8 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
     return np.stack(out)
 
 
-def _is_maze(subset: Subset) -> bool:
-    return "pixels/top" in subset.pixel_arrays
+def _has_map(subset: Subset) -> bool:
+    return subset.record.family == ANT_MAZE and "top" in shown(subset).views
 
 
 def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
@@ -87,11 +82,11 @@ def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, sc
     length = int(subset.read("length", [episode])[0])
     steps = np.linspace(0, length, columns).round().astype(int)
     rows = []
-    for name in _views(subset):
+    for name in shown(subset).arrays:
         frames = subset.episode(episode, [name, "length"])[name][steps]
         rows.append(np.concatenate(list(_enlarge(frames, scale)), axis=1))
-    if _is_maze(subset):
-        drawn = _map(subset, subset.episode(episode, ["state", "length", "pixels/top"]), steps, scale)
+    if _has_map(subset):
+        drawn = _map(subset, subset.episode(episode, ["state", _top(subset)]), steps, scale)
         rows.append(np.concatenate(list(drawn), axis=1))
     picture = np.concatenate(rows)
     value = float(subset.read("return", [episode])[0])
@@ -118,11 +113,11 @@ def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = 200) -
     columns = []
     for subset in subsets:
         episode = int(subset.episodes[0])
-        values = subset.episode(episode)
-        views = [values[name] for name in _views(subset)]
+        values = subset.episode(episode, ["state", *shown(subset).arrays])
+        views = [values[name] for name in shown(subset).arrays]
         steps = np.minimum(np.arange(frames), len(views[0]) - 1)
         rows = [_enlarge(view[steps], scale) for view in views]
-        if _is_maze(subset):
+        if _has_map(subset):
             rows.append(_map(subset, values, steps, scale))
         picture = np.concatenate(rows, axis=1)
         label = _label(subset.name, picture.shape[2])
@@ -166,7 +161,7 @@ def write_preview(
 
     release = open_release(path)
     names = select(list(release.subsets), list(only)) if release.subsets else []
-    subsets = [release.subsets[name] for name in names if len(_views(release.subsets[name]))]
+    subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:
         raise StoreError(f"{path} has no committed episodes with pictures yet; run the rollout first")
     folder = Path(out) if out else release.path / "preview"

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import platform
 import re
-import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +14,7 @@ import pydantic
 
 from dmcvb_gen import __version__
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import write_json
 from dmcvb_gen.store.schema import SCHEMA_VERSION
 
 MANIFEST = "manifest.json"
@@ -235,17 +234,4 @@ def _goal_pairs_of_version_1(record: dict[str, Any], patterns: list[dict[str, An
 
 def write_json_atomically(path: Path, value: pydantic.BaseModel | dict[str, Any]) -> None:
     """Write JSON so that a reader (or a crash) sees the old file or the new one, never a part."""
-    data = value.model_dump(mode="json") if isinstance(value, pydantic.BaseModel) else value
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
-    try:
-        with os.fdopen(handle, "w") as file:
-            json.dump(data, file, indent=1)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_json(path, value)

@@ -6,7 +6,7 @@ The one place that knows. A task with one view stores `pixels`; one with several
     pixels_hidden_goal/<view>   the goal left out
 
 A subset whose setting hides the goal (`hidden`, `fixed`) has both, and shows the second alone: the first would give
-the answer away. Views come in the task's order, which the subset's attributes record; environments, policies and
+the answer away. Views come in the task's order, which the subset's record keeps; environments, policies and
 channels stacked of several views all follow it.
 """
 
@@ -19,18 +19,15 @@ from typing import TYPE_CHECKING
 from dmcvb_gen.errors import UnknownNameError
 
 if TYPE_CHECKING:
+    from dmcvb_gen.store.manifest import SubsetRecord
     from dmcvb_gen.store.reader import Subset
 
 ONE_VIEW = ("pixels",)
 """The views of a task with one."""
 SHOWN, HIDDEN = "pixels", "pixels_hidden_goal"
 """Folders of the pictures with the goal, and without it."""
-HIDDEN_SETTINGS = ("hidden", "fixed")
-"""Settings in which nobody sees the goal."""
 NOT_TRAINED_ON = ("overhead",)
 """Views that are collected, but that no agent sees (paper, section 3.2)."""
-_USUAL_ORDER = ("top", "egocentric", "follow", "overhead")
-"""Of subsets whose attributes do not record their views."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +66,6 @@ class Pictures:
         return Pictures(tuple(names[view] for view in views), self.hide_goal)
 
 
-def hides_goal(setting: str) -> bool:
-    """Whether nobody sees the goal under a setting."""
-    return setting in HIDDEN_SETTINGS
-
-
 def picture_arrays(views: Sequence[str], hide_goal: bool = False) -> tuple[str, ...]:
     """Names of the picture arrays of views: ("pixels",), or ("pixels/top", ...), ("pixels_hidden_goal/top", ...)."""
     if tuple(views) == ONE_VIEW:
@@ -90,18 +82,9 @@ def picture_of(array: str) -> tuple[str, bool] | None:
     return view or ONE_VIEW[0], folder == HIDDEN
 
 
-def stored_views(subset: Subset) -> tuple[str, ...]:
-    """The views of a subset, in the task's order, whether their pictures are stored or not."""
-    recorded = subset.attrs.get("views")
-    if recorded:
-        return tuple(map(str, recorded))
-    found = {picture_of(name)[0] for name in subset.pixel_arrays}
-    usual = [view for view in _USUAL_ORDER if view in found]
-    return (*usual, *sorted(found.difference(usual)))
-
-
-def shown(subset: Subset, views: Sequence[str] | None = None) -> Pictures:
-    """The pictures that a subset shows: all its views, in the task's order, the goal hidden where its setting says so.
+def shown(subset: Subset | SubsetRecord, views: Sequence[str] | None = None) -> Pictures:
+    """The pictures that a subset (or the subset of a record) shows: all its views, in the task's order, the goal
+    hidden where its setting says so; whether they are stored or not.
 
     Args:
       views: of them, these alone, in this order.
@@ -109,7 +92,8 @@ def shown(subset: Subset, views: Sequence[str] | None = None) -> Pictures:
     Raises:
       UnknownNameError: no such view.
     """
-    return Pictures(stored_views(subset), hides_goal(subset.setting)).select(views)
+    record = getattr(subset, "record", subset)
+    return Pictures(record.views, record.hidden_goal).select(views)
 
 
 def training_pictures(subset: Subset) -> Pictures:

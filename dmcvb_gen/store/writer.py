@@ -16,6 +16,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import PARTIAL, copy_file, remove_partial
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
@@ -65,13 +66,20 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
                 if environment not in environments:
                     environments = (*environments, environment)
             manifest = old.model_copy(update={"environments": environments})
-        elif root.exists() and any(root.iterdir()):
+        elif root.exists() and any(not path.name.endswith(PARTIAL) for path in root.iterdir()):
             raise StoreError(f"{root} is not empty and holds no release; choose an empty or new folder for --out")
         root.mkdir(parents=True, exist_ok=True)
+        _clear(root)
         write_json_atomically(path, manifest)
     except OSError as error:
         raise StoreError(f"cannot write to {root}: {error.strerror or error}; choose a writable --out") from None
     return manifest
+
+
+def _clear(root: Path) -> None:
+    """Delete what killed processes left in the making, where files are few; a shard's are deleted as it is written."""
+    remove_partial(root, below=False)
+    remove_partial(root / "commits")
 
 
 def _asked(manifest: Manifest) -> list[SubsetRecord]:
@@ -115,15 +123,14 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
     try:
         if any((root / "commits" / subset.name).glob("*.json")):
-            with tempfile.TemporaryDirectory(prefix=".create-", dir=root) as folder:
+            with tempfile.TemporaryDirectory() as folder:
                 group = zarr.create_group(folder, attributes=attributes, overwrite=True)
                 create_arrays(group, specs, *shape, schema_version=version)
                 zarr.consolidate_metadata(folder)
                 for source in sorted(Path(folder).rglob("zarr.json")):
                     target = path / source.relative_to(folder)
                     if not target.exists():
-                        target.parent.mkdir(parents=True, exist_ok=True)
-                        os.replace(source, target)
+                        copy_file(source, target)
             (path / ".created").touch()
             return
         group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
@@ -157,13 +164,16 @@ def write_shard(
     group_path = root / subset_path(subset.name)
     record = root / commit_path(subset.name, shard)
     try:
+        there = _read_commit(root, subset, shard)
+        if there:  # another process has made it since this one planned to
+            return there
         record.unlink(missing_ok=True)
         group = zarr.open_group(str(group_path), mode="r+", use_consolidated=False)
         files = []
         for name, values in arrays:
             array, name = find_array(group, name)
             file = group_path / name / array.metadata.encode_chunk_key((shard,) + (0,) * (array.ndim - 1))
-            for stale in file.parent.glob(f"{file.name}*.partial"):
+            for stale in file.parent.glob(f"{file.name}.*.partial"):
                 stale.unlink(missing_ok=True)  # left by a killed writer
             file.unlink(missing_ok=True)
             array[first:last] = values
@@ -172,6 +182,11 @@ def write_shard(
                     os.fsync(handle.fileno())
                 relative = file.relative_to(root).as_posix()
                 files.append(FileRecord(path=relative, bytes=file.stat().st_size, sha256=sha256_file(file)))
+            elif np.any(values):
+                raise StoreError(
+                    f"{file} vanished while it was written: another process writes the same release; let one of the "
+                    "two go on, and run the same command again"
+                )
         commit = CommitRecord(
             subset=subset.name,
             shard=shard,
@@ -210,15 +225,22 @@ def read_commits(root: Path, subset: SubsetRecord) -> dict[int, CommitRecord]:
     """The committed shards of a subset, shard -> record (those whose files are all there at their size)."""
     commits = {}
     for shard in range(shard_count(subset)):
-        path = root / commit_path(subset.name, shard)
-        if not path.exists():
-            continue
-        commit = parse_commit(path.read_bytes(), str(path))
-        if commit.subset != subset.name or commit.shard != shard or commit.episodes != shard_episodes(subset, shard):
-            raise StoreError(f"{path} is the record of another shard; delete it and run the rollout again")
-        if all(_size(root / file.path) == file.bytes for file in commit.files):
+        commit = _read_commit(root, subset, shard)
+        if commit:
             commits[shard] = commit
     return commits
+
+
+def _read_commit(root: Path, subset: SubsetRecord, shard: int) -> CommitRecord | None:
+    path = root / commit_path(subset.name, shard)
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    commit = parse_commit(text, str(path))
+    if commit.subset != subset.name or commit.shard != shard or commit.episodes != shard_episodes(subset, shard):
+        raise StoreError(f"{path} is the record of another shard; delete it and run the rollout again")
+    return commit if all(_size(root / file.path) == file.bytes for file in commit.files) else None
 
 
 def _size(path: Path) -> int | None:
@@ -258,6 +280,7 @@ def finish_release(root: Path, manifest: Manifest) -> Manifest:
     )
     try:
         write_json_atomically(root / MANIFEST, manifest)
+        remove_partial(root, foreign=complete)  # where all is committed, nobody has anything left to make
     except OSError as error:
         raise StoreError(f"cannot write {root / MANIFEST}: {error.strerror or error}") from None
     return manifest

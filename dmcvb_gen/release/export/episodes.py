@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmcvb_gen.readers.release import SubsetReader, picture_names
+from dmcvb_gen.readers.release import SubsetReader
 from dmcvb_gen.store import Manifest
+from dmcvb_gen.store.pictures import Pictures, shown
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 
@@ -68,9 +69,14 @@ class Source:
         return 1 / (ACTION_REPEAT * get_task(self.subset.task).control_timestep)
 
     @property
-    def views(self) -> list[str]:
-        """Names of the views, without the arrays' folder: "pixels", or "top", ..."""
-        return [name.split("/")[-1] for name in picture_names(self.subset, None)]
+    def pictures(self) -> Pictures:
+        """What the subset shows: its views in their order, the goal left out where its setting hides it."""
+        return shown(self.subset)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views: "pixels", or "top", ..."""
+        return self.pictures.views
 
     @property
     def description(self) -> str:
@@ -78,14 +84,14 @@ class Source:
         return f"{self.subset.name} of {manifest.name} {manifest.version} ({manifest.license}), {manifest.generator}"
 
     def __iter__(self) -> Iterator[ExportEpisode]:
-        names = picture_names(self.subset, None)
-        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *names]
+        pictures = self.pictures
+        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *pictures.arrays]
         for index in self.episodes:
             values = self.subset.episode(index, arrays)
             yield ExportEpisode(
                 index=index,
                 seed=int(values["seed"]),
-                pixels={name.split("/")[-1]: values[name] for name in names},
+                pixels={view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
                 terminated=bool(values["terminated"]),
                 **{name: values[name] for name in ("state", "action", "reward", "discount")},
             )
