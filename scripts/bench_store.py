@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.behaviours.policies.policy_file import random_policy
+from dmcvb_gen.behaviours.policies.actor import random_policy
 from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.rollout.plan import Job, make_plan, renderer_for
 from dmcvb_gen.rollout.recipe import make_recipe

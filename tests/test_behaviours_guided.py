@@ -8,9 +8,10 @@ import torch
 
 from dmcvb_gen.behaviours.learning import runs
 from dmcvb_gen.behaviours.learning.guided import deepened, divergence
+from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.training import open_run
-from dmcvb_gen.behaviours.policies.policy_file import Actor, load_policy, read_header
+from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
@@ -41,7 +42,7 @@ def test_saturated_actions_need_not_be_met_to_the_digit():
 def test_a_deeper_student_begins_as_its_guide(tmp_path):
     torch.manual_seed(0)
     run = open_run(tmp_path / "run", config(settings={"layers": 4}), False)
-    weights = run.guide.weights
+    weights = as_tensors(run.guide.weights)
     student, guide = Actor(run.header), Actor(run.guide.header)
     assert run.header.hidden == (256, 256, 256, 256) and run.guide.header.hidden == (256, 256)
     student.load_state_dict(deepened(weights, student.state_dict()))

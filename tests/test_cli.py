@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import pytest
-import torch
 from click.testing import CliRunner
 from PIL import Image
 
@@ -103,8 +102,8 @@ def broken_policy(tmp_path, kind):
         path.write_bytes(source.read_bytes()[:5000])
     elif kind == "nan":
         policy = load_policy(source)
-        weights = {name: value.clone() for name, value in policy.weights.items()}
-        weights["mean.weight"][0, 0] = torch.nan
+        weights = {name: value.copy() for name, value in policy.weights.items()}
+        weights["mean.weight"][0, 0] = float("nan")
         save_policy(path, policy.header, weights)
     else:
         path.write_bytes(source.read_bytes())

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import tracemalloc
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from dmcvb_gen import arithmetic
+from dmcvb_gen.behaviours.learning.networks import Actor, as_arrays
+from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
 from dmcvb_gen.behaviours.policies.bundled import bundled_policies, resolve_policies
-from dmcvb_gen.behaviours.policies.policy_file import (
-    Actor,
-    Evaluation,
-    PolicyHeader,
-    load_policy,
-    random_policy,
-    read_header,
-    save_policy,
-)
-from dmcvb_gen.behaviours.policies.simulate import TILE, TiledActor
+from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader, weight_shapes
+from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header, save_policy
+from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.tasks import get_task
 
@@ -45,7 +44,7 @@ def policy_path(tmp_path):
     actor = Actor(header)
     actor.observation_mean += 0.5
     actor.observation_std *= 2.0
-    save_policy(tmp_path / "policy.safetensors", header, actor.state_dict())
+    save_policy(tmp_path / "policy.safetensors", header, as_arrays(actor.state_dict()))
     return tmp_path / "policy.safetensors"
 
 
@@ -71,33 +70,62 @@ def test_actions_are_the_networks_by_hand(policy_path):
     policy = load_policy(policy_path)
     np.testing.assert_allclose(policy.act(observations(), deterministic=True), np.tanh(mean), atol=1e-6)
     rngs = [np.random.default_rng(i) for i in range(5)]
-    noise = np.stack([np.random.default_rng(i).standard_normal(6, np.float32) for i in range(5)])
+    noise = np.stack([arithmetic.normal(np.random.default_rng(i), (6,)) for i in range(5)])
     np.testing.assert_allclose(policy.act(observations(), rngs), np.tanh(mean + std * noise), atol=1e-6)
 
 
 @pytest.mark.parametrize("distribution", ["squashed_gaussian", "gaussian", "deterministic"])
 @pytest.mark.parametrize("layer_norm", [False, True])
-def test_every_kind_of_actor_acts_in_range(tmp_path, distribution, layer_norm):
-    header = header_of(distribution=distribution, layer_norm=layer_norm, noise=0.1, activation="elu")
-    save_policy(tmp_path / "p", header, Actor(header).state_dict())
-    policy = load_policy(tmp_path / "p")
-    sampled = policy.act(100 * observations(), [np.random.default_rng(i) for i in range(5)])
+@pytest.mark.parametrize("activation", ["relu", "tanh", "elu", "gelu"])
+def test_every_kind_of_actor_acts_as_torchs_does(tmp_path, distribution, layer_norm, activation):
+    header = header_of(
+        distribution=distribution, layer_norm=layer_norm, noise=0.1, activation=activation, hidden=(17, 9)
+    )
+    torch.manual_seed(1)
+    actor = Actor(header)
+    assert weight_shapes(header) == {name: tuple(value.shape) for name, value in actor.state_dict().items()}
+    save_policy(tmp_path / "p", header, as_arrays(actor.state_dict()))
+    policy, seen = load_policy(tmp_path / "p"), 3 * observations(7)
+    with torch.no_grad():
+        mean, std = actor(torch.from_numpy(seen))
+    for ours, theirs in zip(policy.distribution(seen), (mean, std), strict=True):
+        np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-5, atol=2e-6)
+    squashed = mean.clamp(-1, 1) if distribution == "gaussian" else torch.tanh(mean)
+    np.testing.assert_allclose(policy.act(seen, deterministic=True), squashed.numpy(), atol=2e-6)
+    sampled = policy.act(100 * seen, [np.random.default_rng(i) for i in range(7)])
     assert sampled.dtype == np.float32 and np.abs(sampled).max() <= 1
-    assert (sampled != policy.act(100 * observations(), deterministic=True)).any()
+    assert (sampled != policy.act(100 * seen, deterministic=True)).any()
 
 
-def test_a_tiled_action_depends_on_nothing_but_its_episode(policy_path):
-    policy, seen = load_policy(policy_path), observations(40)
+def test_sums_are_added_up_from_the_first_input_to_the_last():
+    """Oracle: the same sum, one addition at a time."""
+    rng, header = np.random.default_rng(0), header_of(hidden=(), distribution="gaussian")
+    weights = {name: rng.normal(size=shape).astype(np.float32) for name, shape in weight_shapes(header).items()}
+    weights |= {"observation_mean": np.zeros(24, np.float32), "observation_std": np.ones(24, np.float32)}
+    seen = observations(9)
+    expected = np.tile(weights["mean.bias"], (9, 1))
+    for i in range(24):
+        expected = expected + seen[:, i : i + 1] * weights["mean.weight"][:, i]
+    assert expected.dtype == np.float32
+    np.testing.assert_array_equal(Policy(header, weights, "").distribution(seen)[0], expected)
 
-    def act(episodes):
-        episodes = np.asarray(episodes)
-        rngs = [np.random.default_rng(int(i)) for i in episodes]
-        actor = TiledActor([policy], np.zeros(len(episodes), int), episodes, rngs, 24)
-        return actor.act(seen[episodes], len(episodes), 6)
 
-    whole = act(np.arange(40))
-    assert TILE < 40
-    np.testing.assert_array_equal(act([3, 39, 17]), whole[[3, 39, 17]])
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_an_action_depends_on_nothing_but_its_own_row(policy_path, deterministic):
+    policy, seen = load_policy(policy_path), observations(41)
+
+    def act(rows):
+        return policy.act(seen[rows], [np.random.default_rng(row) for row in rows], deterministic)
+
+    whole = act(list(range(41)))
+    for rows in ([3], [40, 17], list(range(5, 23)), [9, 8, 7, 6, 5, 4, 3]):
+        np.testing.assert_array_equal(act(rows), whole[rows])
+
+
+def test_a_random_policy_draws_even_where_mean_actions_are_asked_for():
+    task = get_task("walker-walk")
+    out = simulate(task, [random_policy(task)], [0, 1], 0, ("t",), deterministic=True, max_steps=4)
+    assert np.abs(out.action[:, :4]).mean() > 0.3 and (out.action[0] != out.action[1]).any()
 
 
 def test_random_actions_are_uniform_from_each_stream():
@@ -128,6 +156,10 @@ def tamper(path, out, change):
         (lambda w, h: w.update({"mean.bias": torch.zeros(7)}), "mean.bias"),
         (lambda w, h: w.update({"mean.bias": torch.zeros(6, dtype=torch.float64)}), "mean.bias"),
         (lambda w, h: h.update(hidden=[8, 8]), "shape"),
+        (lambda w, h: h.update(hidden=[60_000] * 16), "shape"),
+        (lambda w, h: h.update(hidden=[2**40]), "hidden"),
+        (lambda w, h: h.update(hidden=[1] * 100_000), "hidden"),
+        (lambda w, h: h.update(observation_size=2**50), "observation_size"),
         (lambda w, h: h.update(action_size=7), "train it again"),
         (lambda w, h: h.update(task="cheetah-run"), "not for walker-walk"),
         (lambda w, h: h.update(format_version=99), "newer dmcvb-gen"),
@@ -138,6 +170,36 @@ def test_a_file_that_does_not_fit_is_refused(policy_path, tmp_path, change, word
     path = tamper(policy_path, tmp_path / "changed.safetensors", change)
     with pytest.raises(PolicyFileError, match=words):
         load_policy(path, get_task("walker-walk"))
+
+
+def test_a_small_file_that_asks_for_huge_layers_is_refused_at_once(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    header = json.loads(header_of(hidden=[65_536] * 16).model_dump_json())
+    save_file({"mean.bias": torch.zeros(6)}, path, metadata={"header": json.dumps(header)})
+    tracemalloc.start()
+    with pytest.raises(PolicyFileError, match="asks for"):
+        load_policy(path)
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
+
+
+def test_headers_of_earlier_versions_are_read():
+    assert Evaluation(mean=1.0, std=0.5, episodes=3, mode="deterministic", seed=0).mode == "mean"
+
+
+def test_a_header_says_how_its_policy_came_to_be():
+    assert "DAgger" in header_of(algorithm="guided").origin and "SAC" in header_of().origin
+    assert header_of(algorithm="my-own").origin == "by my-own"
+
+
+def test_policies_act_without_torch():
+    code = "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
+    code += "from dmcvb_gen.behaviours.policies import actor, bundled, evaluation, paper, policy_file, simulate\n"
+    code += "from dmcvb_gen.tasks import get_task; task = get_task('walker-walk')\n"
+    code += "policy = policy_file.load_policy(bundled.bundled_policies(task.id, 'expert')[0], task)\n"
+    code += "print(simulate.simulate(task, [policy], [0], 0, ('t',), max_steps=2).action[0, 0])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 0 and ran.stdout.startswith("["), ran.stderr
 
 
 @pytest.mark.parametrize("keep", [0, 4, 40, 0.5, 0.999])

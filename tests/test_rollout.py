@@ -14,7 +14,7 @@ import time
 import numpy as np
 import pytest
 
-from dmcvb_gen.behaviours.policies.policy_file import random_policy
+from dmcvb_gen.behaviours.policies.actor import random_policy
 from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
 from dmcvb_gen.rollout.estimate import estimate

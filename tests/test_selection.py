@@ -10,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from dmcvb_gen.behaviours.learning.networks import Actor, as_arrays
 from dmcvb_gen.behaviours.learning.run_log import COLUMNS
 from dmcvb_gen.behaviours.learning.selection import (
     MAZE_LEVELS,
@@ -21,7 +22,8 @@ from dmcvb_gen.behaviours.learning.selection import (
 )
 from dmcvb_gen.behaviours.learning.thinning import LIMIT, superfluous
 from dmcvb_gen.behaviours.policies.bundled import level_files
-from dmcvb_gen.behaviours.policies.policy_file import Actor, Evaluation, PolicyHeader, read_header, save_policy
+from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.behaviours.policies.policy_file import read_header, save_policy
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 
@@ -174,7 +176,7 @@ def run_folder(tmp_path):
         save_policy(
             tmp_path / "checkpoints" / f"{index * 1000:010d}.safetensors",
             header.model_copy(update=dict(agent_step=index * 1000, evaluation=evaluation)),
-            Actor(header).state_dict(),
+            as_arrays(Actor(header).state_dict()),
         )
     return tmp_path
 

@@ -12,7 +12,7 @@ from dmcvb_gen.behaviours.learning.episodes import standing_states
 from dmcvb_gen.behaviours.learning.runs import RunConfig, check_same
 from dmcvb_gen.behaviours.learning.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
 from dmcvb_gen.behaviours.learning.training import SacRun, open_run
-from dmcvb_gen.behaviours.policies.policy_file import PolicyHeader
+from dmcvb_gen.behaviours.policies.header import PolicyHeader
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task

@@ -129,10 +129,11 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, 
     dmcvb-gen evaluate-behaviour
     dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
     """
+    from dmcvb_gen.behaviours.policies.actor import random_policy
     from dmcvb_gen.behaviours.policies.bundled import bundled_levels, levels_of, resolve_policies
     from dmcvb_gen.behaviours.policies.evaluation import maze_scores
     from dmcvb_gen.behaviours.policies.paper import paper_returns
-    from dmcvb_gen.behaviours.policies.policy_file import load_policy, random_policy, read_header
+    from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
     from dmcvb_gen.behaviours.policies.simulate import simulate
     from dmcvb_gen.rollout.info import return_statistics
     from dmcvb_gen.tasks import get_task, task_ids

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
-from dmcvb_gen.behaviours.policies.policy_file import Policy, load_policy, random_policy
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import RecipeError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.rendering import available_renderers, make_renderer

@@ -17,11 +17,13 @@ import numpy as np
 import torch
 
 from dmcvb_gen.behaviours.learning.episodes import Episodes
+from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
 from dmcvb_gen.behaviours.learning.runs import SAVE_SECONDS, Report, Run, Tick
 from dmcvb_gen.behaviours.learning.sac import RowBuffer
 from dmcvb_gen.behaviours.learning.settings import Count, Natural, NonNegative, Positive, Share
+from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
-from dmcvb_gen.behaviours.policies.policy_file import Actor, Policy, load_policy
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
 
 GUIDE = "ant-maze-empty7x7"
@@ -97,9 +99,9 @@ class GuidedRun(Run):
         settings, task, config = self.settings, self.task, self.config
         torch.manual_seed(config.seed)
         student = Actor(self.header)
-        student.load_state_dict(deepened(self.guide.weights, student.state_dict()))
+        student.load_state_dict(deepened(as_tensors(self.guide.weights), student.state_dict()))
         guide = Actor(self.guide.header).requires_grad_(False)
-        guide.load_state_dict(self.guide.weights)
+        guide.load_state_dict(as_tensors(self.guide.weights))
         optimizer = torch.optim.Adam(student.parameters(), lr=settings.learning_rate, fused=True)
         shapes = {"observation": (task.behaviour_size,), "mean": (task.action_size,), "std": (task.action_size,)}
         rows = max(min(settings.buffer_size, config.steps), settings.simulations)

@@ -11,7 +11,7 @@ import csv
 from collections.abc import Mapping
 from pathlib import Path
 
-from dmcvb_gen.behaviours.policies.policy_file import Evaluation
+from dmcvb_gen.behaviours.policies.header import Evaluation
 
 COLUMNS = ("step", "seconds", "return_mean", "return_std", "success", "speed", "alpha", "updates")
 """Agent steps; seconds of training; returns of the evaluation's episodes; share of episodes that the task ended and

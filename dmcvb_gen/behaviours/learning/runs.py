@@ -33,19 +33,15 @@ from typing import Any
 
 import torch
 
+from dmcvb_gen.behaviours.learning.networks import as_arrays
 from dmcvb_gen.behaviours.learning.run_log import RunLog
 from dmcvb_gen.behaviours.learning.settings import check_settings
 from dmcvb_gen.behaviours.learning.thinning import superfluous
+from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
 from dmcvb_gen.behaviours.policies.evaluation import evaluate
+from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.behaviours.policies.paper import paper_returns
-from dmcvb_gen.behaviours.policies.policy_file import (
-    Actor,
-    Evaluation,
-    Policy,
-    PolicyHeader,
-    random_policy,
-    save_policy,
-)
+from dmcvb_gen.behaviours.policies.policy_file import save_policy
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.store.manifest import environment
 from dmcvb_gen.tasks import get_task
@@ -231,14 +227,11 @@ class Run(abc.ABC):
         """Evaluate the actor's `weights`, export them as a policy file, log; evaluations are not training time."""
         self.seconds += time.time() - self._started
         header = self.header.model_copy(update={"agent_step": self.step})
-        weights = {name: value.detach().clone() for name, value in weights.items()}
-        with torch.random.fork_rng(devices=()):  # learning goes on as if it had not been looked at
-            actor = Actor(header)
-            actor.load_state_dict(weights)
-            evaluation, _ = evaluate(Policy(header, actor, ""), self.task, EVALUATION_EPISODES, seed=self.step)
+        arrays = as_arrays(weights)
+        evaluation, _ = evaluate(Policy(header, arrays, ""), self.task, EVALUATION_EPISODES, seed=self.step)
         trained = header.training | {"seconds": round(self.seconds, 1)}
         header = header.model_copy(update={"evaluation": evaluation, "training": trained})
-        save_policy(self._checkpoint(self.step), header, weights)
+        save_policy(self._checkpoint(self.step), header, arrays)
         self._log.add(self.step, evaluation, self.seconds, updates, metrics)
         self._thin()
         progress = Progress(self.step, evaluation, self.seconds, self.step / max(self.seconds, 1e-9))

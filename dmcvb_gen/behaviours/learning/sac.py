@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from torch import nn
 
+from dmcvb_gen.behaviours.learning.networks import Actor
 from dmcvb_gen.behaviours.learning.row_files import map_rows, rows_in
 from dmcvb_gen.behaviours.learning.settings import Count, Decay, Natural, NonNegative, Positive, Share
-from dmcvb_gen.behaviours.policies.policy_file import LOG_STD_RANGE, Actor, PolicyHeader
+from dmcvb_gen.behaviours.policies.header import LOG_STD_RANGE, PolicyHeader
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,12 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
 from dmcvb_gen.behaviours.learning.row_files import map_rows, rows_in
 from dmcvb_gen.behaviours.learning.runs import SAVE_SECONDS, Report, Run, Tick, read_config
 from dmcvb_gen.behaviours.learning.settings import OffPolicySettings
 from dmcvb_gen.behaviours.learning.vec_env import TaskVecEnv
-from dmcvb_gen.behaviours.policies.policy_file import Actor, load_policy
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
 
 CLIP_OBSERVATION = 10.0
@@ -269,7 +270,7 @@ class Sb3Run(Run):
             if normalize and normalize.norm_obs and "obs_rms" in saved.get("normalize", {}):
                 _set_statistics(normalize.obs_rms, saved["normalize"]["obs_rms"])
             return
-        weights = load_policy(source).weights
+        weights = as_tensors(load_policy(source).weights)
         fit(lambda: model.policy.load_state_dict({name: weights[ours] for ours, name in self._names().items()}, False))
         if normalize and normalize.norm_obs:
             std = weights["observation_std"].numpy().astype(float)

@@ -15,16 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from dmcvb_gen.behaviours.learning.run_log import read_rows
+from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
 from dmcvb_gen.behaviours.policies.evaluation import evaluate
-from dmcvb_gen.behaviours.policies.policy_file import (
-    Evaluation,
-    Policy,
-    PolicyHeader,
-    load_policy,
-    random_policy,
-    read_header,
-    save_policy,
-)
+from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.store.manifest import write_json_atomically
 from dmcvb_gen.tasks import get_task

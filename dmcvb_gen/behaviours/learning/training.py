@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from dmcvb_gen.behaviours.learning.episodes import Episodes, shaping_of
+from dmcvb_gen.behaviours.learning.networks import as_tensors
 from dmcvb_gen.behaviours.learning.runs import (
     SAVE_SECONDS,
     Progress,
@@ -141,7 +142,7 @@ def _start_from(learner: Sac, source: str) -> None:
             raise DmcvbError(f"--init-from {source}: no run of sac is saved there; give its folder or a policy file")
         _fit(f"--init-from {source}", learner.load_networks, torch.load(saved, weights_only=True)["learner"])
         return
-    _fit(f"--init-from {source}", learner.actor.load_state_dict, load_policy(path).weights)
+    _fit(f"--init-from {source}", learner.actor.load_state_dict, as_tensors(load_policy(path).weights))
     learner.norm.mean = learner.actor.observation_mean.numpy().astype(float)
     learner.norm.count = 1e5
     learner.norm.m2 = learner.actor.observation_std.numpy().astype(float) ** 2 * learner.norm.count

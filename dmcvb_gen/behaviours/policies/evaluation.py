@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from dmcvb_gen.behaviours.policies.policy_file import Evaluation, Policy
+from dmcvb_gen import arithmetic
+from dmcvb_gen.behaviours.policies.actor import Policy
+from dmcvb_gen.behaviours.policies.header import Evaluation
 from dmcvb_gen.behaviours.policies.simulate import Simulation, simulate
 from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
 
 
 def evaluate(
-    policy: Policy, task: Task, episodes: int = 100, seed: int = 1, deterministic: bool = False, threads: int = 1
+    policy: Policy, task: Task, episodes: int = 100, seed: int = 1, deterministic: bool = True, threads: int = 1
 ) -> tuple[Evaluation, Simulation]:
     """Roll a policy out over fresh episodes (streams of their own, apart from every release's).
 
@@ -33,7 +35,7 @@ def evaluate(
             mean=float(returns.mean()),
             std=float(returns.std()),
             episodes=episodes,
-            mode="deterministic" if deterministic else "sampled",
+            mode="mean" if deterministic else "sampled",
             seed=seed,
             quartiles=tuple(float(value) for value in np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))),
             success=success,
@@ -54,5 +56,5 @@ def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float
         return None, None
     reached = simulation.terminated
     seconds = simulation.length * ACTION_REPEAT * task.control_timestep
-    speed = np.linalg.norm(simulation.state[:, 0, part], axis=1) / seconds
+    speed = arithmetic.norm(simulation.state[:, 0, part]) / seconds
     return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None

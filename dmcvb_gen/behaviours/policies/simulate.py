@@ -1,27 +1,21 @@
 """Simulating episodes: task, policies and streams in; actions, rewards, states and physics out. No pixels here.
 
 An episode depends on its index alone, never on which episodes are simulated beside it: physics does not
-mix simulations, every random number comes from the episode's own streams, and the policy always sees
-tiles of `TILE` rows in which an episode has a fixed place (a matrix product may round differently at
-another batch size).
+mix simulations, every random number comes from the episode's own streams, and a policy adds up in a fixed order,
+whatever rows lie beside it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
-from dmcvb_gen.behaviours.policies.policy_file import Policy
+from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.seeding import episode_seed, episode_stream
 from dmcvb_gen.tasks.base import Task
-
-TILE = 32
-"""Rows of every policy call. Part of the data: another value may change bits."""
 
 
 @dataclass(frozen=True)
@@ -66,56 +60,29 @@ class Simulation:
         return {name: getattr(self, name) for name in names} | {"return": self.returns, "goal_pair": self.goal_pair}
 
 
-class TiledActor:
-    """Actions of a batch of episodes, each from its own policy, in calls of a fixed shape."""
+def _actions(
+    policies: Sequence[Policy],
+    assigned: np.ndarray,
+    generators: Sequence[np.random.Generator],
+    observations: np.ndarray,
+    active: np.ndarray,
+    action_size: int,
+    deterministic: bool,
+) -> np.ndarray:
+    """Actions of a batch of episodes, each from its own policy; zeros where an episode is over.
 
-    def __init__(
-        self,
-        policies: Sequence[Policy],
-        assigned: np.ndarray,
-        episodes: np.ndarray,
-        generators: Sequence[np.random.Generator],
-        observation_size: int,
-        deterministic: bool = False,
-    ):
-        self._deterministic = deterministic
-        self._calls = []  # (policy, rows of the batch, their places in the tile, generators of the tile)
-        spare = np.random.default_rng(0)  # noise of unused rows, thrown away
-        for tile in np.unique(episodes // TILE):
-            for index in np.unique(assigned):
-                rows = np.flatnonzero((episodes // TILE == tile) & (assigned == index))
-                if not len(rows):
-                    continue
-                places = episodes[rows] % TILE
-                streams = [spare] * TILE
-                for row, place in zip(rows, places, strict=True):
-                    streams[place] = generators[row]
-                self._calls.append((policies[index], rows, places, streams))
-        self._tile = np.zeros((TILE, observation_size), np.float32)
-
-    def act(self, observations: np.ndarray, size: int, action_size: int) -> np.ndarray:
-        """(size, observation) -> (size, action) float32."""
-        actions = np.zeros((size, action_size), np.float32)
-        for policy, rows, places, streams in self._calls:
-            self._tile[:] = 0
-            self._tile[places] = observations[rows]
-            chosen = policy.act(self._tile, generators=streams, deterministic=self._deterministic)
-            actions[rows] = chosen[places]
-        return actions
+    Returns:
+      (size, action) float32.
+    """
+    actions = np.zeros((len(observations), action_size), np.float32)
+    for index in np.unique(assigned):
+        rows = np.flatnonzero(active & (assigned == index))
+        if len(rows):
+            streams = [generators[row] for row in rows]
+            actions[rows] = policies[index].act(observations[rows], streams, deterministic)
+    return actions
 
 
-@contextlib.contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """More threads gain nothing on a tile, wait for each other on a busy machine, and may round differently."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@one_torch_thread()
 def simulate(
     task: Task,
     policies: Sequence[Policy],
@@ -123,7 +90,7 @@ def simulate(
     seed: int,
     names: tuple[str, ...],
     *,
-    deterministic: bool = False,
+    deterministic: bool = True,
     goal_pairs: Sequence[tuple] | None = None,
     episodes_per_goal: int | None = None,
     threads: int = 1,
@@ -135,7 +102,7 @@ def simulate(
       policies: behaviour policies; episode i takes number i modulo their count.
       episodes: indices of the episodes.
       seed, names: the recipe's seed and the names of the streams (see `seeding`).
-      deterministic: mean actions instead of samples.
+      deterministic: mean actions; False draws samples (uniform random actions are always drawn).
       goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
       max_steps: agent steps at which an episode ends, if not the task's time limit.
     """
@@ -146,7 +113,6 @@ def simulate(
     }
     behaviour = (episodes % len(policies)).astype(np.int16)
     pair = np.full(size, -1, np.int16) if goal_pairs is None else (episodes // episodes_per_goal).astype(np.int16)
-    actor = TiledActor(policies, behaviour, episodes, streams["policy"], task.behaviour_size, deterministic)
     seconds = {"physics": 0.0, "policy": 0.0}
 
     started = time.perf_counter()
@@ -180,7 +146,8 @@ def simulate(
         if step == limit or not active.any():
             break
         started = time.perf_counter()
-        actions = actor.act(batch.behaviour_observation(), size, task.action_size)
+        seen = batch.behaviour_observation()
+        actions = _actions(policies, behaviour, streams["policy"], seen, active, task.action_size, deterministic)
         acted = time.perf_counter()
         result = batch.step(actions, active)
         seconds["policy"] += acted - started
