@@ -72,13 +72,15 @@ def test_one_command_sets_every_bundled_level_beside_the_paper():
 def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
     file = bundled_folder() / "walker-walk" / "medium.safetensors"
     (row,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--json"))
-    assert (row["task"], row["level"], row["mode"]) == ("walker-walk", "medium", "sampled")
+    assert (row["task"], row["level"], row["mode"]) == ("walker-walk", "medium", "mean")
     folder = json.loads(
         evaluated("walker-walk", "--behaviour", file.parent, "--level", "medium", "--episodes", 2, "--json")
     )
     assert folder[0]["returns"] == row["returns"]
-    table = evaluated("--behaviour", file, "--episodes", 2, "--deterministic")
-    assert "DMC-VB paper" in table and "deterministic actions" in table
+    table = evaluated("--behaviour", file, "--episodes", 2)
+    assert "DMC-VB paper" in table and "mean actions" in table
+    (drawn,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--sample", "--json"))
+    assert drawn["mode"] == "sampled" and drawn["returns"] != row["returns"]
 
 
 def test_a_folder_without_picks_says_what_to_run(tmp_path):

@@ -268,9 +268,9 @@ def with_policy(subset, **evaluation):
 def test_returns_unlike_the_policys_own_fail(release):
     subset = open_release(release)[NAME]
     assert not list(check_policy_returns(subset))
-    [finding] = check_policy_returns(with_policy(subset, mean=300.0, std=5.0))
+    [finding] = check_policy_returns(with_policy(subset, mean=300.0, std=5.0, mode="mean"))
     assert finding.check == "returns" and "its file says 300.0" in finding.message
-    assert not list(check_policy_returns(with_policy(subset, mode="deterministic")))  # not comparable
+    assert not list(check_policy_returns(with_policy(subset, mode="sampled")))  # not comparable
 
 
 def test_returns_unlike_the_papers_are_a_warning(release, small_release):

@@ -58,7 +58,7 @@ def check_policy_returns(subset: Subset) -> Iterator[Finding]:
     behaviour = subset.read("behaviour")
     for index, policy in enumerate(subset.record.policies):
         said, returns = policy.header.get("evaluation"), subset.returns[behaviour == index]
-        mode = "deterministic" if subset.record.deterministic else "sampled"
+        mode = "mean" if subset.record.deterministic else "sampled"
         if not said or not len(returns) or said["mode"] != mode:
             continue
         spread = max(said["std"], float(returns.std()))

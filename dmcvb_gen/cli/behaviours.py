@@ -74,9 +74,9 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes a pick.")
 @click.option("--seed", type=click.IntRange(0), default=20_000, show_default=True)
-@click.option("--deterministic", is_flag=True, help="Judge mean actions instead of sampled ones.")
+@click.option("--sample", is_flag=True, help="Judge drawn actions instead of mean ones.")
 @json_option
-def select_checkpoints(run, episodes, seed, deterministic, as_json):
+def select_checkpoints(run, episodes, seed, sample, as_json):
     """Pick the expert (95 %), medium (50 %) and mixed (0 to 50 %) checkpoints of a run.
 
     \b
@@ -85,7 +85,7 @@ def select_checkpoints(run, episodes, seed, deterministic, as_json):
     """
     from dmcvb_gen.behaviours.learning import selection as module
 
-    picked = module.select_checkpoints(run, episodes, seed, deterministic)
+    picked = module.select_checkpoints(run, episodes, seed, not sample)
     if as_json:
         return print_json(module.selection_json(picked))
     console = Console()
@@ -118,9 +118,9 @@ def select_checkpoints(run, episodes, seed, deterministic, as_json):
 @click.option("--behaviour", metavar="FILE|RUN", help="A policy file or a run's picks instead of the bundled ones.")
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
-@click.option("--deterministic", is_flag=True)
+@click.option("--sample", is_flag=True, help="Draw actions instead of taking mean ones.")
 @json_option
-def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, as_json):
+def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, as_json):
     """Returns of behaviour policies over fresh episodes, beside the paper's.
 
     Without TASK: every bundled policy, and random actions in its task; with --behaviour, that policy or run.
@@ -151,9 +151,9 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, deterministic, 
                 policies = [random_policy(task)]
             else:
                 policies = [load_policy(path, task) for path in resolve_policies(task_id, level, behaviour)]
-            out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=deterministic)
+            out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
-            row |= dict(mode="deterministic" if deterministic else "sampled", returns=return_statistics(out.returns))
+            row |= dict(mode="sampled" if sample else "mean", returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
             row |= {} if success is None else dict(success=success, speed=speed)
             rows.append(row | dict(paper=paper_returns(task_id, level)))

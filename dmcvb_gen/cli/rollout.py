@@ -43,7 +43,7 @@ def _out_default(name: str) -> Path:
 @click.option("--backgrounds", default="builtin", show_default=True, help="builtin, or a folder of videos.")
 @click.option("--split", type=click.Choice(["train", "val"]), default="train", help="Videos and styles: train or val.")
 @click.option("--behaviour", metavar="FILE|RUN", help="A policy file or training run, instead of the bundled one.")
-@click.option("--deterministic", is_flag=True, help="Mean actions instead of samples.")
+@click.option("--sample", is_flag=True, help="Draw actions instead of taking the policies' mean ones.")
 @click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
@@ -154,7 +154,7 @@ def _recipe_from_options(tasks, options):
         steps=options["steps"],
         episodes_per_shard=options["episodes_per_shard"],
         behaviour=options["behaviour"] and str(Path(options["behaviour"]).resolve()),
-        deterministic=options["deterministic"],
+        deterministic=not options["sample"],
         fixed_goals=options["fixed_goals"],
         episodes_per_goal=options["episodes_per_goal"],
         seed=options["seed"],

@@ -81,7 +81,7 @@ class SubsetPattern(_Model):
         ("visible", "hidden", "fixed").
       episodes, steps: how much of each subset; give one. Steps are for tasks of fixed length.
       policies: level -> policy file or run folder, where not the bundled ones.
-      deterministic: take the policy's mean action instead of a sample.
+      deterministic: take the policies' mean actions, as DMC-VB does; false draws samples. Level random is always drawn.
       fixed_goals, episodes_per_goal: for the setting "fixed" (benchmark B3).
     """
 
@@ -92,7 +92,7 @@ class SubsetPattern(_Model):
     steps: int | None = pydantic.Field(default=None, gt=0)
     episodes_per_shard: int | None = pydantic.Field(default=None, gt=0, le=1000)
     policies: dict[str, str] = {}
-    deterministic: bool = False
+    deterministic: bool = True
     fixed_goals: int = pydantic.Field(default=5, gt=0)
     episodes_per_goal: int = pydantic.Field(default=10, gt=0)
 
@@ -189,7 +189,7 @@ def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting:
         episodes=episodes,
         episodes_per_shard=min(shard, episodes),
         policy=pattern.policies.get(level),
-        deterministic=pattern.deterministic,
+        deterministic=pattern.deterministic and level != "random",
         episodes_per_goal=per_goal,
     )
 

@@ -232,7 +232,7 @@ def pick_checkpoints(
 
 
 def select_checkpoints(
-    folder: str | Path, episodes: int = 100, seed: int = 20_000, deterministic: bool = False
+    folder: str | Path, episodes: int = 100, seed: int = 20_000, deterministic: bool = True
 ) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
 
