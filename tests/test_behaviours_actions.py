@@ -9,6 +9,7 @@ from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.rollout.recipe import make_recipe
+from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import get_task
 
 
@@ -34,5 +35,7 @@ def test_mean_actions_are_taken_by_default_and_drawn_ones_scatter_around_them(ta
     default = simulate(task, [policy], range(3), 0, (task_id,), max_steps=3)
     assert (default.action == mean.action).all() and (drawn.action == again.action).all()
     first = mean.action[:, 0]
-    assert (policy.act(mean.state[:, 0][:, task.behaviour_indices], deterministic=True) == first).all()
+    batch = task.batch(3)
+    batch.reset([episode_stream(0, (task_id,), i, "initial_state") for i in range(3)])
+    assert (policy.act(batch.behaviour_observation(), deterministic=True) == first).all()
     assert 0.01 < abs(drawn.action[:, 0] - first).mean() < 1
