@@ -39,6 +39,8 @@ class GuidedSettings:
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       buffer_size: agent steps remembered.
       ahead: how far down the way the guide is shown where to go, meters.
+      mean_share: share of the simulations in which the student acts by its mean, as data are made: it learns what the
+        guide would do where its own mean stands still.
       guided_share: share of training episodes that the guide walks itself.
       least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
@@ -58,6 +60,7 @@ class GuidedSettings:
     buffer_size: Count = 400_000
     ahead: NonNegative = 2.0
     guided_share: Share = 0.2
+    mean_share: Share = 0.5
     least_std: Positive = 0.1
     train_episode_steps: Natural = 300
 
@@ -152,7 +155,9 @@ class GuidedRun(Run):
                 (own_mean, own_std), (mean, std) = student(torch.from_numpy(observation)), guide(shown)
                 walks = torch.from_numpy(guided)[:, None]
                 chosen = torch.where(walks, mean, own_mean), torch.where(walks, std, own_std)
-                action = torch.tanh(chosen[0] + chosen[1] * torch.randn_like(mean)).numpy()
+                noise = torch.randn_like(mean)
+                noise[: round(settings.mean_share * len(noise))] = 0
+                action = torch.tanh(chosen[0] + chosen[1] * noise).numpy()
             buffer.add(observation=observation, mean=mean.numpy(), std=std.numpy())
             result = episodes.batch.step(action)
             self.step += settings.simulations

@@ -43,6 +43,8 @@ class SacSettings:
         an evaluation). DMC-VB's own reward is flat in the whole goal cell.
       standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
         instead of the task's initial states; evaluations always start as the task does.
+      mean_share: share of the simulations that act by the mean, as data are made: a policy that only ever collects with
+        noise never sees the places where its mean stands still.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
       critics: how many critics.
       clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
@@ -71,6 +73,7 @@ class SacSettings:
     shaping: NonNegative = 0.0
     progress: NonNegative = 0.0
     standing_starts: Share = 0.0
+    mean_share: Share = 0.0
     train_episode_steps: Natural = 0
     buffer_size: Count = 1_000_000
     critics: Count = 2
@@ -311,10 +314,12 @@ class Sac:
         torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Sampled actions for collecting, (n, observation) -> (n, action) float32."""
+        """Actions for collecting, (n, observation) -> (n, action) float32: mean ones in the first rows, else sampled."""
         with torch.no_grad():
             mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
-            return torch.tanh(mean + std * torch.randn_like(mean)).numpy()
+            noise = torch.randn_like(mean)
+            noise[: round(self.settings.mean_share * len(noise))] = 0
+            return torch.tanh(mean + std * noise).numpy()
 
     def metrics(self) -> dict[str, float]:
         """Losses, policy entropy (nats) and temperature of the last update."""
