@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.guided import deepened, divergence
+from dmcvb_gen.behaviours.learning.guided import Imitation, deepened, divergence
 from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.training import open_run
@@ -75,8 +75,8 @@ def test_a_student_sees_the_goal_and_its_guide_the_way():
 def test_a_student_comes_nearer_to_its_guide(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
     run = open_run(tmp_path / "run", config(), False)
-    losses, update = [], run._update
-    run._update = lambda *args: losses.append(float(update(*args))) or torch.tensor(losses[-1])
+    losses, update = [], Imitation.update
+    monkeypatch.setattr(Imitation, "update", lambda *args: losses.append(update(*args)) or losses[-1])
     run.train()
     assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:20])
     header = read_header(next((tmp_path / "run" / "checkpoints").iterdir()))

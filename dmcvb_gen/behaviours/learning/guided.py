@@ -99,96 +99,139 @@ class GuidedRun(Run):
         return 0
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
-        settings, task, config = self.settings, self.task, self.config
-        torch.manual_seed(config.seed)
-        student = Actor(self.header)
-        student.load_state_dict(deepened(as_tensors(self.guide.weights), student.state_dict()))
-        guide = Actor(self.guide.header).requires_grad_(False)
-        guide.load_state_dict(as_tensors(self.guide.weights))
-        optimizer = torch.optim.Adam(student.parameters(), lr=settings.learning_rate, fused=True)
-        shapes = {"observation": (task.behaviour_size,), "mean": (task.action_size,), "std": (task.action_size,)}
-        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
-        buffer = RowBuffer(rows, shapes, self.folder / "resume")
-        rng = np.random.default_rng([config.seed, 0xB0FF])
-        owed, next_evaluation, updates, loss = 0.0, config.evaluate_every, 0, 0.0
+        settings, config = self.settings, self.config
+        learner, next_evaluation = Imitation(self), config.evaluate_every
         if saved:
-            if saved["guide"] != self.guide.digest:
-                raise DmcvbError(
-                    f"{self.folder} learned from another guide than the one that is here now; choose another --out"
-                )
-            student.load_state_dict(saved["student"])
-            optimizer.load_state_dict(saved["optimizer"])
-            torch.set_rng_state(saved["torch_rng"])
-            rng.bit_generator.state = json.loads(saved["rng"])
-            buffer.restore(**saved["buffer"])
-            owed, next_evaluation, updates = saved["owed"], saved["next_evaluation"], saved["updates"]
-        episodes = Episodes(self, rng)
+            learner.load_state(saved["learner"])
+            next_evaluation = saved["next_evaluation"]
+        episodes = Episodes(self, learner.rng)
         if saved:
             observation = episodes.restore(saved["episodes"])
-            guided = saved["guided"].numpy().copy()
         else:
             observation = episodes.start(np.arange(settings.simulations))
-            guided = rng.random(settings.simulations) < settings.guided_share
+            learner.choose_walkers(np.arange(settings.simulations))
         last_saved = self._started
 
         def save() -> None:
-            buffer.flush()
-            self.save(
-                {
-                    "guide": self.guide.digest,
-                    "student": student.state_dict(),
-                    "optimizer": optimizer.state_dict(),
-                    "torch_rng": torch.get_rng_state(),
-                    "rng": json.dumps(rng.bit_generator.state),
-                    "buffer": {"position": buffer.position, "full": buffer.full, "rows": buffer.size},
-                    "episodes": episodes.saved(observation),
-                    "guided": torch.from_numpy(guided.copy()),
-                    "owed": owed,
-                    "next_evaluation": next_evaluation,
-                    "updates": updates,
-                }
-            )
+            parts = {"learner": learner.state(), "episodes": episodes.saved(observation)}
+            self.save(parts | {"next_evaluation": next_evaluation})
 
         while self.step < config.steps:
-            shown = torch.from_numpy(episodes.batch.guided_observation(settings.ahead))
-            with torch.no_grad():
-                (own_mean, own_std), (mean, std) = student(torch.from_numpy(observation)), guide(shown)
-                walks = torch.from_numpy(guided)[:, None]
-                chosen = torch.where(walks, mean, own_mean), torch.where(walks, std, own_std)
-                noise = torch.randn_like(mean)
-                noise[: round(settings.mean_share * len(noise))] = 0
-                action = torch.tanh(chosen[0] + chosen[1] * noise).numpy()
-            buffer.add(observation=observation, mean=mean.numpy(), std=std.numpy())
+            action = learner.act(observation, episodes.batch.guided_observation(settings.ahead))
             result = episodes.batch.step(action)
             self.step += settings.simulations
             observation = episodes.restart_ended(episodes.batch.behaviour_observation(), result.terminated)
-            ended = episodes.elapsed == 0
-            guided[ended] = rng.random(ended.sum()) < settings.guided_share
-            if len(buffer) >= settings.batch_size:
-                owed += settings.updates_per_step * settings.simulations
-                rate = settings.learning_rate * 0.5 ** (self.step / settings.half_life)
-                optimizer.param_groups[0]["lr"] = rate
-            while owed >= 1:
-                loss = self._update(student, optimizer, buffer.sample(rng, settings.batch_size))
-                owed -= 1
-                updates += 1
+            learner.choose_walkers(np.flatnonzero(episodes.elapsed == 0))
+            learner.learn(self.step)
             tick(settings.simulations)
-            if self.step >= min(next_evaluation, self.config.steps):
-                progress = self.record(student.state_dict(), updates, {"divergence": float(loss)}, report)
+            if self.step >= min(next_evaluation, config.steps):
+                metrics = {"divergence": learner.loss}
+                progress = self.record(learner.student.state_dict(), learner.updates, metrics, report)
                 next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
                     last_saved = self._started
         save()
 
-    def _update(self, student: Actor, optimizer: torch.optim.Optimizer, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        loss = divergence(
-            batch["mean"], batch["std"].clamp(min=self.settings.least_std), *student(batch["observation"])
-        )
-        optimizer.zero_grad(set_to_none=True)
+
+class Imitation:
+    """A student beside its guide: it acts, notes what the guide would have done, and learns that.
+
+    Attributes:
+      updates: gradient updates so far.
+      loss: the last one's divergence, nats an action.
+    """
+
+    def __init__(self, run: GuidedRun):
+        self.run, self.settings = run, run.settings
+        task, config, settings = run.task, run.config, run.settings
+        torch.manual_seed(config.seed)
+        self.student = Actor(run.header)
+        self.student.load_state_dict(deepened(as_tensors(run.guide.weights), self.student.state_dict()))
+        self.guide = Actor(run.guide.header).requires_grad_(False)
+        self.guide.load_state_dict(as_tensors(run.guide.weights))
+        self.optimizer = torch.optim.Adam(self.student.parameters(), lr=settings.learning_rate, fused=True)
+        shapes = {"observation": (task.behaviour_size,), "mean": (task.action_size,), "std": (task.action_size,)}
+        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
+        self.buffer = RowBuffer(rows, shapes, run.folder / "resume")
+        self.rng = np.random.default_rng([config.seed, 0xB0FF])
+        self.guided = np.zeros(settings.simulations, bool)
+        self.owed, self.updates, self.loss = 0.0, 0, 0.0
+
+    def choose_walkers(self, ids: np.ndarray) -> None:
+        """Draw who walks in the new episodes of the simulations `ids`, the guide or the student."""
+        self.guided[ids] = self.rng.random(len(ids)) < self.settings.guided_share
+
+    def act(self, observation: np.ndarray, shown: np.ndarray) -> np.ndarray:
+        """Actions of whoever walks, (n, action) float32; what the guide would have done is noted.
+
+        Args:
+          observation: (n, observation), what the student sees.
+          shown: (n, observation), what the guide is shown.
+        """
+        with torch.no_grad():
+            own_mean, own_std = self.student(torch.from_numpy(observation))
+            mean, std = self.guide(torch.from_numpy(shown))
+            walks = torch.from_numpy(self.guided)[:, None]
+            noise = torch.randn_like(mean)
+            noise[: round(self.settings.mean_share * len(noise))] = 0
+            action = torch.tanh(torch.where(walks, mean, own_mean) + torch.where(walks, std, own_std) * noise)
+        self.buffer.add(observation=observation, mean=mean.numpy(), std=std.numpy())
+        return action.numpy()
+
+    def learn(self, step: int) -> None:
+        """The updates that a step of all simulations is worth."""
+        settings = self.settings
+        if len(self.buffer) < settings.batch_size:
+            return
+        self.optimizer.param_groups[0]["lr"] = settings.learning_rate * 0.5 ** (step / settings.half_life)
+        self.owed += settings.updates_per_step * settings.simulations
+        while self.owed >= 1:
+            self.loss = self.update(self.buffer.sample(self.rng, settings.batch_size))
+            self.owed -= 1
+            self.updates += 1
+
+    def update(self, batch: dict[str, torch.Tensor]) -> float:
+        """One gradient step; gives the divergence before it."""
+        std = batch["std"].clamp(min=self.settings.least_std)
+        loss = divergence(batch["mean"], std, *self.student(batch["observation"]))
+        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        optimizer.step()
-        return loss.detach()
+        self.optimizer.step()
+        return float(loss.detach())
+
+    def state(self) -> dict[str, Any]:
+        """Everything that learning goes on from."""
+        self.buffer.flush()
+        return {
+            "guide": self.run.guide.digest,
+            "student": self.student.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "torch_rng": torch.get_rng_state(),
+            "rng": json.dumps(self.rng.bit_generator.state),
+            "buffer": {"position": self.buffer.position, "full": self.buffer.full, "rows": self.buffer.size},
+            "guided": torch.from_numpy(self.guided.copy()),
+            "owed": self.owed,
+            "updates": self.updates,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from `state()`.
+
+        Raises:
+          DmcvbError: it learned from another guide.
+        """
+        if state["guide"] != self.run.guide.digest:
+            raise DmcvbError(
+                f"{self.run.folder} learned from another guide than the one that is here now; choose another --out"
+            )
+        self.student.load_state_dict(state["student"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        torch.set_rng_state(state["torch_rng"])
+        self.rng.bit_generator.state = json.loads(state["rng"])
+        self.buffer.restore(**state["buffer"])
+        self.guided = state["guided"].numpy().copy()
+        self.owed, self.updates = state["owed"], state["updates"]
 
 
 def deepened(weights: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
