@@ -314,7 +314,7 @@ class Sac:
         torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Actions for collecting, (n, observation) -> (n, action) float32: mean ones in the first rows, else sampled."""
+        """Actions for collecting, (n, observation) -> (n, action) float32: means in the first rows, samples below."""
         with torch.no_grad():
             mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
             noise = torch.randn_like(mean)
