@@ -17,13 +17,11 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.behaviours.policies.actor import random_policy
-from dmcvb_gen.behaviours.policies.simulate import simulate
-from dmcvb_gen.rollout.plan import Job, make_plan, renderer_for
+from dmcvb_gen.pool import ignore
+from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.rollout.recipe import make_recipe
-from dmcvb_gen.rollout.worker import exogenous_of, paint
+from dmcvb_gen.rollout.worker import painted_arrays, simulate_job
 from dmcvb_gen.store.schema import create_arrays, picture_spec
-from dmcvb_gen.tasks import get_task
 
 LAYOUTS = (
     "zstd",
@@ -41,19 +39,14 @@ CHUNKS = (8, 32, 128, 501)
 
 def pictures(task_id: str, setting: str, episodes: int) -> np.ndarray:
     """(episode, 501, 64, 64, 3) uint8."""
-    task = get_task(task_id)
     recipe = make_recipe(
         {
             "name": "bench",
             "subsets": [{"tasks": task_id, "levels": "random", "settings": setting, "episodes": episodes}],
         }
     )
-    job: Job = make_plan(recipe, tempfile.mkdtemp()).jobs[0]
-    record = job.subsets[0]
-    out = simulate(task, [random_policy(task)], range(episodes), 0, job.names)
-    renderer, backgrounds = renderer_for(record, "builtin", "train")
-    labels = exogenous_of(job, record, out.episodes, out.physics, out.length, backgrounds)
-    return next(paint(task, renderer, out.physics, labels, out.length, task.max_steps + 1))[1]
+    job = make_plan(recipe, tempfile.mkdtemp()).jobs[0]
+    return next(painted_arrays(job, job.subsets[0], simulate_job(job), ignore))[1]
 
 
 def measure(values: np.ndarray, layout: str, chunk: int) -> dict[str, float]:

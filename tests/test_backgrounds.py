@@ -174,7 +174,7 @@ def test_long_videos_count_with_their_first_frames_and_memory_is_bounded(tmp_pat
 
 def test_decoded_frames_and_their_digest_are_the_same_each_time():
     first = load_backgrounds("builtin", "val")
-    again = backgrounds_module.Backgrounds("builtin", "val", list(zip(first.names, first._files, strict=True)))
+    again = backgrounds_module.Backgrounds("builtin", "val", list(zip(first.names, first.files, strict=True)))
     assert again.digest == first.digest and again is not first
     assert not first.frames(0).flags.writeable  # nobody changes what others see
 

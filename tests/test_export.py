@@ -20,8 +20,8 @@ from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.release import export as package
 from dmcvb_gen.release.export import FORMATS, export, format_table
 from dmcvb_gen.release.import_tfds import import_tfds
-from dmcvb_gen.release.regenerate import check
-from dmcvb_gen.release.repaint import repaint
+from dmcvb_gen.release.regenerate import Regeneration
+from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
 
@@ -233,9 +233,9 @@ def test_dmc_vbs_folders_are_imported_whole(imported, episodes):
     assert verify(imported).sound
     assert next(release[NAME].batches(16))["pixels"].shape == (16, 9, 16, 16)
     with pytest.raises(StoreError, match="was imported"):
-        check(imported)
+        Regeneration(imported).check()
     with pytest.raises(StoreError, match="was imported"):
-        repaint(imported, imported.parent / "x", size=8)
+        repaint(Repainting(imported, imported.parent / "x", size=8))
 
 
 def test_damaged_or_foreign_folders_are_not_imported(exported, tmp_path):

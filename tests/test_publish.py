@@ -24,7 +24,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.release import transfer
 from dmcvb_gen.release.publish import CLAIM, INDEX, fetch, publish
-from dmcvb_gen.release.regenerate import check
+from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.remote import public, reason
@@ -189,7 +189,7 @@ def test_a_part_moves_only_its_shards_verifies_and_can_be_completed(s3, small_re
     assert shards == wanted and not any("static" in path or "none" in path for path in moved)
     release = dmcvb_gen.open(part)
     assert list(release.subsets) == [NAME] and list(release[NAME].episodes) == [2]
-    assert verify(part).sound and check(part, [NAME], (2, 3)).sound
+    assert verify(part).sound and Regeneration(part, [NAME], (2, 3)).check().sound
     assert not release.manifest.complete and release.manifest.lineage[0]["from"] == "s3://bucket/small"
     batch = next(release[NAME].batches(32))
     assert batch["pixels"].shape == (32, 9, 16, 16)

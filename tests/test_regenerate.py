@@ -12,9 +12,9 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.release.regenerate import check, remake, repair
-from dmcvb_gen.release.shards import chosen_shards, make_jobs
+from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
@@ -47,13 +47,14 @@ MAZE |= {"episodes": 3, "fixed_goals": 2, "episodes_per_goal": 2, "episodes_per_
 @pytest.mark.parametrize("pattern", [LOCOMOTION, MAZE], ids=["locomotion", "maze"])
 def test_the_jobs_are_those_of_the_rollout(tmp_path, pattern, trajectories):
     plan = make_plan(small_recipe(subsets=[pattern], trajectories=trajectories), tmp_path / "r")
-    jobs = make_jobs(plan.manifest, tmp_path / "r", chosen_shards(plan.manifest), tmp_path / "r")
+    inputs = release_inputs(tmp_path / "r", plan.manifest.subsets)
+    jobs = make_jobs(plan.manifest, chosen_shards(plan.manifest), tmp_path / "r", inputs)
     assert sorted(jobs, key=str) == sorted(plan.jobs, key=str) and jobs
 
 
 def test_a_part_of_a_release_comes_out_with_its_digests(small_release):
     before = stamps_of(small_release)
-    outcome = check(small_release, ["*/*/dynamic"], (2, 3))
+    outcome = Regeneration(small_release, ["*/*/dynamic"], (2, 3)).check()
     [shard] = outcome.shards
     assert outcome.sound and shard.equal and (shard.subset, shard.shard) == (NAME, 1)
     assert outcome.environment == {} and stamps_of(small_release) == before
@@ -62,7 +63,7 @@ def test_a_part_of_a_release_comes_out_with_its_digests(small_release):
 def test_nothing_but_the_manifest_is_needed(small_release, tmp_path):
     (tmp_path / "bare").mkdir()
     shutil.copy(small_release / "manifest.json", tmp_path / "bare")
-    outcome = repair(tmp_path / "bare")
+    outcome = Regeneration(tmp_path / "bare").repair()
     assert outcome.sound and len(outcome.shards) == 6
     assert files_of(tmp_path / "bare").keys() - {tmp_path / "bare/manifest.json"}
     for path, data in files_of(small_release).items():
@@ -79,7 +80,7 @@ def test_damaged_and_missing_shards_are_repaired_and_sound_ones_not_touched(copy
     (copy / state).unlink()
     (copy / commit_path("walker-walk/random/static", 1)).unlink()
     before = stamps_of(copy)
-    outcome = repair(copy)
+    outcome = Regeneration(copy).repair()
     assert outcome.sound and {(shard.subset.split("/")[-1], shard.shard) for shard in outcome.shards} == {
         ("dynamic", 1),
         ("none", 0),
@@ -99,13 +100,13 @@ def test_damaged_and_missing_shards_are_repaired_and_sound_ones_not_touched(copy
 def test_lost_metadata_is_put_back(copy):
     (copy / f"{NAME}.zarr/zarr.json").write_text("{")
     shutil.rmtree(copy / f"{NAME}.zarr/pixels")
-    assert repair(copy).sound and verify(copy).sound
-    assert repair(copy).shards == ()
+    assert Regeneration(copy).repair().sound and verify(copy).sound
+    assert Regeneration(copy).repair().shards == ()
 
 
 def test_a_release_keeps_its_own_codecs_when_the_code_has_new_ones(copy, monkeypatch):
     monkeypatch.setattr("dmcvb_gen.store.writer.picture_layout_for", lambda setting: "zstd-9")
-    assert check(copy, [NAME], (2, 3)).sound
+    assert Regeneration(copy, [NAME], (2, 3)).check().sound
 
 
 def change_actions(folder):
@@ -144,33 +145,33 @@ def test_a_shard_that_comes_out_otherwise_is_not_put_in(copy):
     pixels = next(file for file in open_release(copy)[NAME].commits[0].files if "/pixels/" in file.path).path
     (copy / pixels).write_bytes(b"rubbish")
     before = files_of(copy)
-    outcome = repair(copy)
+    outcome = Regeneration(copy).repair()
     assert not outcome.sound and [shard.repaired for shard in outcome.shards] == [False]
     assert files_of(copy) == before
 
 
 def test_beside_it_makes_an_equal_release(small_release, tmp_path):
-    outcome = remake(small_release, tmp_path / "beside", ["*/*/none"])
+    outcome = Regeneration(small_release, ["*/*/none"]).remake(tmp_path / "beside")
     assert outcome.sound and all(shard.equal for shard in outcome.shards)
     assert list(open_release(tmp_path / "beside").subsets) == ["walker-walk/random/none"]
     with pytest.raises(StoreError, match="leave --out away"):
-        remake(small_release, small_release)
+        Regeneration(small_release).remake(small_release)
 
 
 def test_bad_requests_say_what_to_do(small_release, tmp_path, copy):
     with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
-        check(small_release, ["cheetah-run"])
+        Regeneration(small_release, ["cheetah-run"]).check()
     with pytest.raises(StoreError, match="no subset has episodes 7:9"):
-        check(small_release, episodes=(7, 9))
+        Regeneration(small_release, episodes=(7, 9)).check()
     with pytest.raises(StoreError, match="holds no release"):
-        check(tmp_path)
+        Regeneration(tmp_path).check()
     with pytest.raises(StoreError, match="not those that.*--backgrounds"):
         data = json.loads((copy / "manifest.json").read_text())
         for subset in data["subsets"]:
             if subset["backgrounds"]:
                 subset["backgrounds"]["digest"] = "0" * 64
         (copy / "manifest.json").write_text(json.dumps(data))
-        check(copy, [NAME])
+        Regeneration(copy, [NAME]).check()
     data["schema_version"] = 99
     (copy / "manifest.json").write_text(json.dumps(data))
     result = CliRunner().invoke(main, ["regenerate", str(copy)])
@@ -182,4 +183,4 @@ def test_a_policy_that_is_nowhere_is_named(copy):
     data["subsets"][0]["policies"] = [{"name": "mine", "digest": "f" * 64, "path": "policies/mine.safetensors"}]
     (copy / "manifest.json").write_text(json.dumps(data))
     with pytest.raises(StoreError, match="policies/mine.safetensors"):
-        check(copy)
+        Regeneration(copy).check()

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from dmcvb_gen.behaviours.policies import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
-from dmcvb_gen.release.regenerate import check
-from dmcvb_gen.release.repaint import repaint
+from dmcvb_gen.release.regenerate import Regeneration
+from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.store import open_release
@@ -31,7 +31,7 @@ def no_simulation(monkeypatch):
 @pytest.fixture(scope="module")
 def dynamic(small_release, tmp_path_factory):
     out = tmp_path_factory.mktemp("repainted") / "r"
-    repaint(small_release, out, ["*/*/none"], distractor="dynamic")
+    repaint(Repainting(small_release, out, ["*/*/none"], distractor="dynamic"))
     return out
 
 
@@ -49,7 +49,8 @@ def test_a_repainted_subset_has_the_bytes_of_a_rolled_out_one(small_release, dyn
 
 def test_two_processes_paint_the_same_bytes_as_one(small_release, dynamic, tmp_path):
     ticks = []
-    repaint(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic", workers=2, tick=ticks.append)
+    request = Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic")
+    repaint(request, workers=2, tick=ticks.append)
     name = "walker-walk/random/dynamic"
     assert len(list((dynamic / "commits").rglob("*.json"))) > 1  # else one process does it all
     assert shard_bytes(tmp_path / "r", name) == shard_bytes(dynamic, name) != {}
@@ -57,7 +58,7 @@ def test_two_processes_paint_the_same_bytes_as_one(small_release, dynamic, tmp_p
 
 
 def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dynamic, small_release):
-    assert verify(dynamic).sound and check(dynamic, episodes=(2, 3)).sound
+    assert verify(dynamic).sound and Regeneration(dynamic, episodes=(2, 3)).check().sound
     manifest = open_release(dynamic).manifest
     [lineage] = manifest.lineage
     assert lineage["kind"] == "repaint" and lineage["from"] == "small 1.0.0" and len(lineage["manifest_sha256"]) == 64
@@ -66,7 +67,7 @@ def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dy
 
 
 def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, no_simulation):
-    repaint(small_release, tmp_path / "r", ["*/*/static"], size=24, labels=["depth", "segmentation"])
+    repaint(Repainting(small_release, tmp_path / "r", ["*/*/static"], size=24, labels=["depth", "segmentation"]))
     old, new = (open_release(folder)["walker-walk/random/static"] for folder in (small_release, tmp_path / "r"))
     assert new.read("pixels").shape == (3, 501, 24, 24, 3)
     for name in set(old.arrays) - {"pixels"}:
@@ -76,7 +77,7 @@ def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, n
     assert depth.max() > 1 and ((geoms >= 0) == (depth > 0)).mean() > 0.99 and len(np.unique(geoms)) > 3
     assert verify(tmp_path / "r").sound
     with pytest.raises(StoreError, match="depth and segmentation"):
-        check(tmp_path / "r")
+        Regeneration(tmp_path / "r").check()
 
 
 @pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")
@@ -94,21 +95,21 @@ def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
 def test_an_interrupted_repaint_goes_on(small_release, dynamic, tmp_path, no_simulation):
     shutil.copytree(dynamic, tmp_path / "r")
     (tmp_path / "r/commits/walker-walk/random/dynamic/00001.json").unlink()
-    manifest = repaint(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic")
+    manifest = repaint(Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic"))
     assert manifest.complete and manifest.subsets[0].digest == open_release(dynamic).manifest.subsets[0].digest
 
 
 def test_mistakes_are_refused_before_any_painting(small_release, tmp_path):
     with pytest.raises(RecipeError, match="both become walker-walk/random/static.*--only"):
-        repaint(small_release, tmp_path / "r", distractor="static")
+        repaint(Repainting(small_release, tmp_path / "r", distractor="static"))
     with pytest.raises(DmcvbError, match="8 to 1024"):
-        repaint(small_release, tmp_path / "r", size=4)
+        repaint(Repainting(small_release, tmp_path / "r", size=4))
     with pytest.raises(DmcvbError, match="warp"):
-        repaint(small_release, tmp_path / "r", renderer="povray")
+        repaint(Repainting(small_release, tmp_path / "r", renderer="povray"))
     with pytest.raises(DmcvbError, match="dynamic"):
-        repaint(small_release, tmp_path / "r", ["*/*/none"], distractor="blurry")
+        repaint(Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="blurry"))
     with pytest.raises(StoreError, match="the release itself"):
-        repaint(small_release, small_release)
+        repaint(Repainting(small_release, small_release))
     assert not (tmp_path / "r").exists()
 
 
@@ -121,4 +122,21 @@ def test_a_damaged_source_is_not_painted(small_release, tmp_path):
     data[100] ^= 255
     (tmp_path / "copy" / file.path).write_bytes(data)
     with pytest.raises(StoreError, match="does not have its digest; run `dmcvb-gen regenerate"):
-        repaint(tmp_path / "copy", tmp_path / "r", ["*/*/none"], size=8)
+        repaint(Repainting(tmp_path / "copy", tmp_path / "r", ["*/*/none"], size=8))
+
+
+MAZE = {"tasks": "ant-maze-empty7x7", "levels": "random", "settings": ["visible", "hidden"], "episodes": 2}
+
+
+def test_a_maze_repainted_for_evaluation_is_what_its_rollout_would_be(tmp_path):
+    recipe = {"subsets": [MAZE | {"max_steps": 3}], "size": 8}
+    roll_out(small_recipe(**recipe), tmp_path / "train")
+    wanted = roll_out(small_recipe(**recipe, split="val"), tmp_path / "wanted")
+    found = repaint(Repainting(tmp_path / "train", tmp_path / "val", split="val"))
+    assert [subset.digest for subset in found.subsets] == [subset.digest for subset in wanted.subsets]
+    assert {subset.split for subset in found.subsets} == {"val"} and found.recipe["split"] == "val"
+    assert found.lineage[-1]["new_labels"] == [subset.name for subset in found.subsets]
+    for folder, styles in (("train", {2, 3, 4, 5}), ("val", {1})):
+        for subset in open_release(tmp_path / folder).subsets.values():
+            assert set((subset.read("exogenous/style") // 100).ravel()) <= styles
+    assert verify(tmp_path / "val").sound and Regeneration(tmp_path / "val").check().sound

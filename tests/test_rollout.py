@@ -6,6 +6,7 @@ import json
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,13 +14,19 @@ import time
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from dmcvb_gen.behaviours.policies.actor import random_policy
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
 from dmcvb_gen.behaviours.policies.simulate import simulate
+from dmcvb_gen.cli import main
+from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
+from dmcvb_gen.names import LOCOMOTION, family_of
+from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.rollout.estimate import estimate
 from dmcvb_gen.rollout.plan import make_plan, prepare
-from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, select, shipped_recipes
+from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.store import open_release
 from dmcvb_gen.tasks import get_task
@@ -138,8 +145,6 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 
 
 def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, tmp_path):
-    import shutil
-
     from dmcvb_gen.rollout.executors import run_jobs
 
     copy = tmp_path / "copy"
@@ -168,8 +173,8 @@ def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path
     cost = estimate(make_plan(small_recipe(), tmp_path / "r"))
     release = open_release(small_release)
     assert cost.jobs == 2 and cost.episodes == 9 and cost.steps == 4500
-    actual = sum(subset.bytes for subset in release.subsets.values())
-    assert 0.4 * actual < cost.bytes < 2.5 * actual
+    for name, subset in release.subsets.items():
+        assert 0.75 * subset.bytes < subset.steps * cost.rates[name].bytes_per_step < 1.25 * subset.bytes
     assert all(1e-6 < rate.seconds_per_step < 1 for rate in cost.rates.values())
     assert not (tmp_path / "r").exists()
 
@@ -179,7 +184,7 @@ def test_shipped_recipes_expand_to_what_the_paper_has():
     mini = expand(load_recipe("dmcvb-mini"))
     assert len(mini) == 36 and all(request.episodes == 20 for request in mini)
     whole = expand(load_recipe("dmcvb-v1"))
-    locomotion = [request for request in whole if not request.task.startswith("ant-maze")]
+    locomotion = [request for request in whole if family_of(request.task) == LOCOMOTION]
     assert len(locomotion) == 36 and all(request.episodes * 500 == 1_000_000 for request in locomotion)
     assert len(whole) == 36 + 7 * 2 * 2 + 7
 
@@ -222,12 +227,88 @@ def test_subsets_that_make_no_sense_are_refused(tmp_path, changes, words):
         make_plan(make_recipe({"name": "x", "subsets": [pattern]}), tmp_path / "r")
 
 
-def test_patterns_select_and_unknown_ones_are_refused():
-    names = ["walker-walk/expert/none", "walker-walk/expert/static", "cheetah-run/random/none"]
-    assert select(names, ["walker-walk/*/static"]) == names[1:2]
-    assert select(names, ["walker-walk"]) == names[:2] and select(names, []) == names
-    with pytest.raises(UnknownNameError, match="walker-walk/expert/none"):
-        select(names, ["walker-walk/*/dynamic"])
+def test_a_recipe_is_narrowed_to_what_has_the_asked_names():
+    mini = load_recipe("dmcvb-mini")
+    part = narrow(mini, ["walker-walk"], ["expert", "random"], ["dynamic"])
+    names = [request.name for request in expand(part)]
+    assert names == ["walker-walk/expert/dynamic", "walker-walk/random/dynamic"]
+    mazes = expand(narrow(load_recipe("dmcvb-v1"), (), (), ["fixed"]))
+    assert len(mazes) == 7 and {request.setting for request in mazes} == {"fixed"}
+    with pytest.raises(UnknownNameError, match="task of recipe dmcvb-mini 'ant-maze-empty7x7'"):
+        narrow(mini, ["ant-maze-empty7x7"])
+    with pytest.raises(RecipeError, match="no subset that is walker-walk, visible at once"):
+        narrow(load_recipe("dmcvb-v1"), ["walker-walk"], (), ["visible"])
+
+
+def test_a_recipe_takes_other_values_and_none_is_dropped():
+    mini = load_recipe("dmcvb-mini")
+    other = override(mini, episodes=5, seed=7, size=32, max_steps=50, deterministic=True)
+    assert other.seed == 7 and other.size == 32
+    for request in expand(other):
+        assert (
+            request.episodes == 5 and request.max_steps == 50 and request.deterministic == (request.level != "random")
+        )
+    whole = narrow(load_recipe("dmcvb-v1"), (), (), ["none"])
+    assert {request.episodes for request in expand(override(whole, episodes=3))} == {3}
+    with pytest.raises(RecipeError, match="--fixed-goals means nothing"):
+        override(mini, fixed_goals=2)
+    with pytest.raises(RecipeError, match="--episodes means nothing for fixed goals"):
+        override(load_recipe("dmcvb-v1"), episodes=3)
+    with pytest.raises(RecipeError, match="--behaviour needs one task"):
+        override(mini, behaviour="x")
+
+
+RECIPE = ["rollout", "--recipe", "dmcvb-mini", "walker-walk", "--level", "random", "--distractor", "none"]
+
+
+def test_options_beside_a_recipe_are_heard(tmp_path):
+    changes = ["--episodes", "1", "--seed", "7", "--size", "8", "--max-steps", "3", "--samples", "1"]
+    result = CliRunner().invoke(main, [*RECIPE, *changes, "--out", str(tmp_path / "r"), "--json"])
+    assert result.exit_code == 0, result.output
+    manifest = open_release(tmp_path / "r").manifest
+    assert [subset.name for subset in manifest.subsets] == ["walker-walk/random/none"] and manifest.complete
+    subset = manifest.subsets[0]
+    assert (subset.episodes, subset.size, subset.max_steps, manifest.recipe["seed"]) == (1, 8, 3, 7)
+    assert open_release(tmp_path / "r")[subset.name].read("state").shape[1] == 4
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (["--difficulty", "hard"], "--difficulty"),
+        (["--reward", "geodesic"], "--reward"),
+        (["--layout", "empty7x7"], "--layout"),
+        (["--goal", "visible"], "visible"),
+        (["--fixed-goals", "3"], "--fixed-goals"),
+        (["--episodes", "3", "--steps", "100"], "not both"),
+        (["--behaviour", "x"], "--behaviour"),
+        (["--out", "s3://bucket/name"], "is a URL"),
+    ],
+)
+def test_options_that_mean_nothing_beside_a_recipe_are_refused_by_name(tmp_path, monkeypatch, options, words):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(main, ["rollout", "--recipe", "dmcvb-mini", "--dry-run", *options])
+    assert result.exit_code == 2 and words in result.output + result.stderr and not list(tmp_path.iterdir())
+
+
+def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_this_machine(tmp_path):
+    shutil.copytree(builtin_folder(), tmp_path / "mine/videos")
+    policy = bundled_policies("walker-walk", "expert")[0]
+    shutil.copy(policy, tmp_path / "mine/own.safetensors")
+    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "dynamic", "episodes": 1, "max_steps": 3}
+    pattern["policies"] = {"expert": str(tmp_path / "mine/own.safetensors")}
+    recipe = small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "mine/videos"), size=8)
+    manifest = roll_out(recipe, tmp_path / "r")
+    shutil.rmtree(tmp_path / "mine")
+    assert str(tmp_path) not in (tmp_path / "r/manifest.json").read_text()
+    outcome = Regeneration(tmp_path / "r").check()
+    assert outcome.sound and [shard.equal for shard in outcome.shards] == [True]
+    [subset] = manifest.subsets
+    copies = load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "train")
+    assert copies.digest == load_backgrounds("builtin", "train").digest == subset.backgrounds["digest"]
+    assert load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "val").digest == (
+        load_backgrounds("builtin", "val").digest
+    )
 
 
 def test_the_manifest_names_everything_needed_to_make_it_again(small_release):

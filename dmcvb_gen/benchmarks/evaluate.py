@@ -20,7 +20,8 @@ from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.distractors import ExogenousWalk, load_backgrounds
 from dmcvb_gen.names import distractor_of
 from dmcvb_gen.release.verify import is_imported
-from dmcvb_gen.rollout.plan import renderer_for
+from dmcvb_gen.rollout.jobs import video_source
+from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.rollout.recipe import RendererChoice
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store import Subset
@@ -84,13 +85,8 @@ def protocol(
     if pictures:
         facts |= {"size": subset.record.size, "renderer": _renderer_choice(subset), "backgrounds": None}
         if distractor_of(subset.task, subset.setting).kind != "none":
-            facts["backgrounds"] = load_backgrounds(_video_source(subset, backgrounds), SPLIT).digest
+            facts["backgrounds"] = load_backgrounds(video_source(subset.root, subset.record, backgrounds), SPLIT).digest
     return facts
-
-
-def _video_source(subset: Subset, backgrounds: str | None) -> str:
-    recorded = subset.record.backgrounds
-    return backgrounds or (recorded["source"] if recorded else "builtin")
 
 
 def _renderer_choice(subset: Subset) -> dict[str, Any]:
@@ -154,7 +150,7 @@ class Evaluator:
         self.device, self.normalization, self.stack = torch.device(device), normalization, stack
         self.pair, self.renderer = pair, None
         if pixels:
-            choice, source = _renderer_choice(subset), _video_source(subset, backgrounds)
+            choice, source = _renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
             on = "cuda" if self.device.type == "cuda" and choice["name"] == "warp" else "cpu"
             self.renderer, self._videos = renderer_for(subset.record, source, SPLIT, on, **choice)
             if hasattr(self.renderer, "worlds"):

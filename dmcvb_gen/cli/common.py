@@ -1,8 +1,9 @@
-"""What the commands share: the --json option and the tables."""
+"""What the commands share: the --json option, folders and tables."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import click
@@ -17,6 +18,25 @@ def print_json(value: Any) -> None:
 
 def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def local_folder(given: str) -> Path:
+    """A folder of this machine.
+
+    Raises:
+      click.UsageError: it is a URL, which the command cannot write to.
+    """
+    if "://" in given:
+        raise click.UsageError(
+            f"--out {given} is a URL and this command writes to folders; make the release in a folder, then "
+            "`dmcvb-gen publish FOLDER URL`."
+        )
+    return Path(given)
+
+
+def background_source(given: str) -> str:
+    """--backgrounds as a recipe has it: "builtin", or an absolute folder."""
+    return given if given == "builtin" else str(Path(given).resolve())
 
 
 def format_bytes(count: float) -> str:

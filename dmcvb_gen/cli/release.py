@@ -7,7 +7,7 @@ import dataclasses
 import click
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import format_bytes, json_option, print_json
+from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json
 
 
 @click.command()
@@ -83,17 +83,13 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
     dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
     dmcvb-gen regenerate releases/mini
     """
-    from dmcvb_gen.release import regenerate as work
+    from dmcvb_gen.release.regenerate import Regeneration
 
     if check and out:
         raise click.UsageError("Give --check or --out, not both.")
-    arguments = dict(only=only, episodes=episodes, backgrounds=backgrounds, device=device, workers=workers)
+    work = Regeneration(path, only, episodes, backgrounds, device, workers)
     with frames_bar(as_json) as bar:
-        arguments["tick"] = bar.update
-        if out:
-            outcome = work.remake(path, out, **arguments)
-        else:
-            outcome = (work.check if check else work.repair)(path, **arguments)
+        outcome = work.remake(out, bar.update) if out else (work.check if check else work.repair)(bar.update)
     if as_json:
         print_json(
             {
@@ -131,19 +127,19 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
 @click.option("--out", type=click.Path(), required=True, help="Folder of the new release.")
 @workers_option
 @json_option
-def repaint(path, out, as_json, backgrounds, **options):
+def repaint(path, out, as_json, backgrounds, workers, **options):
     """Give episodes new pixels, from their stored physics states: nothing is simulated.
 
     \b
     dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\
         --out releases/mini84
     """
-    from dmcvb_gen.cli.rollout import _background_source
+    from dmcvb_gen.release.repaint import Repainting
     from dmcvb_gen.release.repaint import repaint as run
 
-    backgrounds = backgrounds and _background_source(backgrounds)
+    request = Repainting(path, local_folder(out), backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
-        manifest = run(path, out, backgrounds=backgrounds, tick=bar.update, **options)
+        manifest = run(request, workers, bar.update)
     if as_json:
         return print_json({"out": out, "complete": manifest.complete, "subsets": [s.name for s in manifest.subsets]})
     for subset in manifest.subsets:

@@ -7,15 +7,17 @@ import time
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import format_bytes, json_option, print_json
+from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json
+from dmcvb_gen.names import ANT_MAZE, DIFFICULTIES, FIXED, SPLITS, DistractorSetting, family_of, task_folder
 
 
-def _out_default(name: str) -> Path:
-    return Path("releases") / name
+def _out_default(name: str) -> str:
+    return str(Path("releases") / name)
 
 
 @click.command()
@@ -24,7 +26,7 @@ def _out_default(name: str) -> Path:
 @click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/*/static'.")
 @click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
 @click.option("--distractor", "settings", multiple=True, help="none, static, dynamic. Repeatable.  [default: none]")
-@click.option("--difficulty", type=click.Choice(["easy", "medium", "hard"]), default="medium", show_default=True)
+@click.option("--difficulty", type=click.Choice(DIFFICULTIES), default="medium", show_default=True)
 @click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
 @click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
 @click.option("--episodes-per-goal", type=click.IntRange(1), default=10, show_default=True, help="With --fixed-goals.")
@@ -32,6 +34,7 @@ def _out_default(name: str) -> Path:
 @click.option("--reward", type=click.Choice(["saturated", "geodesic"]), help="Mazes: DMC-VB's distance, or the path's.")
 @click.option("--episodes", type=click.IntRange(1), help="Episodes a subset.  [default: 20]")
 @click.option("--steps", type=click.IntRange(1), help="Steps a subset, instead of --episodes.")
+@click.option("--max-steps", type=click.IntRange(1), help="Time limit of an episode.  [default: 500, mazes 600]")
 @click.option("--range", "episode_range", metavar="A:B", help="Only the shards that hold episodes A to B - 1.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
@@ -41,19 +44,21 @@ def _out_default(name: str) -> Path:
 )
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
 @click.option("--backgrounds", default="builtin", show_default=True, help="builtin, or a folder of videos.")
-@click.option("--split", type=click.Choice(["train", "val"]), default="train", help="Videos and styles: train or val.")
+@click.option("--split", type=click.Choice(SPLITS), default="train", help="Videos and styles: train or val.")
 @click.option("--behaviour", metavar="FILE|RUN", help="A policy file or training run, instead of the bundled one.")
 @click.option("--sample", is_flag=True, help="Draw actions instead of taking the policies' mean ones.")
 @click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
-@click.option("--out", type=click.Path(path_type=Path), help="The release's folder.  [default: releases/NAME]")
+@click.option("--out", help="The release's folder.  [default: releases/NAME]")
 @click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
 @json_option
-def rollout(tasks, recipe, only, episode_range, out, workers, device, dry_run, as_json, **options):
+@click.pass_context
+def rollout(context, only, episode_range, out, workers, device, dry_run, as_json, **options):
     """Roll out behaviour policies into a release of painted episodes.
 
-    The same command goes on where it stopped: what is committed is kept.
+    The same command goes on where it stopped: what is committed is kept. With --recipe, TASKs, --level, --distractor
+    and --goal keep a part of the recipe, and other options take the place of its values.
 
     \b
     dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8
@@ -62,47 +67,49 @@ def rollout(tasks, recipe, only, episode_range, out, workers, device, dry_run, a
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
     from dmcvb_gen.rollout.estimate import estimate, raw_bytes
-    from dmcvb_gen.rollout.executors import run_jobs
-    from dmcvb_gen.rollout.plan import finish, make_plan, prepare
-    from dmcvb_gen.rollout.recipe import load_recipe
+    from dmcvb_gen.rollout.plan import make_plan, prepare
 
-    if bool(recipe) == bool(tasks or options["layouts"]):
-        raise click.UsageError("Give TASKs or --recipe (one of them); `dmcvb-gen list` shows the tasks and recipes.")
-    chosen = load_recipe(recipe) if recipe else _recipe_from_options(tasks, options)
-    out = out or _out_default(chosen.name)
+    chosen = _recipe(context, options)
+    out = local_folder(out or _out_default(chosen.name))
     plan = make_plan(chosen, out, only, device, parse_range(episode_range))
     if dry_run:
         return _show_plan(plan, estimate(plan), workers, as_json)
-    prepared = prepare(plan, raw_bytes(plan))
+    _run(prepare(plan, raw_bytes(plan)), workers, as_json)
+
+
+def _run(plan, workers, as_json):
+    from dmcvb_gen.rollout.executors import run_jobs
+    from dmcvb_gen.rollout.plan import finish
+
     started, steps, seconds = time.time(), 0, {}
-    with _told_when_stopped(), _progress(prepared, as_json) as bar:
+    with _told_when_stopped(), _progress(plan, as_json) as bar:
         finished = 0
-        for result in run_jobs(prepared.jobs, workers, bar.update):
+        for result in run_jobs(plan.jobs, workers, bar.update):
             finished += sum(commit.episodes[1] - commit.episodes[0] for commit in result.commits)
             steps += result.steps
             for part, value in result.seconds.items():
                 seconds[part] = seconds.get(part, 0.0) + value
-            bar.set_postfix_str(f"{finished}/{prepared.episodes} episodes", refresh=False)
-    manifest = finish(prepared)
+            bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
+    manifest = finish(plan)
     elapsed = time.time() - started
     if as_json:
         print_json(
             dict(
-                out=str(out),
+                out=str(plan.root),
                 complete=manifest.complete,
                 steps=steps,
                 seconds=round(elapsed, 2),
                 seconds_by_part={part: round(value, 2) for part, value in seconds.items()},
-                already_done=prepared.done,
+                already_done=plan.done,
                 digests={subset.name: subset.digest for subset in manifest.subsets},
             )
         )
         return
     state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
-    kept = f", {prepared.done} shards were there already" if prepared.done else ""
+    kept = f", {plan.done} shards were there already" if plan.done else ""
     rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
-    click.echo(f"{out}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
-    click.echo(f"Look at it: dmcvb-gen info {out}; dmcvb-gen preview {out}")
+    click.echo(f"{plan.root}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
+    click.echo(f"Look at it: dmcvb-gen info {plan.root}; dmcvb-gen preview {plan.root}")
 
 
 def parse_range(text: str | None) -> tuple[int, int] | None:
@@ -119,22 +126,75 @@ def parse_range(text: str | None) -> tuple[int, int] | None:
     return int(first), int(last)
 
 
-def _recipe_from_options(tasks, options):
-    from dmcvb_gen.distractors.base import DistractorSetting
-    from dmcvb_gen.rollout.plan import single_recipe
-    from dmcvb_gen.rollout.recipe import is_maze, task_folder
+def _recipe(context, options):
+    """The recipe that a command line asks for."""
+    from dmcvb_gen.rollout.recipe import load_recipe
 
-    tasks = (*tasks, *(_layout_task(layout) for layout in options["layouts"]))
+    tasks = (*options["tasks"], *(_layout_task(layout) for layout in options["layouts"]))
+    if not options["recipe"] and not tasks:
+        raise click.UsageError("Give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes.")
+    if options["steps"] and options["episodes"]:
+        raise click.UsageError("Give --episodes or --steps, not both.")
+    given = {name for name in options if context.get_parameter_source(name) == ParameterSource.COMMANDLINE}
+    if options["recipe"]:
+        return _changed_recipe(load_recipe(options["recipe"]), tasks, options, given)
+    return _recipe_from_options(tasks, options)
+
+
+NOT_WITH_RECIPE = {
+    "layouts": "--layout: name the maze by its TASK",
+    "reward": "--reward: ask for 'ant-maze-...@geodesic' in the recipe",
+    "difficulty": "--difficulty: ask for --distractor dynamic_hard",
+}
+
+
+def _changed_recipe(recipe, tasks, options, given):
+    """A recipe, narrowed and overridden by the options that were given beside it; none goes unheard."""
+    from dmcvb_gen.rollout.recipe import narrow, override
+
+    for name, cure in NOT_WITH_RECIPE.items():
+        if name in given:
+            raise click.UsageError(f"--recipe takes no {cure} instead.")
+    settings = [DistractorSetting.parse(name).name for name in options["settings"]] + list(options["goals"])
+    if tasks or options["levels"] or settings:
+        recipe = narrow(recipe, tasks, options["levels"], settings)
+    changes = {name: options[name] for name in given & _OVERRIDES}
+    changes |= {name: value for name, value in _translated(options).items() if name in given}
+    if "renderer" in given or "samples" in given:
+        old = recipe.renderer
+        backend = options["renderer"] if "renderer" in given else old.backend
+        kept = old.samples if backend == old.backend else None
+        changes["renderer"] = {"backend": backend, "samples": options["samples"] if "samples" in given else kept}
+    if "sample" in given:
+        changes["deterministic"] = False
+    if "independent" in given:
+        changes["trajectories"] = "independent"
+    return override(recipe, **changes) if changes else recipe
+
+
+_OVERRIDES = {"episodes", "steps", "max_steps", "episodes_per_shard"}
+_OVERRIDES |= {"fixed_goals", "episodes_per_goal", "seed", "size", "split"}
+
+
+def _translated(options):
+    """Places of files as the recipe has them."""
+    behaviour = options["behaviour"] and str(Path(options["behaviour"]).resolve())
+    return {"behaviour": behaviour, "backgrounds": background_source(options["backgrounds"])}
+
+
+def _recipe_from_options(tasks, options):
+    from dmcvb_gen.rollout.recipe import single_recipe
+
     if options["reward"] == "geodesic":
-        tasks = tuple(f"{task}@geodesic" if is_maze(task) else task for task in tasks)
+        tasks = tuple(f"{task}@geodesic" if family_of(task) == ANT_MAZE else task for task in tasks)
     levels = options["levels"] or ("random",)
-    mazes = [task for task in tasks if is_maze(task)]
-    if mazes and len(mazes) < len(tasks):
+    families = {family_of(task) for task in tasks}
+    if len(families) > 1:
         raise click.UsageError("Mazes and locomotion tasks take different settings; roll them out by a --recipe.")
-    if mazes:
+    if families == {ANT_MAZE}:
         if options["settings"]:
             raise click.UsageError("Mazes vary in style, not by --distractor; use --goal visible|hidden.")
-        settings = ("fixed",) if options["fixed_goals"] else options["goals"] or None
+        settings = (FIXED,) if options["fixed_goals"] else options["goals"] or None
     else:
         if options["goals"] or options["fixed_goals"]:
             raise click.UsageError("--goal and --fixed-goals are for ant-maze tasks.")
@@ -143,31 +203,25 @@ def _recipe_from_options(tasks, options):
             name if "_" in name else DistractorSetting(name, difficulty).name
             for name in options["settings"] or ("none",)
         ]
-    episodes = options["episodes"] or (None if options["steps"] else 20)
+    subset_fields = {name: options[name] for name in ("steps", "episodes_per_shard", "max_steps")}
+    subset_fields["episodes"] = options["episodes"] or (None if options["steps"] else 20)
+    subset_fields["deterministic"] = not options["sample"]
     name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))
     return single_recipe(
         tasks,
         levels,
         settings,
         name=name[:80].rstrip("-."),
-        episodes=episodes,
-        steps=options["steps"],
-        episodes_per_shard=options["episodes_per_shard"],
-        behaviour=options["behaviour"] and str(Path(options["behaviour"]).resolve()),
-        deterministic=not options["sample"],
+        subset_fields=subset_fields,
         fixed_goals=options["fixed_goals"],
         episodes_per_goal=options["episodes_per_goal"],
         seed=options["seed"],
         size=options["size"],
         renderer={"backend": options["renderer"], "samples": options["samples"]},
         trajectories="independent" if options["independent"] else "shared",
-        backgrounds=_background_source(options["backgrounds"]),
         split=options["split"],
+        **_translated(options),
     )
-
-
-def _background_source(given: str) -> str:
-    return given if given == "builtin" else str(Path(given).resolve())
 
 
 def _layout_task(layout: str) -> str:
@@ -202,7 +256,11 @@ def _show_plan(plan, cost, workers, as_json):
     cores = os.cpu_count() or 1
     if as_json:
         rates = {
-            name: dict(steps_per_second=1 / rate.seconds_per_step, bytes_per_step=rate.bytes_per_step)
+            name: dict(
+                steps_per_second=1 / rate.seconds_per_step,
+                bytes_per_step=rate.bytes_per_step,
+                steps_per_episode=rate.steps_per_episode,
+            )
             for name, rate in cost.rates.items()
         }
         print_json(
@@ -226,15 +284,15 @@ def _show_plan(plan, cost, workers, as_json):
     rows: dict[str, list[float]] = {}
     for job in plan.jobs:
         for record in job.subsets:
-            rate = cost.rates[f"{record.task}/{record.setting}"]
-            steps = job.frames // len(job.subsets)
-            row = rows.setdefault(record.name, [0, 0, 0.0, 0.0])
+            rate = cost.rates[record.name]
+            steps = len(job.episodes) * rate.steps_per_episode
+            row = rows.setdefault(record.name, [0, 0.0, 0.0, 0.0])
             row[0] += len(job.episodes)
             row[1] += steps
             row[2] += steps * rate.bytes_per_step
             row[3] += steps * rate.seconds_per_step / 3600
     for name, (episodes, steps, size, hours) in rows.items():
-        table.add_row(name, f"{episodes:,}", f"{steps:,}", format_bytes(size), f"{hours:.2f}")
+        table.add_row(name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
     console = Console()
     console.print(table)
     console.print(

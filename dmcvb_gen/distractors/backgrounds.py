@@ -46,6 +46,7 @@ class Backgrounds:
       source: "builtin" or the folder.
       split: "train" or "val".
       names: of the videos, in order.
+      files: of each video, in order: one, or a picture a frame.
       lengths: frames of each video.
       digest: SHA-256 over the decoded frames of all videos.
 
@@ -56,7 +57,7 @@ class Backgrounds:
     def __init__(self, source: str, split: str, videos: list[tuple[str, tuple[Path, ...]]]):
         self.source, self.split = source, split
         self.names = tuple(name for name, _ in videos)
-        self._files = tuple(files for _, files in videos)
+        self.files = tuple(files for _, files in videos)
         self._decoded: OrderedDict[int, np.ndarray] = OrderedDict()
         lengths, digest = [], hashlib.sha256()
         for video in range(len(self)):
@@ -78,7 +79,7 @@ class Backgrounds:
           BackgroundError: a file cannot be read.
         """
         if video not in self._decoded:
-            self._decoded[video] = _decode(self._files[video])
+            self._decoded[video] = _decode(self.files[video])
             held = sum(frames.nbytes for frames in self._decoded.values())
             while held > CACHE_BYTES and len(self._decoded) > 1:
                 held -= self._decoded.popitem(last=False)[1].nbytes

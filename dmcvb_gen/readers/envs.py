@@ -22,7 +22,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.names import ANT_MAZE, FIXED, VISIBLE, distractor_of, hides_goal, normalize_setting
 from dmcvb_gen.rendering import make_renderer
-from dmcvb_gen.rollout.plan import check_renderer
+from dmcvb_gen.rollout.painting import check_renderer
 from dmcvb_gen.rollout.recipe import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store.pictures import Pictures

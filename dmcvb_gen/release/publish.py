@@ -19,7 +19,6 @@ import pydantic
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.regenerate import load_manifest
-from dmcvb_gen.release.shards import ShardKey, chosen_shards
 from dmcvb_gen.release.transfer import (
     OBJECT_STORES,
     download,
@@ -28,6 +27,7 @@ from dmcvb_gen.release.transfer import (
     retry,
     upload,
 )
+from dmcvb_gen.rollout.jobs import ShardKey, chosen_shards
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,

@@ -1,7 +1,8 @@
 """Making a release's shards again from its manifest alone: to check them, to repair them, or beside.
 
-`check` compares digests and says how far and why they differ; `repair` puts back what is damaged or missing and
-takes only shards that came out with the very bytes that the manifest promises; `remake` writes a release beside.
+`Regeneration.check` compares digests and says how far and why they differ; `repair` puts back what is damaged or
+missing and takes only shards that came out with the very bytes that the manifest promises; `remake` writes a release
+beside.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,24 +18,16 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import folder_in_the_making, remove_partial
+from dmcvb_gen.files import copy_file, folder_in_the_making, remove_partial, write_json
 from dmcvb_gen.pool import Tick, ignore
-from dmcvb_gen.release.shards import ShardKey, chosen_shards, damage, make_jobs, read_commit
+from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.plan import Job, subset_attributes
-from dmcvb_gen.store.manifest import (
-    MANIFEST,
-    CommitRecord,
-    Manifest,
-    SubsetRecord,
-    environment,
-    parse_manifest,
-    write_json_atomically,
-)
+from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs, release_inputs
+from dmcvb_gen.rollout.plan import copy_inputs, create_groups
+from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment, parse_manifest
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     commit_path,
-    create_subset,
     find_array,
     finish_release,
     read_commits,
@@ -155,17 +147,188 @@ def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
     return root, parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
 
 
-def create_groups(root: Path, manifest: Manifest, records: Sequence[SubsetRecord]) -> None:
-    """Create the (empty) Zarr groups of subsets."""
-    for record in records:
-        task = get_task(record.task)
-        create_subset(
-            root,
-            record,
-            array_specs(EpisodeShape.of(task), record.size),
-            task.max_steps + 1,
-            subset_attributes(record, manifest),
-        )
+@dataclass(frozen=True)
+class Regeneration:
+    """Which shards of a release to make again, and how.
+
+    Attributes:
+      root: the release's folder.
+      only, episodes: subset patterns and (first, last + 1): the shards that hold any of them; all by default.
+      backgrounds: where the videos are now, if they moved.
+      device: paint there instead of where the manifest says.
+      workers: processes.
+    """
+
+    root: str | Path
+    only: Sequence[str] = ()
+    episodes: tuple[int, int] | None = None
+    backgrounds: str | None = None
+    device: str | None = None
+    workers: int = 1
+
+    def check(self, tick: Tick = ignore) -> Outcome:
+        """Make shards again and compare their digests with the release; the release is not changed.
+
+        Raises:
+          DmcvbError: the shards cannot be made here (policy, backgrounds or renderer missing).
+        """
+        root, manifest = load_manifest(self.root)
+        shards = chosen_shards(manifest, self.only, self.episodes)
+        outcomes, held = [], Held(root)
+        with _Workshop(root, manifest, _unique(shards.values())) as folder:
+            for commit in self._make(manifest, shards, folder, tick):
+                record = shards[commit.subset, commit.shard]
+                promised = read_commit(root, record, commit.shard)
+                held.add(commit)
+                equal = None if promised is None else promised.same_data(commit)
+                outcomes.append(_outcome(root, folder, record, commit, damage(root, record, commit.shard), equal))
+                for file in commit.files:
+                    (folder / file.path).unlink(missing_ok=True)  # a checked shard needs no room
+        outcomes = [
+            replace(outcome, equal=held.equal(shards[outcome.subset, outcome.shard]))
+            if outcome.equal is None
+            else outcome
+            for outcome in outcomes
+        ]
+        return Outcome(tuple(outcomes), environment_difference(manifest))
+
+    def repair(self, tick: Tick = ignore) -> Outcome:
+        """Make damaged and missing shards again, in place; sound ones are not touched.
+
+        A shard is taken only if it has the bytes that its commit record (or the subset's digest) promises; where the
+        manifest promises nothing yet, because the release was never finished, it is taken as it is.
+
+        Raises: see `check`.
+        """
+        root, manifest = load_manifest(self.root)
+        wanted = chosen_shards(manifest, self.only, self.episodes)
+        shards = {key: record for key, record in wanted.items() if damage(root, record, key[1]) is not None}
+        records = _unique(chosen_shards(manifest, self.only).values())
+        with _Workshop(root, manifest, records) as folder:
+            for record in records:
+                _restore_metadata(root, folder, record)
+            outcomes = self._repair(root, manifest, shards, folder, tick)
+        if not manifest.complete and any(outcome.repaired for outcome in outcomes):
+            finish_release(root, manifest)
+        return Outcome(tuple(outcomes), environment_difference(manifest))
+
+    def _repair(self, root, manifest, shards, folder, tick) -> list[ShardOutcome]:
+        outcomes, held = [], Held(root)
+        waiting: list[tuple[SubsetRecord, CommitRecord, str | None]] = []
+
+        def settle(record, commit, was, equal):
+            taken = equal is not False
+            if taken:
+                _move_in(root, folder, commit)
+            outcomes.append(_outcome(root, folder, record, commit, was, equal, repaired=taken))
+
+        for commit in self._make(manifest, shards, folder, tick):
+            record = shards[commit.subset, commit.shard]
+            was, promised = damage(root, record, commit.shard), read_commit(root, record, commit.shard)
+            if promised is None and record.digest is not None:  # the subset's digest decides, once all are there
+                held.add(commit)
+                waiting.append((record, commit, was))
+            else:
+                settle(record, commit, was, None if promised is None else promised.same_data(commit))
+        verdicts = {record.name: held.equal(record) for record, _, _ in waiting}
+        for record, commit, was in waiting:
+            settle(record, commit, was, verdicts[record.name])
+        return outcomes
+
+    def remake(self, out: str | Path, tick: Tick = ignore) -> Outcome:
+        """Write a release beside, from the manifest of `root`; run again, it goes on where it stopped.
+
+        Args:
+          out: folder of the new release.
+
+        Raises: see `check`.
+        """
+        root, manifest = load_manifest(self.root)
+        out = Path(out)
+        if out.resolve() == root.resolve():
+            raise StoreError(f"--out {out} is the release itself; leave --out away to repair it in place")
+        shards = chosen_shards(manifest, self.only, self.episodes)
+        records = _unique(shards.values())
+        fresh = start_release(out, _unfinished(manifest))
+        create_groups(out, fresh, records)
+        for record in records:
+            _take_metadata(root, out, record)
+        done = {record.name: read_commits(out, record) for record in records}
+        todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
+        commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
+        commits += self._make(manifest, todo, out, tick, copy=True)
+        finished = finish_release(out, fresh)
+        digests = {record.name: record.digest for record in finished.subsets}
+        outcomes = []
+        for commit in commits:
+            record = shards[commit.subset, commit.shard]
+            promised = read_commit(root, record, commit.shard)
+            equal = promised.same_data(commit) if promised else None
+            if promised is None and record.digest and digests[record.name]:
+                equal = digests[record.name] == record.digest
+            outcomes.append(_outcome(root, out, record, commit, None, equal))
+        return Outcome(tuple(outcomes), environment_difference(manifest))
+
+    def _make(self, manifest, shards, folder, tick, copy=False) -> Iterator[CommitRecord]:
+        """Make shards in `folder` (with the policies and videos that they come from, if they are to be copied)."""
+        check_makeable(manifest)
+        records = _unique(shards.values())
+        inputs = release_inputs(Path(self.root), records, self.backgrounds)
+        if copy:
+            copy_inputs(folder, records, inputs)
+        for result in run_jobs(make_jobs(manifest, shards, folder, inputs, self.device), self.workers, tick):
+            yield from result.commits
+
+
+def check_makeable(manifest: Manifest) -> None:
+    """Raises StoreError for a release whose shards cannot be made from its manifest."""
+    for entry in manifest.lineage:
+        if entry.get("kind") == "import":
+            raise StoreError(f"{manifest.name} was imported, so there is nothing to make it from; import it again")
+        if entry.get("labels"):
+            raise StoreError(
+                f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "
+                "repaint that release again instead of regenerating this one"
+            )
+
+
+def _unfinished(manifest: Manifest) -> Manifest:
+    """The manifest as it was before any shard."""
+    subsets = tuple(record.model_copy(update={"digest": None}) for record in manifest.subsets)
+    return manifest.model_copy(update={"subsets": subsets, "environments": (environment(),), "complete": False})
+
+
+class Held:
+    """Shards made again whose commit record is lost: with the others, they must give their subset's digest."""
+
+    def __init__(self, root: Path):
+        self._root = root
+        self._commits: dict[tuple[str, int], CommitRecord] = {}
+
+    def add(self, commit: CommitRecord) -> None:
+        self._commits[commit.subset, commit.shard] = commit
+
+    def equal(self, record: SubsetRecord) -> bool | None:
+        """Whether the subset has its digest; None where it has none, or another shard is missing too."""
+        if record.digest is None:
+            return None
+        commits = {}
+        for shard in range(shard_count(record)):
+            commit = read_commit(self._root, record, shard) or self._commits.get((record.name, shard))
+            if commit is None:
+                return None
+            commits[shard] = commit
+        return subset_digest(commits) == record.digest
+
+
+def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardOutcome:
+    differences = compare_shards(root, folder, record, commit.shard) if equal is False else None
+    return ShardOutcome(
+        record.name, commit.shard, commit.episodes, was, equal, repaired, differences or (), differences is not None
+    )
+
+
+# -- files ----------------------------------------------------------------------------------------
 
 
 def _is_json(path: Path) -> bool:
@@ -181,7 +344,7 @@ def _take_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
     for target in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
         source = root / target.relative_to(folder)
         if _is_json(source):
-            shutil.copyfile(source, target)
+            copy_file(source, target)
 
 
 def _unique(records) -> list[SubsetRecord]:
@@ -211,149 +374,12 @@ class _Workshop:
         self._stack.close()
 
 
-def _run(jobs: Sequence[Job], workers: int, tick: Tick) -> Iterator[CommitRecord]:
-    for result in run_jobs(jobs, workers, tick):
-        yield from result.commits
-
-
-def check(
-    root: str | Path,
-    only: Sequence[str] = (),
-    episodes: tuple[int, int] | None = None,
-    *,
-    backgrounds: str | None = None,
-    device: str | None = None,
-    workers: int = 1,
-    tick: Tick = ignore,
-) -> Outcome:
-    """Make shards again and compare their digests with the release; the release is not changed.
-
-    Args:
-      only, episodes: which shards (those that hold any of the episodes).
-      backgrounds: where the videos are now, if they moved.
-      device: paint there instead of where the manifest says.
-
-    Raises:
-      DmcvbError: the shards cannot be made here (policy, backgrounds or renderer missing).
-    """
-    root, manifest = load_manifest(root)
-    shards = chosen_shards(manifest, only, episodes)
-    outcomes = []
-    with _Workshop(root, manifest, _unique(shards.values())) as folder:
-        jobs = make_jobs(manifest, root, shards, folder, backgrounds=backgrounds, device=device)
-        held: dict[str, dict[int, CommitRecord]] = {}
-        for commit in _run(jobs, workers, tick):
-            record = shards[commit.subset, commit.shard]
-            promised = read_commit(root, record, commit.shard)
-            held.setdefault(record.name, {})[commit.shard] = commit
-            equal = None if promised is None else promised.same_data(commit)
-            outcomes.append(_outcome(root, folder, record, commit, damage(root, record, commit.shard), equal=equal))
-            for file in commit.files:
-                (folder / file.path).unlink(missing_ok=True)  # a checked shard needs no room
-    outcomes = [
-        outcome
-        if outcome.equal is not None
-        else replace(outcome, equal=_subset_equal(root, shards[outcome.subset, outcome.shard], held))
-        for outcome in outcomes
-    ]
-    return Outcome(tuple(outcomes), environment_difference(manifest))
-
-
-def _subset_equal(root: Path, record: SubsetRecord, held: dict[str, dict[int, CommitRecord]]) -> bool | None:
-    """Whether shards without a commit record, beside those that have one, give the subset's digest."""
-    if record.digest is None:
-        return None
-    commits = {}
-    for shard in range(shard_count(record)):
-        commit = read_commit(root, record, shard) or held[record.name].get(shard)
-        if commit is None:
-            return None  # another shard is missing too: not all was asked for
-        commits[shard] = commit
-    return subset_digest(commits) == record.digest
-
-
-def _outcome(root, folder, record, commit, was, *, equal, repaired=False) -> ShardOutcome:
-    differences = None
-    if equal is False:
-        differences = compare_shards(root, folder, record, commit.shard)
-    return ShardOutcome(
-        record.name,
-        commit.shard,
-        commit.episodes,
-        was,
-        equal,
-        repaired,
-        differences or (),
-        differences is not None,
-    )
-
-
-def repair(
-    root: str | Path,
-    only: Sequence[str] = (),
-    episodes: tuple[int, int] | None = None,
-    *,
-    backgrounds: str | None = None,
-    device: str | None = None,
-    workers: int = 1,
-    tick: Tick = ignore,
-) -> Outcome:
-    """Make damaged and missing shards again, in place; sound ones are not touched.
-
-    A shard is taken only if it has the bytes that its commit record (or the subset's digest) promises; where the
-    manifest promises nothing yet, because the release was never finished, it is taken as it is.
-
-    Args, raises: see `check`.
-    """
-    root, manifest = load_manifest(root)
-    shards = {
-        key: record
-        for key, record in chosen_shards(manifest, only, episodes).items()
-        if damage(root, record, key[1]) is not None
-    }
-    records = _unique(chosen_shards(manifest, only).values())
-    outcomes: list[ShardOutcome] = []
-    with _Workshop(root, manifest, records) as folder:
-        for record in records:
-            _restore_metadata(root, folder, record)
-        jobs = make_jobs(manifest, root, shards, folder, backgrounds=backgrounds, device=device)
-        held: dict[str, dict[int, CommitRecord]] = {}
-        reasons: dict[ShardKey, str | None] = {}
-        for commit in _run(jobs, workers, tick):
-            record = shards[commit.subset, commit.shard]
-            was, promised = damage(root, record, commit.shard), read_commit(root, record, commit.shard)
-            if promised is None and record.digest is not None:
-                held.setdefault(record.name, {})[commit.shard] = commit
-                reasons[record.name, commit.shard] = was
-                continue
-            equal = None if promised is None else promised.same_data(commit)
-            if equal is not False:
-                _move_in(root, folder, commit)
-            outcomes.append(_outcome(root, folder, record, commit, was, equal=equal, repaired=equal is not False))
-        for record in records:
-            if record.name not in held:
-                continue
-            equal = _subset_equal(root, record, held)
-            for commit in held[record.name].values():
-                if equal is not False:
-                    _move_in(root, folder, commit)
-                was = reasons[record.name, commit.shard]
-                outcomes.append(_outcome(root, folder, record, commit, was, equal=equal, repaired=equal is not False))
-    if not manifest.complete and any(outcome.repaired for outcome in outcomes):
-        here = environment()
-        if here not in manifest.environments:
-            manifest = manifest.model_copy(update={"environments": (*manifest.environments, here)})
-        finish_release(root, manifest)
-    return Outcome(tuple(outcomes), environment_difference(manifest))
-
-
 def _restore_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
     """Put back Zarr metadata that is missing or no JSON; what can be read stays."""
     for source in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
         target = root / source.relative_to(folder)
         if not _is_json(target):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+            copy_file(source, target)
     (root / subset_path(record.name) / ".created").touch()
 
 
@@ -366,73 +392,9 @@ def _move_in(root: Path, folder: Path, commit: CommitRecord) -> None:
             target = root / file.path
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(folder / file.path, target)
-        write_json_atomically(record, commit)
+        write_json(record, commit)
     except OSError as error:
         raise StoreError(
             f"cannot put shard {commit.shard} of {commit.subset} into {root}: {error.strerror or error}; "
             "make room and run the same command again"
         ) from None
-
-
-def remake(
-    root: str | Path,
-    out: str | Path,
-    only: Sequence[str] = (),
-    episodes: tuple[int, int] | None = None,
-    *,
-    backgrounds: str | None = None,
-    device: str | None = None,
-    workers: int = 1,
-    tick: Tick = ignore,
-) -> Outcome:
-    """Write a release beside, from the manifest of `root`; run again, it goes on where it stopped.
-
-    Args:
-      out: folder of the new release.
-
-    Args, raises: see `check`.
-    """
-    root, manifest = load_manifest(root)
-    out = Path(out)
-    if out.resolve() == root.resolve():
-        raise StoreError(f"--out {out} is the release itself; leave --out away to repair it in place")
-    shards = chosen_shards(manifest, only, episodes)
-    fresh = manifest.model_copy(
-        update={
-            "subsets": tuple(record.model_copy(update={"digest": None}) for record in manifest.subsets),
-            "environments": (environment(),),
-            "complete": False,
-        }
-    )
-    fresh = start_release(out, fresh)
-    create_groups(out, fresh, _unique(shards.values()))
-    for record in _unique(shards.values()):
-        _take_metadata(root, out, record)
-    done = {record.name: read_commits(out, record) for record in _unique(shards.values())}
-    todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
-    jobs = make_jobs(manifest, root, todo, out, backgrounds=backgrounds, device=device)
-    copy_policies(root, out, _unique(shards.values()), jobs)
-    commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
-    commits += _run(jobs, workers, tick)
-    finished = finish_release(out, fresh)
-    digests = {record.name: record.digest for record in finished.subsets}
-    outcomes = []
-    for commit in commits:
-        record = shards[commit.subset, commit.shard]
-        promised = read_commit(root, record, commit.shard)
-        equal = promised.same_data(commit) if promised else None
-        if promised is None and record.digest and digests[record.name]:
-            equal = digests[record.name] == record.digest
-        outcomes.append(_outcome(root, out, record, commit, None, equal=equal))
-    return Outcome(tuple(outcomes), environment_difference(manifest))
-
-
-def copy_policies(root: Path, out: Path, records: Sequence[SubsetRecord], jobs: Sequence[Job]) -> None:
-    """Copy the policies of subsets into another release."""
-    found = {record.name: job.policies for job in jobs for record in job.subsets}
-    for record in records:
-        for policy, source in zip(record.policies, found.get(record.name, ()), strict=False):
-            target = out / policy.path
-            if policy.path and not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source, target)

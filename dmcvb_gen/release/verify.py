@@ -16,7 +16,8 @@ from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.release.import_tfds import MISSING
-from dmcvb_gen.rollout.plan import renderer_for
+from dmcvb_gen.rollout.jobs import video_source
+from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.store.pictures import picture_of
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
@@ -98,15 +99,15 @@ def check_values(subset: Subset) -> Iterator[Finding]:
             yield Finding("shapes", subset.name, f"array {spec.name} is missing")
             return
         array = subset.array(spec.name)
-        rows = (task.max_steps + 1,) if spec.steps else ()
+        rows = (subset.record.max_steps + 1,) if spec.steps else ()
         wanted = (subset.record.episodes, *rows, *spec.shape)
         if array.shape != wanted or array.dtype != np.dtype(spec.dtype):
             yield Finding("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
             return
     seen: dict[bytes, int] = {}
     for episode, length in zip(map(int, episodes), map(int, subset.lengths), strict=True):
-        if not 0 < length <= task.max_steps:
-            yield Finding("lengths", subset.name, f"length {length} is not in 1..{task.max_steps}", episode)
+        if not 0 < length <= subset.record.max_steps:
+            yield Finding("lengths", subset.name, f"length {length} is not in 1..{subset.record.max_steps}", episode)
             continue
         names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
         values = subset.episode(episode, [*names, "return", "terminated"])
@@ -127,7 +128,7 @@ def check_values(subset: Subset) -> Iterator[Finding]:
             yield Finding("returns", subset.name, f"return {total:.2f} is outside {low:g}..{high:g}", episode)
         if (
             bool(values["terminated"]) != (values["discount"][-1] == 0)
-            or (length < task.max_steps) > values["terminated"]
+            or (length < subset.record.max_steps) > values["terminated"]
         ):
             yield Finding("lengths", subset.name, "length, discount and terminated do not agree", episode)
         key = values["action"].tobytes()
@@ -173,7 +174,7 @@ def check_physics(subset: Subset) -> Iterator[Finding]:
 def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Finding]:
     """Sampled frames painted again from physics and labels; frames that are black or never change."""
     recorded = subset.record.backgrounds
-    source = backgrounds or (recorded["source"] if recorded else "builtin")
+    source = video_source(subset.root, subset.record, backgrounds)
     split = recorded["split"] if recorded else "train"
     if recorded:
         digest = load_backgrounds(source, split).digest

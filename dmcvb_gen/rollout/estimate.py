@@ -1,38 +1,57 @@
-"""How long and how big: a plan in, steps, bytes and core-hours out, from a short measurement on this machine."""
+"""How long and how big: a plan in, steps, bytes and core-hours out, from short measurements on this machine.
+
+What is measured once serves all that it is true of: episodes of a task and level for all settings that show them,
+pictures of a task, level and kind of distractor; the mazes, whose pictures cost the same, share theirs.
+"""
 
 from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import zarr
 
-from dmcvb_gen.behaviours.policies.simulate import simulate
-from dmcvb_gen.rollout.plan import Job, Plan, load_policies, renderer_for
-from dmcvb_gen.rollout.worker import exogenous_of, label_arrays, len_rows, paint
+from dmcvb_gen.behaviours.policies.simulate import Simulation
+from dmcvb_gen.names import ANT_MAZE, distractor_of
+from dmcvb_gen.rollout.jobs import Job
+from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
+from dmcvb_gen.rollout.plan import Plan
+from dmcvb_gen.rollout.worker import simulate_job
 from dmcvb_gen.store.manifest import SubsetRecord
-from dmcvb_gen.store.schema import EpisodeShape, array_specs, create_arrays, picture_layout_for
+from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, array_specs, create_arrays, picture_layout_for
 from dmcvb_gen.store.writer import find_array
 from dmcvb_gen.tasks import get_task
 
-SAMPLE_EPISODES, SHORT_STEPS, LONG_STEPS = 2, 127, 255
-"""Two runs whose frames fill the tracer's launches of 256: their difference is what steps cost, without start-up."""
+SAMPLE_EPISODES = {"locomotion": 2, ANT_MAZE: 6}
+"""Whole episodes simulated for a sample; a maze's vary in length."""
+TIMED_STEPS = 16
+"""Steps of a job's whole batch that are timed: a batch's cost a step is not that of a few episodes."""
+SAMPLE_CHUNKS = 5
+"""Runs of frames, a chunk of the pictures each, painted and compressed for a sample; spread over the episodes."""
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Measured on a few short episodes of one task and setting."""
+    """Measured on a few episodes of one task, level and setting.
+
+    Attributes:
+      seconds_per_step: of one core, for simulating, painting and storing one setting.
+      bytes_per_step: stored.
+      steps_per_episode: mean length.
+    """
 
     seconds_per_step: float
     bytes_per_step: float
+    steps_per_episode: float
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a plan will cost. Steps of maze tasks are an upper bound: their episodes may end early."""
+    """What a plan will cost; `rates` by subset."""
 
     jobs: int
     done: int
@@ -46,64 +65,97 @@ class Estimate:
         return self.core_seconds / max(workers, 1)
 
 
-def measure(job: Job, record: SubsetRecord) -> Rate:
-    """Simulate, paint and compress a few short episodes, in a temporary folder."""
-    task = get_task(record.task)
-    policies = load_policies(record.task, job.policies)
-    renderer, backgrounds = renderer_for(record, job.backgrounds, job.split, job.device)
+@dataclass(frozen=True)
+class _Sample:
+    """Whole episodes of a trajectory, and what a step of them costs without pictures."""
 
-    def run(steps: int) -> tuple[float, float]:
+    episodes: Simulation
+    seconds_per_step: float
+
+
+def _simulate(job: Job) -> _Sample:
+    count = min(SAMPLE_EPISODES[job.subsets[0].family], job.subsets[0].episodes)
+    simulate_job(job, max_steps=1)  # models are compiled, policies read
+    started = time.perf_counter()
+    timed = simulate_job(job, max_steps=TIMED_STEPS)
+    seconds = (time.perf_counter() - started) / timed.length.sum()
+    return _Sample(simulate_job(job, episodes=range(count)), seconds)
+
+
+def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, float]:
+    """Seconds and bytes a step of painting and storing one setting."""
+    task, chunk = get_task(record.task), min(PIXEL_CHUNK_STEPS, record.max_steps + 1)
+    renderer, videos = renderers.get(record, job.inputs.backgrounds, job.device)
+    exogenous = exogenous_of(
+        record, job.seed, job.names, sample.episodes, sample.physics, sample.length, videos
+    )  # of whole episodes: a walk's camera is elsewhere at their end
+    runs = _runs(sample.length + 1, chunk)
+    episode, row = (np.array([[run[i] for run in runs]]).T for i in (0, 1))
+    row = np.minimum(row + np.arange(chunk), sample.length[episode])
+    physics, labels = sample.physics[episode, row], exogenous[episode, row]
+    length = np.full(len(runs), chunk - 1)
+    paint_once = list(paint(task, renderer, physics[:1, :2], labels[:1, :2], length[:1] * 0 + 1, 2))
+    del paint_once  # kernels are compiled and buffers made
+    specs, layout = array_specs(EpisodeShape.of(task), record.size), picture_layout_for(record.setting)
+    with tempfile.TemporaryDirectory() as folder:
+        group = zarr.create_group(folder)
+        create_arrays(group, specs, len(runs), chunk, len(runs), layout)
         started = time.perf_counter()
-        out = simulate(task, policies, range(SAMPLE_EPISODES), job.seed, job.names, max_steps=steps)
-        exogenous = exogenous_of(job, record, out.episodes, out.physics, out.length, backgrounds)
-        rows = task.max_steps + 1
-        with tempfile.TemporaryDirectory() as folder:
-            group = zarr.create_group(folder)
-            specs, layout = array_specs(EpisodeShape.of(task), record.size), picture_layout_for(record.setting)
-            create_arrays(group, specs, SAMPLE_EPISODES, rows, SAMPLE_EPISODES, layout)
-            for name, value in paint(
-                task, renderer, out.physics[:, : len_rows(exogenous)], exogenous, out.length, rows
-            ):
-                find_array(group, name)[0][:] = value
-            for name, value in [*label_arrays(exogenous, out.length, rows), *out.arrays().items()]:
-                find_array(group, name)[0][:] = value
-            elapsed = time.perf_counter() - started
-            files = [path for path in Path(folder).rglob("*") if path.is_file() and path.name != "zarr.json"]
-            return elapsed, float(sum(path.stat().st_size for path in files))
+        for name, value in paint(task, renderer, physics[:, : len_rows(labels)], labels, length, chunk):
+            find_array(group, name)[0][:] = value
+        for name, value in label_arrays(labels, length, chunk):
+            find_array(group, name)[0][:] = value
+        for name, value in sample.arrays().items():
+            if value.ndim > 1:
+                find_array(group, name)[0][:] = value[episode, row]
+        seconds = time.perf_counter() - started
+        files = [path for path in Path(folder).rglob("*") if path.is_file() and path.name != "zarr.json"]
+        size = sum(path.stat().st_size for path in files)
+    frames = len(runs) * chunk
+    return seconds / frames, size / frames
 
-    try:
-        run(2)  # kernels are compiled and buffers made
-        short_seconds, short_bytes = run(SHORT_STEPS)
-        long_seconds, long_bytes = run(LONG_STEPS)
-    finally:
-        renderer.close()
-    steps, whole = SAMPLE_EPISODES * (LONG_STEPS - SHORT_STEPS), SAMPLE_EPISODES * LONG_STEPS
-    seconds, size = (long_seconds - short_seconds) / steps, (long_bytes - short_bytes) / steps
-    # A busy machine can make the longer run the quicker one, and episodes can end early: then the mean must do.
-    return Rate(seconds if seconds > 0 else long_seconds / whole, size if size > 0 else long_bytes / whole)
+
+def _runs(rows: np.ndarray, chunk: int) -> list[tuple[int, int]]:
+    """(episode, first row) of up to `SAMPLE_CHUNKS` chunks, evenly spread over episodes of so many rows."""
+    known = [(episode, first) for episode, count in enumerate(rows) for first in range(0, int(count), chunk)]
+    chosen = np.linspace(0, len(known) - 1, min(SAMPLE_CHUNKS, len(known))).round().astype(int)
+    return [known[index] for index in chosen]
 
 
 def estimate(plan: Plan) -> Estimate:
-    """Measure each task and setting of a plan for a moment and extrapolate."""
+    """Measure what a plan is made of for a moment and extrapolate."""
+    samples: dict[Hashable, _Sample] = {}
+    paintings: dict[Hashable, tuple[float, float]] = {}
     rates: dict[str, Rate] = {}
-    size = seconds = 0.0
+    for job in sorted(plan.jobs, key=lambda job: _painting_key(job.subsets[0])):  # a painter serves all its levels
+        for record in job.subsets:
+            if record.name in rates:
+                continue
+            trajectory = (record.task, record.level, record.deterministic, record.max_steps, bool(record.fixed_goals))
+            if trajectory not in samples:
+                samples[trajectory] = _simulate(job)
+            sample, key = samples[trajectory], _painting_key(record)
+            if key not in paintings:
+                paintings[key] = _paint(job, record, sample.episodes)
+            seconds, size = paintings[key]
+            shared = sample.seconds_per_step / len(job.subsets)
+            rates[record.name] = Rate(seconds + shared, size, float(sample.episodes.length.mean()))
+    steps = size = seconds = 0.0
     for job in plan.jobs:
         for record in job.subsets:
-            key = f"{record.task}/{record.setting}"
-            if key not in rates:
-                rates[key] = measure(job, record)
-            steps = len(job.episodes) * get_task(record.task).max_steps
-            size += steps * rates[key].bytes_per_step
-            seconds += steps * rates[key].seconds_per_step
-    return Estimate(
-        jobs=len(plan.jobs),
-        done=plan.done,
-        episodes=plan.episodes,
-        steps=plan.steps,
-        bytes=size,
-        core_seconds=seconds,
-        rates=rates,
-    )
+            rate = rates[record.name]
+            count = len(job.episodes) * rate.steps_per_episode
+            steps, size = steps + count, size + count * rate.bytes_per_step
+            seconds += count * rate.seconds_per_step
+    return Estimate(len(plan.jobs), plan.done, plan.episodes, round(steps), size, seconds, rates)
+
+
+def _painting_key(record: SubsetRecord) -> tuple:
+    """What decides the cost of a frame; the same for all mazes."""
+    if record.family == ANT_MAZE:
+        return (ANT_MAZE, record.level, "", "")
+    setting = distractor_of(record.task, record.setting)
+    return (record.task, setting.kind, setting.difficulty, record.level)
 
 
 def raw_bytes(plan: Plan) -> float:
@@ -111,7 +163,7 @@ def raw_bytes(plan: Plan) -> float:
     total = 0.0
     for job in plan.jobs:
         for record in job.subsets:
-            task = get_task(record.task)
-            pictures = sum(spec.picture for spec in array_specs(EpisodeShape.of(task), record.size))
-            total += len(job.episodes) * task.max_steps * pictures * record.size**2 * 3
+            specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
+            pictures = sum(spec.picture for spec in specs)
+            total += len(job.episodes) * record.max_steps * pictures * record.size**2 * 3
     return float(np.ceil(total * 0.5))

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,13 +23,17 @@ from typing import Annotated, Any, Literal
 import pydantic
 import yaml
 
-from dmcvb_gen.errors import RecipeError
+from dmcvb_gen.errors import RecipeError, UnknownNameError
 from dmcvb_gen.names import (
     ANT_MAZE,
+    DISTRACTOR_KINDS,
+    FAMILIES,
     FIXED,
     GOAL_MODES,
     LEVELS,
     LOCOMOTION,
+    VISIBLE,
+    DistractorSetting,
     check_level,
     distractor_of,
     family_of,
@@ -44,6 +49,8 @@ from dmcvb_gen.tasks.base import Task
 
 DEFAULT_EPISODES_PER_SHARD = {LOCOMOTION: 50, ANT_MAZE: 10}
 """Episodes a shard: what a worker holds in memory and what a crash can cost."""
+MAX_STEPS = 5000
+"""Longest episode that a recipe may ask for; a shard is held in memory."""
 
 
 # Their place is dmcvb_gen.names; those who still ask here find them.
@@ -82,6 +89,7 @@ class SubsetPattern(_Model):
       episodes, steps: how much of each subset; give one. Steps are for tasks of fixed length.
       policies: level -> policy file or run folder, where not the bundled ones.
       deterministic: take the policies' mean actions, as DMC-VB does; false draws samples. Level random is always drawn.
+      max_steps: steps at which the time limit ends an episode, where not the task's own (500, mazes 600).
       fixed_goals, episodes_per_goal: for the setting "fixed" (benchmark B3).
     """
 
@@ -93,6 +101,7 @@ class SubsetPattern(_Model):
     episodes_per_shard: int | None = pydantic.Field(default=None, gt=0, le=1000)
     policies: dict[str, str] = {}
     deterministic: bool = True
+    max_steps: int | None = pydantic.Field(default=None, gt=0, le=MAX_STEPS)
     fixed_goals: int = pydantic.Field(default=5, gt=0)
     episodes_per_goal: int = pydantic.Field(default=10, gt=0)
 
@@ -136,6 +145,7 @@ class SubsetRequest(_Model):
     setting: str
     episodes: int
     episodes_per_shard: int
+    max_steps: int
     policy: str | None = None
     deterministic: bool = False
     episodes_per_goal: int | None = None
@@ -167,7 +177,7 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
 
 
 def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting: str) -> SubsetRequest:
-    per_goal = None
+    per_goal, max_steps = None, pattern.max_steps or task.max_steps
     if setting == FIXED:
         episodes, per_goal = pattern.fixed_goals * pattern.episodes_per_goal, pattern.episodes_per_goal
     elif pattern.episodes is not None and pattern.steps is not None:
@@ -179,7 +189,7 @@ def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting:
     elif task.family == ANT_MAZE:
         raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
     else:
-        episodes = -(-pattern.steps // task.max_steps)
+        episodes = -(-pattern.steps // max_steps)
     shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[task.family]
     return SubsetRequest(
         name=name,
@@ -189,6 +199,7 @@ def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting:
         episodes=episodes,
         episodes_per_shard=min(shard, episodes),
         policy=pattern.policies.get(level),
+        max_steps=max_steps,
         deterministic=pattern.deterministic and level != "random",
         episodes_per_goal=per_goal,
     )
@@ -198,6 +209,136 @@ def check_size(size: int) -> None:
     """Raises RecipeError for a picture size that no renderer takes."""
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise RecipeError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)")
+
+
+# -- a recipe made smaller or otherwise -----------------------------------------------------------
+
+
+def narrow(
+    recipe: Recipe, tasks: Sequence[str] = (), levels: Sequence[str] = (), settings: Sequence[str] = ()
+) -> Recipe:
+    """The recipe of the subsets that have one of the tasks, one of the levels and one of the settings.
+
+    Args:
+      tasks, levels, settings: all that the recipe has where nothing is given.
+
+    Raises:
+      UnknownNameError: the recipe has no such task, level or setting.
+      RecipeError: no subset has all of them.
+    """
+    wanted = {"tasks": tasks, "levels": levels, "settings": settings}
+    for field, given in wanted.items():
+        known = {value for pattern in recipe.subsets for value in getattr(pattern, field)}
+        if field == "settings":
+            known |= {DistractorSetting.parse(value).name for value in known - set(GOAL_MODES)}
+        for value in given:
+            if value not in known:
+                raise UnknownNameError(f"{field[:-1]} of recipe {recipe.name}", value, known)
+    patterns = []
+    for pattern in recipe.subsets:
+        kept = {
+            field: tuple(v for v in getattr(pattern, field) if not given or v in given or _canonical(v) in given)
+            for field, given in wanted.items()
+        }
+        if all(kept.values()):
+            policies = {level: path for level, path in pattern.policies.items() if level in kept["levels"]}
+            patterns.append(pattern.model_copy(update=kept | {"policies": policies}))
+    if not patterns:
+        given = ", ".join([*tasks, *levels, *settings])
+        raise RecipeError(f"recipe {recipe.name!r} has no subset that is {given} at once; see them with --dry-run")
+    return recipe.model_copy(update={"subsets": tuple(patterns)})
+
+
+def _canonical(setting: str) -> str:
+    """ "dynamic_medium" -> "dynamic"; what is no distractor stays."""
+    return DistractorSetting.parse(setting).name if setting.split("_")[0] in DISTRACTOR_KINDS else setting
+
+
+SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps")
+GOAL_FIELDS = ("fixed_goals", "episodes_per_goal")
+
+
+def override(recipe: Recipe, **changes: Any) -> Recipe:
+    """The recipe with other values: its own fields, and fields of all its subsets that they mean something for.
+
+    Args:
+      changes: fields of `Recipe` or `SubsetPattern`; `episodes` takes the place of `steps` and the other way round;
+        `behaviour`: the policy of the one task and level that the recipe has.
+
+    Raises:
+      RecipeError: a value that is wrong, or that means nothing for this recipe.
+    """
+    own = {name: value for name, value in changes.items() if name in Recipe.model_fields}
+    each = {name: value for name, value in changes.items() if name in SUBSET_FIELDS}
+    goals = {name: value for name, value in changes.items() if name in GOAL_FIELDS}
+    fixed = any(FIXED in pattern.settings for pattern in recipe.subsets)
+    if goals and not fixed:
+        raise RecipeError(f"recipe {recipe.name!r} has no fixed goals, so --{_option(goals)} means nothing for it")
+    amount = {"episodes", "steps"} & set(each)
+    if amount and fixed:
+        raise RecipeError(
+            f"--{amount.pop()} means nothing for fixed goals, which have --fixed-goals x --episodes-per-goal episodes; "
+            "give those, or leave those subsets out with --goal visible --goal hidden"
+        )
+    if amount:
+        each = {"episodes": None, "steps": None} | each
+    if "behaviour" in changes:
+        each["policies"] = {_one_level(recipe): changes["behaviour"]}
+    data = recipe.model_dump(mode="json") | own
+    for pattern in data["subsets"]:
+        pattern |= each | goals
+    return make_recipe(data, "command line")
+
+
+def _option(changes: dict[str, Any]) -> str:
+    return next(iter(changes)).replace("_", "-")
+
+
+def _one_level(recipe: Recipe) -> str:
+    tasks = {task for pattern in recipe.subsets for task in pattern.tasks}
+    levels = {level for pattern in recipe.subsets for level in pattern.levels}
+    if len(tasks) != 1 or len(levels) != 1 or levels == {"random"}:
+        raise RecipeError("--behaviour needs one task and one --level of expert, medium or mixed")
+    return levels.pop()
+
+
+def single_recipe(
+    tasks: Sequence[str],
+    levels: Sequence[str],
+    settings: Sequence[str] | None,
+    *,
+    name: str,
+    behaviour: str | None = None,
+    fixed_goals: int | None = None,
+    episodes_per_goal: int = 10,
+    subset_fields: dict[str, Any],
+    **fields: Any,
+) -> Recipe:
+    """The recipe of a command line without --recipe: every task x level x setting.
+
+    Args:
+      settings: of the tasks' families; by default "none", and "visible" (or "fixed") for mazes.
+      subset_fields: of each `SubsetPattern`.
+      fields: of the `Recipe`.
+
+    Raises:
+      RecipeError: --behaviour with several tasks or levels, or with random.
+    """
+    patterns = []
+    for family in FAMILIES:
+        chosen = [task for task in tasks if family_of(task) == family]
+        if not chosen:
+            continue
+        default = "none" if family == LOCOMOTION else FIXED if fixed_goals else VISIBLE
+        pattern = {"tasks": chosen, "levels": list(levels), "settings": list(settings or (default,)), **subset_fields}
+        if fixed_goals:
+            pattern |= {"fixed_goals": fixed_goals, "episodes_per_goal": episodes_per_goal}
+        patterns.append(pattern)
+    made = make_recipe({"name": name, "subsets": patterns, **fields}, "command line")
+    return override(made, behaviour=behaviour) if behaviour else made
+
+
+# -- recipes in files -----------------------------------------------------------------------------
 
 
 def shipped_recipes() -> tuple[str, ...]:

@@ -9,23 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.behaviours.policies.simulate import Simulation, simulate
-from dmcvb_gen.distractors import make_exogenous
-from dmcvb_gen.labels import Exogenous
-from dmcvb_gen.names import distractor_of
 from dmcvb_gen.pool import Tick, ignore
-from dmcvb_gen.rendering.base import Renderer
-from dmcvb_gen.rollout.plan import Job, load_policies, renderer_for
-from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord
-from dmcvb_gen.store.pictures import picture_arrays
+from dmcvb_gen.rollout.jobs import Job
+from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
+from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, environment
 from dmcvb_gen.store.writer import write_shard
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from dmcvb_gen.tasks.base import Task
-
-PAINT_FRAMES = 2004
-"""Frames painted between two ticks of the progress bar."""
 
 
 @dataclass(frozen=True)
@@ -43,155 +36,41 @@ class JobResult:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def simulate_job(job: Job, threads: int = 1) -> Simulation:
-    """The episodes of a job, without pictures."""
+def load_policies(job: Job) -> list[Policy]:
+    """The behaviour policies of a job (uniform random actions where there is no file)."""
     task = get_task(job.subsets[0].task)
-    pairs = None
-    if job.fixed_goals:
-        pairs = fixed_pairs(task.layout, job.fixed_goals, job.seed)
-    return simulate(
-        task,
-        load_policies(task.id, job.policies),
-        list(job.episodes),
-        job.seed,
-        job.names,
-        deterministic=job.subsets[0].deterministic,
-        goal_pairs=pairs,
-        episodes_per_goal=job.episodes_per_goal,
-        threads=threads,
-    )
+    return [load_policy(path, task) for path in job.inputs.policies] or [random_policy(task)]
 
 
-def exogenous_of(
-    job: Job, record: SubsetRecord, episodes: np.ndarray, physics: np.ndarray, length: np.ndarray, backgrounds
-) -> Exogenous:
-    """Distractor labels of episodes, leading shape (episode, row); rows past an episode's end are zero.
+def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_steps: int | None = None) -> Simulation:
+    """The episodes of a job, without pictures.
 
     Args:
-      physics: (episode, row, physics) float64.
-      length: (episode,) transitions of each.
+      threads: of the physics.
+      episodes, max_steps: others than the job's, for estimates.
     """
+    record = job.subsets[0]
     task = get_task(record.task)
-    rows = int(length.max()) + 1
-    after = np.arange(rows)[None] > length[:, None]
-    padded = physics[:, :rows].copy()
-    last = physics[np.arange(len(physics)), length]
-    padded[after] = np.repeat(last, after.sum(axis=1), axis=0)  # a state that MuJoCo can be put into
-    generators = {
-        name: [episode_stream(job.seed, job.names, int(i), name) for i in episodes]
-        for name in STREAMS
-        if name not in ("initial_state", "policy")
-    }
-    setting = distractor_of(record.task, record.setting)
-    return make_exogenous(task, setting, padded, generators, backgrounds, split=job.split)
-
-
-def paint(
-    task: Task,
-    renderer: Renderer,
-    physics: np.ndarray,
-    exogenous: Exogenous,
-    length: np.ndarray,
-    rows: int,
-    tick: Tick = ignore,
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Pictures of episodes, one array at a time.
-
-    Yields:
-      (name, (episode, rows, size, size, 3) uint8); rows past an episode's end stay zero.
-    """
-    episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
-    size, total = renderer.size, len(episode)
-    names = zip(picture_arrays(task.views), picture_arrays(task.views, hide_goal=True), strict=True)
-    for view, (name, hidden_name) in zip(task.views, names, strict=True):
-        picture = np.zeros((len(physics), rows, size, size, 3), np.uint8)
-        for first in range(0, total, PAINT_FRAMES):
-            e, r = episode[first : first + PAINT_FRAMES], row[first : first + PAINT_FRAMES]
-            picture[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view])[:, 0]
-            tick(len(e))
-        yield name, picture
-        if not task.goal_geoms:
-            continue
-        seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
-        seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
-        shown = [picture[e, rows[0]].copy() for e, rows in spans]
-        hidden = picture
-        for first in range(0, len(seen), PAINT_FRAMES):
-            e, r = episode[seen[first : first + PAINT_FRAMES]], row[seen[first : first + PAINT_FRAMES]]
-            hidden[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view], hide_goal=True)[:, 0]
-        for (e, rows_of), before in zip(spans, shown, strict=True):
-            behind = hidden[e, rows_of[0]]
-            covered = (behind != before).any(axis=-1, keepdims=True)
-            hidden[e, rows_of[1:]] = np.where(covered, behind, hidden[e, rows_of[1:]])
-        yield hidden_name, hidden
-
-
-def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: Exogenous) -> np.ndarray:
-    """Indices of the frames in which the goal (or its shadow) may change a pixel; the others share their pictures."""
-    if not hasattr(task, "goal_in_sight"):
-        return np.arange(len(physics))
-    return np.flatnonzero(task.goal_in_sight(view, physics, exogenous))
-
-
-def _spans_of_one_background(
-    task: Task,
-    view: str,
-    size: int,
-    physics: np.ndarray,
-    exogenous: Exogenous,
-    episode: np.ndarray,
-    row: np.ndarray,
-    seen: np.ndarray,
-) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
-    """Frames that need no picture of their own with the goal hidden.
-
-    Where the camera stands still, and nothing that moves is near the goal, what is behind the goal is the same in
-    every frame of an episode: one hidden picture tells it for all.
-
-    Returns:
-      What is left of `seen`, and (episode, rows): hide the goal in the first of the rows, copy its pixels to the rest.
-    """
-    if not len(seen) or not hasattr(task, "goal_alone"):
-        return seen, []
-    index = task.views.index(view)
-    alone = np.zeros(len(episode), bool)
-    alone[seen] = task.goal_alone(physics[episode[seen], row[seen]], size)
-    spans = []
-    for e in np.unique(episode[seen]):
-        frames = np.flatnonzero(alone & (episode == e))
-        poses = [field[e, row[frames], index] for field in (exogenous.camera_position, exogenous.camera_quaternion)]
-        if len(frames) > 1 and all((pose == pose[0]).all() for pose in poses):
-            spans.append((int(e), row[frames]))
-            alone[frames[0]] = False
-        else:
-            alone[frames] = False
-    return seen[~alone[seen]], spans
-
-
-class _RendererCache:
-    """Renderers by what decides them, so that the shards of a subset share one."""
-
-    def __init__(self):
-        self._made: dict[tuple, tuple] = {}
-
-    def get(self, record: SubsetRecord, backgrounds: str, split: str, device: str):
-        setting = distractor_of(record.task, record.setting)
-        key = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
-        key += (backgrounds, split, device)
-        if key not in self._made:
-            for renderer, _ in self._made.values():
-                renderer.close()  # one at a time: a renderer's buffers are large
-            self._made = {key: renderer_for(record, backgrounds, split, device)}
-        return self._made[key]
-
-
-_renderers = _RendererCache()
+    pairs = fixed_pairs(task.layout, record.fixed_goals, job.seed) if record.fixed_goals else None
+    return simulate(
+        task,
+        load_policies(job),
+        list(episodes or job.episodes),
+        job.seed,
+        job.names,
+        deterministic=record.deterministic,
+        goal_pairs=pairs,
+        episodes_per_goal=record.episodes_per_goal,
+        threads=threads,
+        max_steps=max_steps or record.max_steps,
+    )
 
 
 def run_job(job: Job, threads: int = 1, tick: Tick = ignore) -> JobResult:
     """Simulate, paint and commit a job.
 
     Args:
+      threads: of the physics.
       tick: told how many frames were painted since the last call.
 
     Raises:
@@ -201,48 +80,39 @@ def run_job(job: Job, threads: int = 1, tick: Tick = ignore) -> JobResult:
     seconds = dict(simulation.seconds) | {"rendering": 0.0, "storage": 0.0}
     commits = []
     for record in job.subsets:
-        started = time.perf_counter()
-        commit, painting = _commit(job, record, simulation, tick)
-        seconds["rendering"] += painting
-        seconds["storage"] += time.perf_counter() - started - painting
-        commits.append(commit)
+        started, painting = time.perf_counter(), Stopwatch()
+        arrays = painting.time(painted_arrays(job, record, simulation, tick))
+        made_in = environment(job.device)
+        commits.append(write_shard(Path(job.root), record, job.shard, arrays, simulation.length, made_in))
+        seconds["rendering"] += painting.seconds
+        seconds["storage"] += time.perf_counter() - started - painting.seconds
     return JobResult(tuple(commits), sum(commit.steps for commit in commits), seconds)
 
 
-def _commit(job, record, simulation, tick):
-    task = get_task(record.task)
-    rows = simulation.state.shape[1]
-    painting = 0.0
+def painted_arrays(
+    job: Job, record: SubsetRecord, simulation: Simulation, tick: Tick
+) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of a shard, one at a time: pictures, labels, and what was simulated."""
+    task, rows = get_task(record.task), simulation.state.shape[1]
+    renderer, videos = renderers.get(record, job.inputs.backgrounds, job.device)
+    episodes, physics, length = simulation.episodes, simulation.physics, simulation.length
+    exogenous = exogenous_of(record, job.seed, job.names, episodes, physics, length, videos)
+    yield from paint(task, renderer, physics[:, : len_rows(exogenous)], exogenous, length, rows, tick)
+    yield from label_arrays(exogenous, length, rows)
+    yield from simulation.arrays().items()
 
-    def arrays():
-        nonlocal painting
+
+class Stopwatch:
+    """The time that an iterator takes for its items, apart from what is done with them."""
+
+    def __init__(self):
+        self.seconds = 0.0
+
+    def time(self, items: Iterator) -> Iterator:
+        """The items."""
         started = time.perf_counter()
-        renderer, backgrounds = _renderers.get(record, job.backgrounds, job.split, job.device)
-        exogenous = exogenous_of(job, record, simulation.episodes, simulation.physics, simulation.length, backgrounds)
-        pictures = paint(
-            task, renderer, simulation.physics[:, : len_rows(exogenous)], exogenous, simulation.length, rows, tick
-        )
-        for item in pictures:
-            painting += time.perf_counter() - started
+        for item in items:
+            self.seconds += time.perf_counter() - started
             yield item
             started = time.perf_counter()
-        painting += time.perf_counter() - started
-        yield from label_arrays(exogenous, simulation.length, rows)
-        yield from simulation.arrays().items()
-
-    commit = write_shard(Path(job.root), record, job.shard, arrays(), simulation.length)
-    return commit, painting
-
-
-def len_rows(exogenous: Exogenous) -> int:
-    """Rows of labels with leading shape (episode, row)."""
-    return exogenous.background_video.shape[1]
-
-
-def label_arrays(exogenous: Exogenous, length: np.ndarray, rows: int) -> Iterator[tuple[str, np.ndarray]]:
-    """The labels under their stored names, rows past an episode's end zero."""
-    for name, value in exogenous.items():
-        full = np.zeros((value.shape[0], rows, *value.shape[2:]), value.dtype)
-        full[:, : value.shape[1]] = value
-        full[np.arange(rows)[None] > length[:, None]] = 0
-        yield f"exogenous/{name}", full
+        self.seconds += time.perf_counter() - started

@@ -123,7 +123,7 @@ def simulate(
         state = batch.reset_fixed(streams["initial_state"], [goal_pairs[k] for k in pair])
     seconds["physics"] += time.perf_counter() - started
 
-    rows = max(limit, task.max_steps) + 1
+    rows = limit + 1
     out = Simulation(
         episodes=episodes,
         state=np.zeros((size, rows, task.state_size), np.float32),

@@ -1,0 +1,240 @@
+"""The one maker of jobs: a release's manifest and some of its shards in, the work that makes them out.
+
+A job is one shard of one trajectory: the fixed run of episodes is simulated once and painted for every setting that
+shares it. It depends on nothing but the manifest, its policies and its videos, so a rollout, a repair and a worker on
+another machine make the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmcvb_gen.behaviours.policies.bundled import resolve_policies
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
+from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.errors import BackgroundError, DmcvbError, RecipeError, StoreError
+from dmcvb_gen.names import FIXED, LOCOMOTION, family_of, select
+from dmcvb_gen.rollout.recipe import Recipe, make_recipe
+from dmcvb_gen.store.manifest import Manifest, SubsetRecord
+from dmcvb_gen.store.writer import shard_count, shard_episodes
+from dmcvb_gen.tasks import get_task
+
+ShardKey = tuple[str, int]
+"""(subset, shard)."""
+BUILTIN = "builtin"
+"""The videos that the package brings."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a subset is made from, as it is found on this machine.
+
+    Attributes:
+      policies: files of the behaviour policies, in the record's order; none for uniform random actions.
+      backgrounds: "builtin", or the folder of the videos.
+    """
+
+    policies: tuple[str, ...] = ()
+    backgrounds: str = BUILTIN
+
+
+@dataclass(frozen=True)
+class Job:
+    """One shard of subsets that share a trajectory, to be simulated once and painted for each of them.
+
+    Attributes:
+      root: where the release is, a folder or a URL.
+      subsets: the records of the subsets to write, one or more settings of a task and level.
+      shard: index of the shard.
+      inputs: policies and videos.
+      seed, names: the streams of the simulation.
+      device: where pictures are painted.
+    """
+
+    root: str
+    subsets: tuple[SubsetRecord, ...]
+    shard: int
+    inputs: Inputs
+    seed: int
+    names: tuple[str, ...]
+    device: str = "cpu"
+
+    @property
+    def episodes(self) -> range:
+        return range(*shard_episodes(self.subsets[0], self.shard))
+
+    @property
+    def frames(self) -> int:
+        """Steps to make, counted once for each setting (at most: mazes may end early)."""
+        return len(self.episodes) * self.subsets[0].max_steps * len(self.subsets)
+
+
+def chosen_shards(
+    manifest: Manifest, only: Sequence[str] = (), episodes: tuple[int, int] | None = None
+) -> dict[ShardKey, SubsetRecord]:
+    """The shards that hold any of the chosen episodes.
+
+    Args:
+      only: subset patterns such as "walker-walk/*/static", all subsets by default.
+      episodes: (first, last + 1), all by default.
+
+    Raises:
+      UnknownNameError: a pattern that fits nothing.
+      StoreError: no subset has such episodes.
+    """
+    names = set(select([record.name for record in manifest.subsets], list(only)))
+    chosen = {}
+    for record in manifest.subsets:
+        for shard in range(shard_count(record)) if record.name in names else ():
+            first, last = shard_episodes(record, shard)
+            if episodes is None or (first < episodes[1] and episodes[0] < last):
+                chosen[record.name, shard] = record
+    if not chosen:
+        most = max(record.episodes for record in manifest.subsets)
+        raise StoreError(f"no subset has episodes {episodes[0]}:{episodes[1]}; the longest has 0:{most}")
+    return chosen
+
+
+def make_jobs(
+    manifest: Manifest,
+    shards: Mapping[ShardKey, SubsetRecord],
+    target: str | Path,
+    inputs: Mapping[str, Inputs],
+    device: str | None = None,
+) -> tuple[Job, ...]:
+    """The jobs that make shards; subsets that share trajectories are simulated once.
+
+    Args:
+      target: the folder or URL that the jobs write to.
+      inputs: of each subset, by name.
+      device: paint there instead of where the manifest says.
+
+    Raises:
+      RecipeError: the manifest does not say the goals of a subset with fixed ones.
+    """
+    seed = manifest.recipe.get("seed", 0)
+    groups: dict[tuple, list[SubsetRecord]] = {}
+    for (name, shard), record in shards.items():
+        if record.setting == FIXED and not (record.fixed_goals and record.episodes_per_goal):
+            raise RecipeError(f"the manifest does not say the goals of {name}; make it from its recipe again")
+        where = device or record.renderer.get("device") or "cpu"
+        groups.setdefault((*_trajectory(manifest, record), shard, inputs[name], where), []).append(record)
+    return tuple(
+        Job(str(target), tuple(records), shard, given, seed, names, where)
+        for (names, *_, shard, given, where), records in groups.items()
+    )
+
+
+def _trajectory(manifest: Manifest, record: SubsetRecord) -> tuple:
+    """What decides the episodes of a subset, the names of its streams first."""
+    policies = tuple(policy.digest for policy in record.policies)
+    size = (record.episodes, record.episodes_per_shard, record.max_steps)
+    goals = (record.fixed_goals, record.episodes_per_goal)
+    return stream_names(manifest, record), policies, record.deterministic, *size, *goals
+
+
+def trajectory_names(trajectories: str, record: SubsetRecord) -> tuple[str, ...]:
+    """Names of the random streams of a subset's episodes; subsets of the same names share their trajectories.
+
+    Args:
+      trajectories: the recipe's "shared" or "independent".
+    """
+    shared = trajectories == "shared" and family_of(record.task) == LOCOMOTION  # maze subsets have both pictures
+    return (record.task, record.level) if shared else (record.task, record.level, record.setting)
+
+
+def stream_names(manifest: Manifest, record: SubsetRecord) -> tuple[str, ...]:
+    """Names of the random streams of a subset's episodes (a repainted one keeps those of its source)."""
+    for entry in reversed(manifest.lineage):
+        if record.name in entry.get("streams", {}):
+            return tuple(entry["streams"][record.name])
+    return trajectory_names(manifest.recipe.get("trajectories", "shared"), record)
+
+
+# -- what a release is made from, found again -----------------------------------------------------
+
+
+def release_inputs(root: Path, records: Iterable[SubsetRecord], backgrounds: str | None = None) -> dict[str, Inputs]:
+    """Policies and videos of a release's subsets, checked by digest.
+
+    Args:
+      root: the release's folder, which has copies of what the package does not bring.
+      backgrounds: where the videos are now, instead of where the manifest says.
+
+    Raises:
+      StoreError: a policy or the videos are not there, or not those of the manifest.
+    """
+    return {
+        record.name: Inputs(policy_files(root, record), background_source(root, record, backgrounds))
+        for record in records
+    }
+
+
+def recipe_of(manifest: Manifest) -> Recipe:
+    """The recipe that a manifest records."""
+    return make_recipe(manifest.recipe, "the manifest's recipe")
+
+
+def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:
+    """Files of a subset's policies: the release's own copies, else the bundled ones, by digest.
+
+    Raises:
+      StoreError: neither is there.
+    """
+    task, found = get_task(record.task), []
+    for policy in record.policies:
+        candidates = [root / policy.path] if policy.path else []
+        try:
+            candidates += resolve_policies(record.task, record.level)
+        except DmcvbError:
+            pass  # the release's own copy is enough
+        for path in candidates:
+            try:
+                if Path(path).is_file() and load_policy(path, task).digest == policy.digest:
+                    found.append(str(path))
+                    break
+            except DmcvbError:
+                continue
+        else:
+            raise StoreError(
+                f"policy {policy.name} of {record.name} (digest {policy.digest[:12]}) is neither in the release nor "
+                f"bundled with this dmcvb-gen; put its file at {policy.path}"
+            )
+    return tuple(found)
+
+
+def background_source(root: Path, record: SubsetRecord, moved: str | None = None) -> str:
+    """Where a subset's videos are, checked against the manifest's digest.
+
+    Args:
+      moved: where they are now, instead of where the manifest says.
+
+    Raises:
+      StoreError: they are other videos, or not there.
+    """
+    if record.backgrounds is None:
+        return BUILTIN
+    given = video_source(root, record, moved)
+    try:
+        digest = load_backgrounds(given, record.backgrounds["split"]).digest
+    except BackgroundError as error:
+        raise StoreError(f"the backgrounds of {record.name} cannot be used: {error}") from None
+    if digest != record.backgrounds["digest"]:
+        raise StoreError(
+            f"backgrounds {given!r} are not those that {record.name} was painted with; give --backgrounds FOLDER"
+        )
+    return given
+
+
+def video_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:
+    """Where a subset's videos are: "builtin" or a folder; nothing is opened.
+
+    Args:
+      root: the release's folder, which has copies of videos that the package does not bring.
+      moved: where they are now, instead of where the manifest says.
+    """
+    source = moved or (record.backgrounds or {}).get("source", BUILTIN)
+    inside = not (moved or source == BUILTIN or Path(source).is_absolute())  # absolute: in releases of version 1
+    return f"{root}/{source}" if inside else source

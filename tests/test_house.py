@@ -1,0 +1,126 @@
+"""The house: every module can be imported, and imports point down alone, without a circle."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import dmcvb_gen
+
+ROOT = Path(dmcvb_gen.__file__).parent
+FLOORS = (
+    ("names", "seeding", "errors", "files", "pool", "labels"),  # the ground
+    ("tasks",),
+    ("store",),
+    ("rendering",),
+    ("distractors",),
+    ("behaviours.policies",),
+    ("behaviours.learning", "agents"),
+    ("rollout",),
+    ("readers",),
+    ("release",),
+    ("benchmarks",),
+    ("cli",),
+)
+"""From the ground up; a module may import from its own floor (its own package there) and those below."""
+NEVER = {("store", "tasks"), ("behaviours.policies", "rendering"), ("agents", "behaviours.learning")}
+"""Floors that do not know each other, although one is above the other."""
+
+
+def modules() -> dict[str, Path]:
+    """Module name -> file, of the whole package."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT.parent).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports_of(name: str, path: Path, known: dict[str, Path]) -> set[str]:
+    """Modules of the package that a module imports, anywhere in it, but for the eyes of a type checker."""
+    found: set[str] = set()
+
+    def visit(node: ast.AST) -> None:
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            for child in node.orelse:
+                visit(child)
+            return
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name} has a relative import"
+            for alias in node.names:
+                inside = f"{node.module}.{alias.name}"
+                found.add(inside if inside in known else node.module)
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(path.read_text()))
+    return {other for other in found if other in known} - {name}
+
+
+def floor_of(name: str) -> tuple[int, str]:
+    """(height, floor) of a module; the package itself, which holds the version and the front door, is the roof."""
+    inside = name.removeprefix("dmcvb_gen").lstrip(".")
+    for height, floor in enumerate(FLOORS):
+        for room in floor:
+            if inside == room or inside.startswith(f"{room}."):
+                return height, room
+    assert inside in ("", "__main__", "behaviours"), f"{name} has no place in the house; see DESIGN.md"
+    return len(FLOORS), inside
+
+
+def arrows() -> dict[str, set[str]]:
+    known = modules()
+    return {name: imports_of(name, path, known) - {"dmcvb_gen"} for name, path in known.items()}
+
+
+def test_every_module_can_be_imported():
+    for name in modules():
+        if name != "dmcvb_gen.__main__":  # which runs the command
+            importlib.import_module(name)
+
+
+def test_arrows_point_down():
+    wrong = set()
+    for name, others in arrows().items():
+        height, floor = floor_of(name)
+        for other in others:
+            below, other_floor = floor_of(other)
+            beside = below == height and floor != other_floor and height > 0
+            if below > height or beside or (floor, other_floor) in NEVER:
+                wrong.add(f"{name} imports {other}")
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def test_there_is_no_circle():
+    todo = arrows()
+    while todo:
+        free = [name for name, others in todo.items() if not others & set(todo)]
+        assert free, "in circles: " + ", ".join(sorted(_in_circles(todo)))
+        for name in free:
+            del todo[name]
+
+
+def _in_circles(arrows: dict[str, set[str]]) -> set[str]:
+    """Modules that can reach themselves."""
+    found = set()
+    for start in arrows:
+        seen, waiting = set(), list(arrows[start])
+        while waiting:
+            name = waiting.pop()
+            if name in arrows and name not in seen:
+                seen.add(name)
+                waiting += arrows[name]
+        if start in seen:
+            found.add(start)
+    return found
+
+
+def test_reading_a_store_needs_no_simulator():
+    code = "import sys, dmcvb_gen.store, dmcvb_gen.names; print([m for m in ('mujoco', 'torch') if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
