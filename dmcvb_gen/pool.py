@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import abc
 import atexit
+import itertools
 import multiprocessing
 import os
 import queue
@@ -45,12 +46,24 @@ def ignore(*_) -> None:
     """A tick for callers that show no progress."""
 
 
+class Later:
+    """A result that is on its way while its worker goes on with something else.
+
+    Args:
+      wait: gives the result once it is there, or raises what went wrong.
+    """
+
+    def __init__(self, wait: Callable[[], Any]):
+        self.wait = wait
+
+
 class Pool(abc.ABC):
     """Where functions are run; a context manager that ends its workers when it is left, at once on an error.
 
     `submit(key, function, *arguments)` has `function(*arguments, tick=...)` run; `results()` gives (key, result) as
     they come, until nothing is left of what was submitted, then or meanwhile. The first exception of a function is
-    raised by `results()`.
+    raised by `results()`. A function may give a `Later`: its worker takes the next piece of work, and the result comes
+    when it is there.
     """
 
     @abc.abstractmethod
@@ -85,9 +98,18 @@ class SerialPool(Pool):
         self._waiting.append((key, function, arguments))
 
     def results(self):
-        while self._waiting:
-            key, function, arguments = self._waiting.popleft()
-            yield key, function(*arguments, tick=self._tick)
+        late: deque[tuple[Any, Later]] = deque()
+        while self._waiting or late:
+            if self._waiting:
+                key, function, arguments = self._waiting.popleft()
+                result = function(*arguments, tick=self._tick)
+                if not isinstance(result, Later):
+                    yield key, result
+                    continue
+                late.append((key, result))
+            while late and (len(late) > 1 or not self._waiting):
+                key, later = late.popleft()
+                yield key, later.wait()
 
 
 class ProcessPool(Pool):
@@ -105,10 +127,13 @@ class ProcessPool(Pool):
     def __init__(self, workers: int, threads: int = 1, tick: Tick = ignore, kept: str = KEPT):
         context = multiprocessing.get_context("spawn")
         self._workers, self._tick, self._kept = workers, tick, kept
-        self._ticks = context.Queue()
-        self._pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(self._ticks, threads))
+        self._ticks, self._late = context.Queue(), context.Queue()
+        queues = (self._ticks, self._late)
+        self._pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(*queues, threads))
         self._waiting: deque = deque()
-        self._running: dict[Future, Any] = {}
+        self._running: dict[Future, tuple[int, Any]] = {}
+        self._on_their_way: dict[int, Any] = {}
+        self._numbers = itertools.count()
 
     def submit(self, key, function, *arguments):
         self._waiting.append((key, function, arguments))
@@ -116,11 +141,16 @@ class ProcessPool(Pool):
     def results(self):
         try:
             self._hand_out()
-            while self._running:
+            while self._running or self._on_their_way:
                 done, _ = wait(self._running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
                 self._pass_on()
                 for future in done:
-                    yield self._running.pop(future), future.result()
+                    (number, key), result = self._running.pop(future), future.result()
+                    if isinstance(result, _OnItsWay):
+                        self._on_their_way[number] = key
+                    else:
+                        yield key, result
+                yield from self._arrived()
                 self._hand_out()
         except BrokenProcessPool:
             raise StoreError(
@@ -131,7 +161,27 @@ class ProcessPool(Pool):
     def _hand_out(self) -> None:
         while self._waiting and len(self._running) < IN_FLIGHT * self._workers:
             key, function, arguments = self._waiting.popleft()
-            self._running[self._pool.submit(_work, function, arguments)] = key
+            number = next(self._numbers)
+            self._running[self._pool.submit(_work, number, function, arguments)] = (number, key)
+
+    def _arrived(self) -> Iterator[tuple[Any, Any]]:
+        while self._on_their_way:
+            try:
+                number, result, error = self._late.get(block=not self._running, timeout=POLL_SECONDS)
+            except queue.Empty:
+                self._check_alive()
+                return
+            if number not in self._on_their_way:  # faster than the word that it is on its way
+                self._late.put((number, result, error))
+                return
+            key = self._on_their_way.pop(number)
+            if error is not None:
+                raise error
+            yield key, result
+
+    def _check_alive(self) -> None:
+        if not self._running and any(not process.is_alive() for process in (self._pool._processes or {}).values()):
+            raise BrokenProcessPool
 
     def _pass_on(self) -> None:
         try:
@@ -147,6 +197,7 @@ class ProcessPool(Pool):
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._pass_on()
         self._ticks.close()
+        self._late.close()
 
 
 def open_pool(workers: int = 1, *, threads: int = 1, tick: Tick = ignore, kept: str = KEPT) -> Pool:
@@ -173,11 +224,16 @@ def run_all(
 
 
 _ticks: multiprocessing.Queue | None = None
+_late: multiprocessing.Queue | None = None
 
 
-def _start(ticks, threads: int) -> None:
-    global _ticks
-    _ticks = ticks
+class _OnItsWay:
+    """Stands for a `Later`, which stays in its worker."""
+
+
+def _start(ticks, late, threads: int) -> None:
+    global _ticks, _late
+    _ticks, _late = ticks, late
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     limit_threads(threads)
@@ -205,5 +261,16 @@ def _tell(*facts: Any) -> None:
     _ticks.put(facts)
 
 
-def _work(function: Callable, arguments: tuple) -> Any:
-    return function(*arguments, tick=_tell)
+def _work(number: int, function: Callable, arguments: tuple) -> Any:
+    result = function(*arguments, tick=_tell)
+    if not isinstance(result, Later):
+        return result
+    threading.Thread(target=_wait, args=(number, result), daemon=True).start()
+    return _OnItsWay()
+
+
+def _wait(number: int, later: Later) -> None:
+    try:
+        _late.put((number, later.wait(), None))
+    except BaseException as error:
+        _late.put((number, None, error))

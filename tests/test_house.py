@@ -28,6 +28,10 @@ FLOORS = (
 """From the ground up; a module may import from its own floor (its own package there) and those below."""
 NEVER = {("store", "tasks"), ("behaviours.policies", "rendering"), ("agents", "behaviours.learning")}
 """Floors that do not know each other, although one is above the other."""
+NOT_YET = {"dmcvb_gen.readers.release imports dmcvb_gen.release.remote"}
+"""Arrows that still point up; nothing may be added."""
+CIRCLE = {"dmcvb_gen.readers.blocks", "dmcvb_gen.readers.release", "dmcvb_gen.readers.torch_data"}
+"""Modules that still import each other; nothing may be added."""
 
 
 def modules() -> dict[str, Path]:
@@ -93,14 +97,17 @@ def test_arrows_point_down():
             beside = below == height and floor != other_floor and height > 0
             if below > height or beside or (floor, other_floor) in NEVER:
                 wrong.add(f"{name} imports {other}")
-    assert not wrong, "\n".join(sorted(wrong))
+    assert wrong <= NOT_YET, "\n".join(sorted(wrong))
 
 
 def test_there_is_no_circle():
     todo = arrows()
     while todo:
         free = [name for name, others in todo.items() if not others & set(todo)]
-        assert free, "in circles: " + ", ".join(sorted(_in_circles(todo)))
+        if not free:
+            circle = _in_circles(todo)
+            assert circle <= CIRCLE, "in circles: " + ", ".join(sorted(circle))
+            free = sorted(circle)
         for name in free:
             del todo[name]
 

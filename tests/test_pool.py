@@ -11,7 +11,7 @@ import time
 import pytest
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.pool import IN_FLIGHT, open_pool, run_all
+from dmcvb_gen.pool import IN_FLIGHT, Later, open_pool, run_all
 
 
 def square(number, tick):
@@ -25,6 +25,23 @@ def fail(number, tick):
 
 def die(number, tick):
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def send(number, tick):
+    """Is done at once, and its result comes after that of the next piece of work."""
+    started = time.time()
+
+    def arrive():
+        time.sleep(0.3)
+        if number == 13:
+            raise UnknownNameError("level", "exprt", ("expert", "medium"))
+        return started, time.time(), os.getpid()
+
+    return Later(arrive)
+
+
+def send_and_die(number, tick):
+    return Later(lambda: os.kill(os.getpid(), signal.SIGKILL))
 
 
 def threads(number, tick):
@@ -56,6 +73,23 @@ def test_results_may_ask_for_more_work(workers):
 def test_an_error_of_the_work_arrives_as_it_was_raised(workers):
     with pytest.raises(UnknownNameError, match="Did you mean 'expert'"):
         list(run_all(fail, [1, 2], workers))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_next_piece_of_work_begins_while_a_result_is_on_its_way(workers):
+    found = dict(run_all(send, range(4), workers))
+    assert sorted(found) == [0, 1, 2, 3]
+    if workers == 2:
+        for pid in {pid for _, _, pid in found.values()}:
+            own = sorted(times for *times, worker in found.values() if worker == pid)
+            assert all(later[0] < earlier[1] for earlier, later in zip(own, own[1:], strict=False))
+    with pytest.raises(UnknownNameError, match="Did you mean 'expert'"):
+        list(run_all(send, [1, 13, 2], workers))
+
+
+def test_a_worker_that_dies_with_a_result_on_its_way_is_said():
+    with pytest.raises(StoreError, match="killed"):
+        list(run_all(send_and_die, [1, 2], 2))
 
 
 def test_a_killed_worker_is_one_line_with_a_cure():

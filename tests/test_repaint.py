@@ -139,4 +139,4 @@ def test_a_maze_repainted_for_evaluation_is_what_its_rollout_would_be(tmp_path):
     for folder, styles in (("train", {2, 3, 4, 5}), ("val", {1})):
         for subset in open_release(tmp_path / folder).subsets.values():
             assert set((subset.read("exogenous/style") // 100).ravel()) <= styles
-    assert verify(tmp_path / "val").sound and Regeneration(tmp_path / "val").check().sound
+    assert Regeneration(tmp_path / "val").check().sound
