@@ -186,6 +186,24 @@ def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
     assert "Incomplete: 5 of 9 episodes" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_imported_data_are_checked_trained_on_and_evaluated_by_our_renderer(small_release, tmp_path):
+    exported = run(
+        *("export", small_release, "--only", "walker-walk/random/dynamic", "--to", "rlds", "--out", tmp_path / "rlds")
+    )
+    assert exported.exit_code == 0, exported.output
+    [features] = (tmp_path / "rlds").rglob("features.json")
+    shutil.copytree(features.parent, tmp_path / "locomotion/walker_walk/random/dynamic_medium")
+    imported = run("import", tmp_path / "locomotion", "--out", tmp_path / "release")
+    assert imported.exit_code == 0, imported.output
+    result = run(
+        *("validate", tmp_path / "release", "--agents", "bc,state-bc", "--threads", 1),
+        *("--out", tmp_path / "out"),
+    )
+    assert result.exit_code == 0, result.output
+    facts = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert facts["sound"] and {r["cell"]["agent_name"] for r in facts["results"]} == {"bc", "state-bc"}
+
+
 def test_names_are_text_on_the_page(report, release):
     from dmcvb_gen.benchmarks.report import render_page
 

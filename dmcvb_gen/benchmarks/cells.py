@@ -231,7 +231,7 @@ def _facts(
     )
     return {
         "id": cell.id,
-        "cell": cell.facts() | {"policy_label": cell.policy_label},
+        "cell": cell.facts() | {"policy_label": cell.policy_label, "pretrain_label": cell.pretrain_label},
         "profile": dataclasses.asdict(profile),
         "score": best["score"] | {"step": best["step"]},
         "final": evaluations[-1]["score"],

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.tables import Cell
+from dmcvb_gen.names import task_folder
 from dmcvb_gen.store import Release
 
 DPI = 110
@@ -65,13 +66,15 @@ def curve_figure(results: Sequence[tuple[Cell, dict[str, Any]]], profile: str) -
         groups.setdefault((cell.benchmark, cell.task, cell.policy_label, cell.setting), []).append((cell, result))
     colors = {name: f"C{index}" for index, name in enumerate(dict.fromkeys(label_of(cell) for cell, _ in results))}
     figure = Figure(figsize=(11, 2.8 * len(groups)), layout="constrained")
-    for line, (key, members) in enumerate(groups.items()):
+    for line, members in enumerate(groups.values()):
         loss, score = (figure.add_subplot(len(groups), 2, 2 * line + column) for column in (1, 2))
         for cell, result in members:
             _draw_curve(loss, score, label_of(cell), colors[label_of(cell)], result["curve"])
         data = members[0][1]["data"]["mean"]
         score.axhline(data, color="gray", linestyle="--", linewidth=1, label="data")
-        loss.set(title=f"{'/'.join(key[1:])}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log")
+        loss.set(
+            title=f"{place_of(members[0][0])}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log"
+        )
         score.set(title=f"online return [{profile}]", xlabel="Adam step")
         if data > 0:
             score.set_ylim(bottom=0)
@@ -84,8 +87,12 @@ def curve_figure(results: Sequence[tuple[Cell, dict[str, Any]]], profile: str) -
 
 def label_of(cell: Cell) -> str:
     """A cell among those of its task and policy set: its agent, and what else its encoder learned from."""
-    source = "+".join(part.label for part in cell.pretrain)
-    return f"{cell.agent.name} (encoder: {source})" if source else cell.agent.name
+    return f"{cell.agent.name} (encoder: {cell.pretrain_label})" if cell.pretrain else cell.agent.name
+
+
+def place_of(cell: Cell) -> str:
+    """A cell's task, policy set and setting."""
+    return f"{task_folder(cell.task)}/{cell.policy_label}/{cell.setting}"
 
 
 def _draw_curve(loss, score, label: str, color: str, curve: list[dict[str, Any]]) -> None:

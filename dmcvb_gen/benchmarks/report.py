@@ -18,12 +18,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from dmcvb_gen import __version__
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
-from dmcvb_gen.benchmarks.figures import curve_figure, data_url, figure_url, label_of, return_figure
+from dmcvb_gen.benchmarks.figures import curve_figure, data_url, figure_url, label_of, place_of, return_figure
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.setup import Setup
-from dmcvb_gen.benchmarks.tables import Cell, Missing, Part
+from dmcvb_gen.benchmarks.tables import Cell, Missing
 from dmcvb_gen.files import write_json, write_text
-from dmcvb_gen.names import FIXED
+from dmcvb_gen.names import FIXED, task_folder
 from dmcvb_gen.release.verify import Finding
 from dmcvb_gen.rollout.info import return_statistics
 from dmcvb_gen.store import Release
@@ -247,9 +247,7 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     data: dict[tuple, list[str]] = {}
     for result in results:
         cell = result["cell"]
-        source = "+".join(_label(part) for part in cell["pretrain"])
-        policy = cell["policy_label"] + (f" (encoder: {source})" if source else "")
-        key = (cell["task"], policy, cell["setting"])
+        key = (task_folder(cell["task"]), cell["policy_label"], cell["setting"])
         data[key] = _data_lines(result["data"])
         rows.setdefault(key, {})[cell["agent_name"]] = entry = _score(result)
         if cell["agent"]["sees_state"] and benchmark == "b1":
@@ -266,8 +264,9 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _label(part: Mapping[str, Any]) -> str:
-    return Part(**part).label
+def _number(value: float) -> str:
+    """A return: one decimal where that is worth something."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
 def _score(result: Mapping[str, Any]) -> dict[str, Any]:
@@ -278,11 +277,13 @@ def _score(result: Mapping[str, Any]) -> dict[str, Any]:
         lines.insert(0, f"{100 * result['share']:.0f} % of {result['reference']}")
     elif result["difference"] and result["profile"]["scores"]:  # 0 is the reference itself
         side = "above" if result["difference"] > 0 else "below"
-        lines.insert(0, f"{abs(result['difference']):.0f} {side} {result['reference']}")
+        lines.insert(0, f"{_number(abs(result['difference']))} {side} {result['reference']}")
+    if result["cell"]["pretrain_label"]:
+        lines.append(f"encoder: {result['cell']['pretrain_label']}")
     if paper:
         share = f", {100 * result['paper_share']:.0f} %" if result["paper_share"] is not None else ""
         paper = {"mean": f"{paper['mean']:.0f}", "stderr": f"{paper['stderr']:.0f}", "share": share}
-    return {"mean": f"{score['mean']:.0f}", "stderr": f"{score['stderr']:.0f}", "lines": lines, "paper": paper}
+    return {"mean": _number(score["mean"]), "stderr": _number(score["stderr"]), "lines": lines, "paper": paper}
 
 
 def _goal_lines(score: Mapping[str, Any]) -> list[str]:
@@ -294,7 +295,7 @@ def _goal_lines(score: Mapping[str, Any]) -> list[str]:
 
 
 def _data_lines(data: Mapping[str, Any]) -> list[str]:
-    return [f"{data['mean']:.0f}", *_goal_lines(data)]
+    return [_number(data["mean"]), *_goal_lines(data)]
 
 
 def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -320,7 +321,7 @@ def _inspection(good: Results, profile: str) -> list[tuple]:
     return [
         (
             label_of(cell),
-            f"{cell.task}/{cell.policy_label}/{cell.setting}",
+            place_of(cell),
             *(
                 "-" if result["inspection"][key] is None else f"{result['inspection'][key]:.4f}"
                 for key in ("observation_mse", "state_mse")
@@ -339,11 +340,11 @@ def _sheets(good: Results, setup: Setup, kind: str) -> list[dict[str, str]]:
         path = setup.cells / f"{cell.id}.{kind}.png"
         if not path.exists() or cell.agent.sees_state:
             continue
-        caption = f"{label_of(cell)}, {cell.task} {cell.policy_label}/{cell.setting}"
+        caption = f"{label_of(cell)} on {place_of(cell)}"
         if kind == "rollout":
             score = result["final"]
             caption += f": first of {len(score['returns'])} episodes of the last evaluation, return "
-            caption += f"{score['returns'][0]:.0f} [{setup.profile.name}]"
+            caption += f"{_number(score['returns'][0])} [{setup.profile.name}]"
         found.append({"caption": caption, "source": data_url(path.read_bytes())})
     return found
 

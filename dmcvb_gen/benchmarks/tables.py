@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shlex
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -86,6 +87,15 @@ class Cell:
     @property
     def policy_label(self) -> str:
         return "+".join(part.label for part in self.policy)
+
+    @property
+    def pretrain_label(self) -> str:
+        """What the encoder learns from, with its setting where that is another one; "" for the policy's data."""
+        labels = []
+        for part in self.pretrain:
+            setting = part.subset.split("/")[-1]
+            labels.append(part.label if setting == self.setting else f"{part.label}, {setting}")
+        return "+".join(labels)
 
     @property
     def pretrain_parts(self) -> tuple[Part, ...]:
@@ -212,7 +222,7 @@ class _Shelf:
         settings = dict.fromkeys(setting for _, setting in have + lacking)
         counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
         count = max(counts, default=DEFAULT_EPISODES)
-        rollout = f"dmcvb-gen rollout {task} " + " ".join(f"--level {level}" for level in levels)
+        rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
         out = f"--out releases/{slug(benchmark)}"
         if family_of(task) != ANT_MAZE:
             return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count} {out}"

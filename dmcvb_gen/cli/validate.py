@@ -88,6 +88,8 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
 
 
 def _show(result, profile) -> None:
+    from dmcvb_gen.names import task_folder
+
     for finding in result.structure.findings[:50]:
         click.echo(f"FAIL {finding}")
     for cell, error in result.failed:
@@ -99,7 +101,7 @@ def _show(result, profile) -> None:
             continue
         score, paper = facts["score"], facts["paper"]
         beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if paper else ""
-        where = f"{cell.task} {cell.policy_label}/{cell.setting}"
+        where = f"{task_folder(cell.task)} {cell.policy_label}/{cell.setting}"
         goal = "" if score["success"] is None else f", success {100 * score['success']:.0f} %"
         goal += "" if score["speed"] is None else f" at {score['speed']:.2f} m/s"
         score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]"
