@@ -10,20 +10,29 @@ import torch
 
 from dmcvb_gen.behaviours.learning.runs import Run
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 
+HURRY = 0.1
+"""What a step in a maze costs, lying on the back costs 1 more: the reward itself is 0 in the whole goal cell."""
+
 
 def shaping_of(task: Task) -> Callable[[np.ndarray], np.ndarray]:
-    """(n, state) -> (n,) in [0, 1]: a hint that a learner may be given; only humanoid-walk has one.
+    """(n, state) -> (n,): a hint that a learner may be given; humanoid-walk and mazes have one, others 0.
 
-    Its reward is zero on the floor; the hint is how high and upright it is. It is full once the
-    humanoid stands, so it does not change which gait is best.
+    Humanoid-walk's reward is zero on the floor; the hint, in [0, 1], is how high and upright it is. It is full once the
+    humanoid stands, so it does not change which gait is best. An ant on its back never gets up again; the hint, in
+    [-1.1, -0.1], is how far it has tipped over, and that time passes.
     """
-    if task.id != "humanoid-walk":
-        return lambda state: np.zeros(len(state))
-    height, vertical = task.state_slices["head_height"].start, task.state_slices["torso_vertical"].start + 2
-    return lambda state: np.clip(state[:, height] / 1.4, 0, 1) ** 2 * (1 + state[:, vertical]) / 2
+    slices = task.state_slices
+    if task.id == "humanoid-walk":
+        height, vertical = slices["head_height"].start, slices["torso_vertical"].start + 2
+        return lambda state: np.clip(state[:, height] / 1.4, 0, 1) ** 2 * (1 + state[:, vertical]) / 2
+    if task.family == ANT_MAZE:
+        upright = slices["world_zaxis"].start + 2
+        return lambda state: (state[:, upright] - 1) / 2 - HURRY
+    return lambda state: np.zeros(len(state))
 
 
 def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndarray:
