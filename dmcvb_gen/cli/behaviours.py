@@ -119,8 +119,9 @@ def select_checkpoints(run, episodes, seed, sample, as_json):
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @click.option("--sample", is_flag=True, help="Draw actions instead of taking mean ones.")
+@click.option("--pictures", type=click.Path(path_type=Path), help="A folder for pictures of ten paths a maze.")
 @json_option
-def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, as_json):
+def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, pictures, as_json):
     """Returns of behaviour policies over fresh episodes, beside the paper's.
 
     Without TASK: every bundled policy, and random actions in its task; with --behaviour, that policy or run.
@@ -128,15 +129,17 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, as_json
     \b
     dmcvb-gen evaluate-behaviour
     dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
+    dmcvb-gen evaluate-behaviour ant-maze-easy7x7a --level expert --level medium --pictures paths
     """
     from dmcvb_gen.behaviours.policies.actor import random_policy
     from dmcvb_gen.behaviours.policies.bundled import bundled_levels, levels_of, resolve_policies
-    from dmcvb_gen.behaviours.policies.evaluation import maze_scores
+    from dmcvb_gen.behaviours.policies.evaluation import maze_scores, running_speed, walked_paths
     from dmcvb_gen.behaviours.policies.paper import paper_returns
     from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
     from dmcvb_gen.behaviours.policies.simulate import simulate
     from dmcvb_gen.rollout.info import return_statistics
     from dmcvb_gen.tasks import get_task, task_ids
+    from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
 
     if behaviour:
         levels = levels or levels_of(behaviour)
@@ -145,7 +148,7 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, as_json
         tasks = tasks or sorted({read_header(path).task for path in files})
     rows = []
     for task_id in tasks or [task_id for task_id in task_ids() if bundled_levels(task_id)]:
-        task = get_task(task_id)
+        task, panels = get_task(task_id), {}
         for level in levels or [*bundled_levels(task_id), "random"]:
             if level == "random":
                 policies = [random_policy(task)]
@@ -155,19 +158,24 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, as_json
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
             row |= dict(mode="sampled" if sample else "mean", returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
-            row |= {} if success is None else dict(success=success, speed=speed)
+            if success is not None:
+                row |= dict(success=success, speed=speed, running_speed=running_speed(task, out))
+                panels[f"{level}, {success:.0%} at the goal"] = walked_paths(task, out)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
+        if pictures and panels:
+            save_paths_picture(task.layout, panels, pictures / f"{task_id}.png")
     if as_json:
         return print_json(rows)
     mazes = any("success" in row for row in rows)
     table = Table(title=f"{episodes} episodes each, seed {seed}, {rows[0]['mode']} actions")
     columns = ("mean", "std", "min", "p25", "median", "p75", "max")
-    for column in ("task", "level", *columns, *(("success", "speed m/s") if mazes else ())):
+    for column in ("task", "level", *columns, *(("success", "to goal m/s", "rms m/s") if mazes else ())):
         table.add_column(column, justify="left" if column in ("task", "level") else "right")
     for row in rows:
         extra = []
         if "success" in row:
             extra = [f"{row['success']:.0%}", "-" if row["speed"] is None else f"{row['speed']:.2f}"]
+            extra.append(f"{row['running_speed']:.2f}")
         table.add_row(row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in columns), *extra)
         if row["paper"]:
             table.add_row("", "  DMC-VB paper", *(f"{row['paper'][key]:.1f}" for key in columns), style="dim")

@@ -21,7 +21,6 @@ import abc
 import contextlib
 import dataclasses
 import fcntl
-import functools
 import io
 import json
 import os
@@ -37,7 +36,7 @@ from dmcvb_gen.behaviours.learning.networks import as_arrays
 from dmcvb_gen.behaviours.learning.run_log import RunLog
 from dmcvb_gen.behaviours.learning.settings import check_settings
 from dmcvb_gen.behaviours.learning.thinning import superfluous
-from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
+from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.evaluation import evaluate
 from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.behaviours.policies.paper import paper_returns
@@ -48,8 +47,9 @@ from dmcvb_gen.tasks import get_task
 
 EVALUATION_EPISODES = 20
 """Episodes of the evaluations along the way; selection evaluates its picks again on 100."""
-DENSE_SHARE = 0.6
-"""Share of the paper's expert return below which evaluations are dense: medium and mixed are picked from there."""
+DENSE_SHARE = 0.2
+"""Share of the way from the paper's medium return to its expert's below which evaluations are dense: medium and mixed
+are picked from there."""
 SAVE_SECONDS = 240
 """Seconds after which the next evaluation also saves the state to resume from."""
 
@@ -65,7 +65,7 @@ class RunConfig:
       steps: agent steps (at action repeat 2) to train; a resumed run may have more.
       evaluate_every: agent steps between evaluations (and policy files) while the return is low, where medium and
         mixed checkpoints are picked from.
-      evaluate_sparse: the same once 60 % of the paper's expert return is reached.
+      evaluate_sparse: the same once a fifth of the way from the paper's medium return to its expert's is behind.
       init_from: policy file or run whose actor, critics and normalization it starts from.
     """
 
@@ -243,8 +243,11 @@ class Run(abc.ABC):
         """The agent step of the evaluation after this one: the planned one, where the run ended before it."""
         if self.step < planned:
             return planned
-        config, expert = self.config, paper_returns(self.task.id, "expert")
-        dense = expert is None or evaluation.mean < self._base + DENSE_SHARE * (expert["mean"] - self._base)
+        config = self.config
+        expert, medium = (paper_returns(self.task.id, level) for level in ("expert", "medium"))
+        dense = True
+        if expert and medium:
+            dense = evaluation.mean < medium["mean"] + DENSE_SHARE * (expert["mean"] - medium["mean"])
         return self.step + (config.evaluate_every if dense else config.evaluate_sparse)
 
     def save(self, state: dict[str, Any]) -> None:
@@ -263,13 +266,6 @@ class Run(abc.ABC):
             temporary.unlink(missing_ok=True)
 
     # -- the folder -------------------------------------------------------------------------
-
-    @functools.cached_property
-    def _base(self) -> float:
-        """Return at 0 % of the way: the random policy's where returns are negative, as in the selection."""
-        if self.task.return_range[1] > 0:
-            return 0.0
-        return evaluate(random_policy(self.task), self.task, EVALUATION_EPISODES, seed=0)[0].mean
 
     def _checkpoint(self, step: int) -> Path:
         return self.folder / "checkpoints" / f"{step:010d}.safetensors"

@@ -58,3 +58,23 @@ def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float
     seconds = simulation.length * ACTION_REPEAT * task.control_timestep
     speed = arithmetic.norm(simulation.state[:, 0, part]) / seconds
     return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None
+
+
+def running_speed(task: Task, simulation: Simulation) -> float | None:
+    """Root mean square of the torso's speed over all steps of all episodes, m/s; None for a task without a goal.
+
+    How fast the ants run, however well they know the way; standing still counts.
+    """
+    part = task.state_slices.get("walker_position")
+    if part is None:
+        return None
+    moved = np.diff(simulation.state[..., part].astype(np.float64), axis=1)
+    taken = np.arange(moved.shape[1]) < simulation.length[:, None]
+    return float(np.sqrt((moved[taken] ** 2).sum(axis=1).mean()) / (ACTION_REPEAT * task.control_timestep))
+
+
+def walked_paths(task: Task, simulation: Simulation, count: int = 10) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The first episodes' paths, (point, 2), and goals, (2), of a maze: x and y in meters."""
+    place, goal = task.state_slices["walker_position"], task.state_slices["target_position"]
+    states = zip(simulation.state[:count], simulation.length[:count], strict=True)
+    return [(state[: length + 1, place][:, :2], state[0, goal][:2]) for state, length in states]
