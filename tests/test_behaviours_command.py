@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from dmcvb_gen.behaviours.learning.defaults import parse_settings
 from dmcvb_gen.behaviours.learning.training import RunConfig, command_of
 from dmcvb_gen.behaviours.policies.bundled import bundled_folder, bundled_levels
-from dmcvb_gen.behaviours.policies.evaluation import maze_scores
+from dmcvb_gen.behaviours.policies.evaluation import maze_scores, running_speed
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import train_behaviour
@@ -48,6 +48,21 @@ def test_speed_is_meters_a_second_of_the_ants_that_got_there():
     assert maze_scores(*simulation([100, 80, 1200], [True, True, False], [5, 2, 9])) == pytest.approx((2 / 3, 0.75))
     assert maze_scores(*simulation([1200], [False], [3])) == (0.0, None)
     assert maze_scores(get_task("walker-walk"), None) == (None, None)
+
+
+def test_running_speed_counts_every_step_of_every_episode():
+    task, ran = simulation([2, 1], [False, True], [5, 2])
+    place = task.state_slices["walker_position"].start
+    ran.state[0, :, place] = [0, 0.1, 0.1]  # 2 m/s, then still
+    ran.state[1, :, place] = [3, 3.05, 0]  # 1 m/s; what lies past its end does not count
+    assert running_speed(task, ran) == pytest.approx(((2**2 + 0 + 1**2) / 3) ** 0.5, rel=1e-5)
+    assert running_speed(get_task("walker-walk"), None) is None
+
+
+def test_paths_of_a_maze_are_painted(tmp_path):
+    arguments = ("ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2, "--pictures", tmp_path / "p")
+    assert "rms m/s" in evaluated(*arguments)
+    assert [path.name for path in (tmp_path / "p").iterdir()] == ["ant-maze-easy7x7a.png"]
 
 
 def evaluated(*arguments):
