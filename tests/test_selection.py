@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from dmcvb_gen.behaviours.learning.networks import Actor, as_arrays
 from dmcvb_gen.behaviours.learning.run_log import COLUMNS
 from dmcvb_gen.behaviours.learning.selection import (
-    MAZE_LEVELS,
     MIXED_COUNT,
     converge,
     pick_checkpoints,
@@ -23,9 +22,11 @@ from dmcvb_gen.behaviours.learning.selection import (
 from dmcvb_gen.behaviours.learning.thinning import LIMIT, superfluous
 from dmcvb_gen.behaviours.policies.bundled import level_files
 from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.behaviours.policies.paper import medium_return
 from dmcvb_gen.behaviours.policies.policy_file import read_header, save_policy
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import MAZE_TRAINED_LEVELS as MAZE_LEVELS
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -33,6 +34,10 @@ STEPS = np.arange(1, 101) * 1000
 def rising(top=1000.0, at=40, base=0.0):
     """A line from base to top, then a plateau."""
     return base + (top - base) * np.minimum(np.arange(1, 101) / at, 1)
+
+
+def points_of(returns):
+    return [(int(step), float(value), Path(str(i))) for i, (step, value) in enumerate(zip(STEPS, returns, strict=True))]
 
 
 def select(returns, base=0.0, noise=0.0, fresh=None):
@@ -47,7 +52,7 @@ def select(returns, base=0.0, noise=0.0, fresh=None):
 
     def measure(path):
         value = float(truth[int(path.name)])
-        return Evaluation(mean=value, std=abs(noise), episodes=100, mode="sampled", seed=0)
+        return Evaluation(mean=value, std=abs(noise), episodes=100, mode="mean", seed=0)
 
     return pick_checkpoints(curve, base, converge([p[0] for p in curve], seen, base), measure)
 
@@ -56,10 +61,22 @@ def test_a_monotone_curve_gives_the_first_at_95_and_the_one_at_50():
     found = select(rising())
     assert found.convergence.converged and found.convergence.value == pytest.approx(1000, rel=0.01)
     assert found.picks["expert"][0].step == 38_000 and found.picks["medium"][0].step == 20_000
-    mixed = [pick.evaluation.mean for pick in found.picks["mixed"]]
+    mixed = [pick.step for pick in found.picks["mixed"]]
     assert len(mixed) == MIXED_COUNT
-    np.testing.assert_allclose(mixed, np.linspace(0, 500, MIXED_COUNT), atol=30)
+    np.testing.assert_allclose(mixed, np.linspace(0, 20_000, MIXED_COUNT), atol=1000)
     assert found.reasons == {}
+
+
+def test_mixed_is_even_in_training_steps_not_in_return():
+    """A curve that stays on the floor for three quarters of the way to medium."""
+    returns = np.concatenate([np.full(30, 10.0), np.linspace(10, 1000, 20), np.full(50, 1000.0)])
+    found = select(returns)
+    medium = found.picks["medium"][0]
+    assert medium.step == pytest.approx(40_000, abs=1000)
+    steps = [pick.step for pick in found.picks["mixed"]]
+    np.testing.assert_allclose(steps, np.linspace(0, medium.step, MIXED_COUNT), atol=1000)
+    assert found.picks["mixed"][-1].path == medium.path
+    assert sum(pick.evaluation.mean < 20 for pick in found.picks["mixed"]) == 6
 
 
 def test_noise_moves_the_picks_little_and_fresh_episodes_decide():
@@ -115,7 +132,39 @@ def test_a_jump_over_the_half_says_what_is_missing():
     returns = np.concatenate([np.full(30, 20.0), np.full(70, 1000.0)])
     found = select(returns)
     assert "expert" in found.picks and "evaluate more often" in found.reasons["medium"]
-    assert "evaluate more often" in found.reasons["mixed"]
+    assert found.reasons["mixed"] == found.reasons["medium"]
+
+
+def test_checkpoints_too_far_apart_for_mixed_say_which_is_missing():
+    returns = rising()
+    curve = points_of(returns)
+    sparse = [point for point in curve if not 4000 < point[0] < 15_000]
+
+    def measure(path):
+        return Evaluation(mean=float(returns[int(path.name)]), std=0, episodes=100, mode="mean", seed=0)
+
+    found = pick_checkpoints(sparse, 0.0, converge(STEPS, returns), measure)
+    assert "near step 5714 (number 3 of 8)" in found.reasons["mixed"] and "medium" in found.picks
+
+
+def test_a_maze_medium_is_nearest_to_the_papers_row():
+    returns = rising(top=-50.0, base=-450.0)
+    curve = points_of(returns)
+
+    def measure(path):
+        return Evaluation(mean=float(returns[int(path.name)]), std=0, episodes=100, mode="mean", seed=0)
+
+    picked = {}
+    for task_id in ("ant-maze-empty7x7", "ant-maze-easy7x7b", "ant-maze-medium7x7c"):
+        goal = medium_return(task_id)
+        found = pick_checkpoints(curve, -450.0, converge(STEPS, returns), measure, levels=MAZE_LEVELS, medium=goal)
+        assert found.picks["medium"][0].evaluation.mean == pytest.approx(goal, abs=10)
+        picked[task_id] = goal
+    assert picked == {"ant-maze-empty7x7": -172.2, "ant-maze-easy7x7b": -131.1, "ant-maze-medium7x7c": -176.0}
+    assert medium_return("walker-walk") is None and medium_return("ant-maze-mine:***/*.*/***") is None
+    high = [point for point in curve if point[1] > -120]
+    found = pick_checkpoints(high, -450.0, converge(STEPS, returns), measure, levels=MAZE_LEVELS, medium=-176.0)
+    assert "-176.0 +- 35.2" in found.reasons["medium"]
 
 
 def lucky_curve(seed, count=1000):
@@ -140,13 +189,14 @@ def test_thinning_takes_nothing_that_the_selection_needs(seed):
     convergence = converge([p[0] for p in points], [p[1] for p in points])
 
     def measure(path):
-        return Evaluation(mean=float(values[int(path.name) - 1]), std=0.0, episodes=100, mode="sampled", seed=0)
+        return Evaluation(mean=float(values[int(path.name) - 1]), std=0.0, episodes=100, mode="mean", seed=0)
 
     whole, after = (pick_checkpoints(curve, 0.0, convergence, measure) for curve in (points, thinned))
     assert after.picks["expert"] == whole.picks["expert"] and after.reasons == whole.reasons == {}
     assert after.picks["medium"][0].evaluation.mean == pytest.approx(0.5 * convergence.value, abs=10)
+    last = after.picks["medium"][0].step
     for index, pick in enumerate(after.picks["mixed"]):
-        assert pick.evaluation.mean == pytest.approx(0.5 * convergence.value * index / 7, abs=15)
+        assert pick.step == pytest.approx(last * index / 7, abs=last / 14)
 
 
 def test_short_runs_are_not_thinned_and_records_and_recent_ones_stay():
@@ -161,7 +211,7 @@ def test_negative_returns_are_thinned_by_level_too():
     curve = {step: -1200 + 1.1 * step + float(rng.normal(0, 5)) for step in range(1000)}
     left = set(curve) - set(superfluous(curve, (-2400.0, 0.0)))
     levels = sorted(curve[step] for step in left)
-    assert len(left) < 400 and max(np.diff(levels)) < 30  # 1 % of the range, 3 % of the way
+    assert len(left) < 450 and max(np.diff(levels)) < 30  # 1 % of the range, 3 % of the way
 
 
 @pytest.fixture
@@ -171,7 +221,7 @@ def run_folder(tmp_path):
         task="cheetah-run", observation_size=17, action_size=6, algorithm="sac", agent_step=0, hidden=(4,)
     )
     for index, value in enumerate(rising(top=6.0, at=20), 1):
-        evaluation = Evaluation(mean=float(value), std=1.0, episodes=20, mode="sampled", seed=0)
+        evaluation = Evaluation(mean=float(value), std=1.0, episodes=20, mode="mean", seed=0)
         torch.manual_seed(index)
         save_policy(
             tmp_path / "checkpoints" / f"{index * 1000:010d}.safetensors",
@@ -186,6 +236,7 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
     assert result.exit_code == 0, result.output
     found = json.loads(result.output)
     assert found["convergence"]["converged"] and found["convergence"]["value"] == pytest.approx(6)
+    assert all(pick["evaluation"]["mode"] == "mean" for level in found["levels"].values() for pick in level["picks"])
     assert json.loads((run_folder / "selection.json").read_text()) == found
     assert (run_folder / "curve.png").read_bytes().startswith(b"\x89PNG")
     for level, entry in found["levels"].items():
@@ -195,6 +246,11 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             header = read_header(path)
             assert header.level == level and header.evaluation.episodes == 3
             assert header.agent_step == pick["step"] and header.evaluation.mean == pick["evaluation"]["mean"]
+
+
+def test_a_short_run_may_be_told_where_a_longer_one_ends(run_folder):
+    found = select_checkpoints(run_folder, episodes=2, converged=10.0)
+    assert found.convergence.value == 10.0 and "9.5" in found.reasons["expert"]
 
 
 def test_points_of_thinned_and_half_written_checkpoints(run_folder):
@@ -235,7 +291,7 @@ def test_mazes_have_no_mixed_level():
     ]
 
     def measure(path):
-        return Evaluation(mean=curve[int(path.name)][1], std=0, episodes=100, mode="sampled", seed=0)
+        return Evaluation(mean=curve[int(path.name)][1], std=0, episodes=100, mode="mean", seed=0)
 
     convergence = converge([p[0] for p in curve], [p[1] for p in curve], -450)
     found = pick_checkpoints(curve, -450, convergence, measure, levels=MAZE_LEVELS)

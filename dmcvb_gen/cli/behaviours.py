@@ -75,9 +75,13 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes a pick.")
 @click.option("--seed", type=click.IntRange(0), default=20_000, show_default=True)
 @click.option("--sample", is_flag=True, help="Judge drawn actions instead of mean ones.")
+@click.option("--converged", type=float, help="Return at convergence, of a longer run.  [default: from the curve]")
 @json_option
-def select_checkpoints(run, episodes, seed, sample, as_json):
-    """Pick the expert (95 %), medium (50 %) and mixed (0 to 50 %) checkpoints of a run.
+def select_checkpoints(run, episodes, seed, sample, converged, as_json):
+    """Pick the expert, medium and mixed checkpoints of a run.
+
+    Expert: the first with 95 % of the return at convergence; medium: half of it (mazes: nearest to the paper's row);
+    mixed: eight, evenly spaced in training steps from the start to medium.
 
     \b
     dmcvb-gen select-checkpoints runs/walker-walk
@@ -85,7 +89,7 @@ def select_checkpoints(run, episodes, seed, sample, as_json):
     """
     from dmcvb_gen.behaviours.learning import selection as module
 
-    picked = module.select_checkpoints(run, episodes, seed, not sample)
+    picked = module.select_checkpoints(run, episodes, seed, not sample, converged)
     if as_json:
         return print_json(module.selection_json(picked))
     console = Console()
@@ -93,14 +97,14 @@ def select_checkpoints(run, episodes, seed, sample, as_json):
     end = picked.convergence
     console.print(f"{picked.task}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
     table = Table()
-    for column in ("pick", "agent step", "share aimed at", "mean", "std"):
+    for column in ("pick", "agent step", "aimed at", "mean", "std"):
         table.add_column(column, justify="right" if column != "pick" else "left")
     for picks in picked.picks.values():
         for pick in picks:
             table.add_row(
                 pick.name,
                 f"{pick.step:,}",
-                f"{pick.target:.0%}",
+                pick.target,
                 f"{pick.evaluation.mean:.1f}",
                 f"{pick.evaluation.std:.1f}",
             )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
@@ -36,16 +37,17 @@ def spherical(position: np.ndarray) -> np.ndarray:
     """(..., 3) x y z -> (..., 3) radius, polar angle, azimuth in [-pi, pi)."""
     x, y, z = np.moveaxis(np.asarray(position, np.float64), -1, 0)
     radius = np.sqrt(x * x + y * y + z * z)
-    azimuth = np.arctan2(y, x)
+    azimuth = arithmetic.arctan2(y, x)
     azimuth = np.where(azimuth >= np.pi - 1e-9, azimuth - 2 * np.pi, azimuth)
-    return np.stack([radius, np.arccos(np.clip(z / radius, -1, 1)), azimuth], axis=-1)
+    return np.stack([radius, arithmetic.arccos(np.clip(z / radius, -1, 1)), azimuth], axis=-1)
 
 
 def cartesian(coordinates: np.ndarray) -> np.ndarray:
     """(..., 3) radius, polar angle, azimuth -> (..., 3) x y z."""
     radius, polar, azimuth = np.moveaxis(coordinates, -1, 0)
-    flat = radius * np.sin(polar)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.cos(polar)], axis=-1)
+    (sin_polar, cos_polar), (sin_azimuth, cos_azimuth) = arithmetic.sin_cos(polar), arithmetic.sin_cos(azimuth)
+    flat = radius * sin_polar
+    return np.stack([flat * cos_azimuth, flat * sin_azimuth, radius * cos_polar], axis=-1)
 
 
 def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
@@ -83,16 +85,16 @@ def camera_walk(
     if setting.kind != "dynamic":
         return offsets, rolls
     unit, limit = setting.scale * bounds.nominal_radius / 4, MAX_ROLL_SPEED * setting.scale
-    heading = np.stack([rng.standard_normal(3) for rng in generators])
+    heading = np.stack([arithmetic.normal(rng, (3,)) for rng in generators])
     share = np.stack([rng.random(2) for rng in generators])  # of the top speeds
-    velocity = heading / np.linalg.norm(heading, axis=1, keepdims=True) * share[:, :1] * MAX_SPEED * unit
+    velocity = heading / arithmetic.norm(heading, axis=1, keepdims=True) * share[:, :1] * MAX_SPEED * unit
     roll_velocity = (2 * share[:, 1] - 1) * limit
     ticks = ACTION_REPEAT * (frames - 1)
-    noise = np.stack([rng.standard_normal((ticks, 4)) for rng in generators], axis=1)
+    noise = np.stack([arithmetic.normal(rng, (ticks, 4)) for rng in generators], axis=1)
     position = cartesian(place)
     for tick in range(ticks):
         velocity = velocity + VELOCITY_STD * unit * noise[tick, :, :3]
-        speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+        speed = arithmetic.norm(velocity, axis=1, keepdims=True)
         velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(speed, 1e-12))
         reached = cartesian(_clip(spherical(position + velocity), bounds))
         position, velocity = reached, reached - position  # a limit takes the speed towards it
@@ -124,7 +126,7 @@ def nominal_target(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     Returns:
       (3,) from the centre of mass, meters.
     """
-    return np.asarray(offset) - np.linalg.norm(offset) * np.asarray(rotation)[:, 2]
+    return np.asarray(offset) - arithmetic.norm(offset) * np.asarray(rotation)[:, 2]
 
 
 def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
@@ -137,10 +139,10 @@ def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
     Returns:
       (..., 3, 3), columns: the camera's x (right), y (up) and z (away from the agent) in the world frame.
     """
-    back = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
+    back = offset / arithmetic.norm(offset, axis=-1, keepdims=True)
     right = np.stack([-back[..., 1], back[..., 0], np.zeros(back.shape[:-1])], axis=-1)  # z cross back
-    norm = np.linalg.norm(right, axis=-1, keepdims=True)
+    norm = arithmetic.norm(right, axis=-1, keepdims=True)
     right = np.where(norm > 1e-9, right / np.maximum(norm, 1e-9), np.array([0.0, -1.0, 0.0]))  # straight above
     up = np.cross(back, right)
-    cos, sin = np.cos(roll)[..., None], np.sin(roll)[..., None]
+    sin, cos = (part[..., None] for part in arithmetic.sin_cos(roll))
     return np.stack([cos * right + sin * up, cos * up - sin * right, back], axis=-1)

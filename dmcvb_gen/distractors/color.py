@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
@@ -32,7 +33,7 @@ def color_walk(
     if setting.kind != "dynamic":
         return out
     ticks = ACTION_REPEAT * (frames - 1)
-    noise = np.stack([rng.standard_normal((ticks, *own.shape)) for rng in generators], axis=1)
+    noise = np.stack([arithmetic.normal(rng, (ticks, *own.shape)) for rng in generators], axis=1)
     for tick in range(ticks):
         color = np.clip(color + STEP_STD * setting.scale * noise[tick], low, high)
         if (tick + 1) % ACTION_REPEAT == 0:

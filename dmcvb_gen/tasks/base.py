@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.names import LOCOMOTION
 
 ACTION_REPEAT = 2
@@ -279,7 +280,7 @@ def tolerance(x, lower=0.0, upper=0.0, margin=0.0, sigmoid="gaussian", value_at_
     distance = np.where(x < lower, lower - x, x - upper) / margin
     if sigmoid == "gaussian":
         scale = math.sqrt(-2 * math.log(value_at_margin))
-        value = np.exp(-0.5 * (distance * scale) ** 2)
+        value = arithmetic.exp(-0.5 * (distance * scale) ** 2)
     elif sigmoid == "linear":
         scaled = distance * (1 - value_at_margin)
         value = np.where(np.abs(scaled) < 1, 1 - scaled, 0.0)

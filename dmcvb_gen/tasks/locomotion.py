@@ -14,6 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.tasks.base import EpisodeBatch, Task, tolerance
 
 EPISODE_STEPS = 500
@@ -64,7 +65,7 @@ def _randomize_joints(batch: EpisodeBatch, ids: np.ndarray, generators: Sequence
                 qpos[sim, address] = rng.uniform(-np.pi, np.pi)
             elif kind == mujoco.mjtJoint.mjJNT_FREE:
                 quaternion = rng.random(4)
-                qpos[sim, address + 3 : address + 7] = quaternion / np.linalg.norm(quaternion)
+                qpos[sim, address + 3 : address + 7] = quaternion / arithmetic.norm(quaternion)
 
 
 # -- walker-walk --------------------------------------------------------------------------------
@@ -205,7 +206,8 @@ class HumanoidBatch(EpisodeBatch):
         """Hands and feet in the torso's frame, left hand, left foot, right hand, right foot, (size, 12)."""
         torso_to_limb = self._xpos[:, self._limbs] - self._xpos[:, self._torso, None]
         frame = self._xmat[:, self._torso].reshape(self.size, 3, 3)
-        return (torso_to_limb @ frame).reshape(self.size, 12)
+        turned = arithmetic.total((torso_to_limb[..., None] * frame[:, None]).transpose(2, 0, 1, 3))
+        return turned.reshape(self.size, 12)
 
     def state(self):
         return np.concatenate(
@@ -226,7 +228,7 @@ class HumanoidBatch(EpisodeBatch):
         control = tolerance(self._ctrl, margin=1, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
         small_control = (4 + control) / 5
         move = tolerance(
-            np.linalg.norm(self.com_velocity()[:, :2], axis=1),
+            arithmetic.norm(self.com_velocity()[:, :2]),
             HUMANOID_SPEED,
             np.inf,
             margin=HUMANOID_SPEED,

@@ -1,14 +1,16 @@
 """Picking behaviour policies from a run, as the paper does: a learning curve in; expert, medium and mixed out.
 
-Paper, section 3.1: expert is the first checkpoint with 95 % of the return at convergence, medium the one
-with 50 %, mixed eight checkpoints evenly spaced between 0 and 50 %. Where returns are negative (mazes), a
-share of the way is counted from the random policy's return to the converged one.
+Paper, section 3.1: expert is the first checkpoint with 95 % of the return at convergence, medium the one with 50 %,
+mixed eight checkpoints evenly spaced, in training steps, from the start to medium. Mean actions are judged, as the data
+are made of them. Where returns are negative (mazes), the expert's share of the way is counted from the random policy's
+return, and medium is the checkpoint whose mean return is nearest to the paper's row of its group; the paper has no
+mixed data of mazes.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -18,19 +20,23 @@ from dmcvb_gen.behaviours.learning.run_log import read_rows
 from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
 from dmcvb_gen.behaviours.policies.evaluation import evaluate
 from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.behaviours.policies.paper import medium_return
 from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.names import ANT_MAZE, MAZE_TRAINED_LEVELS, TRAINED_LEVELS
 from dmcvb_gen.store.manifest import write_json_atomically
 from dmcvb_gen.tasks import get_task
 
-LEVELS = ("expert", "medium", "mixed")
-MAZE_LEVELS = ("expert", "medium")
-"""The paper has no mixed data of mazes."""
+LEVELS = TRAINED_LEVELS
 EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
 MEDIUM_TOLERANCE = 0.1
 """How far (as a share of the way) an accepted medium checkpoint may be from 50 %."""
-MIXED_TOLERANCE = 0.12
-"""The same for each of the mixed checkpoints and its target."""
+PAPER_TOLERANCE = 0.2
+"""How far (as a share of it) a maze's medium may be from the paper's return."""
+CANDIDATES = 6
+"""Checkpoints near a medium's return that are measured on fresh episodes."""
+CLOSE_ENOUGH = 0.2
+"""Share of the tolerance within which no nearer checkpoint is looked for."""
 SMOOTHING = 5
 """Evaluations in the moving median of the curve."""
 MIN_POINTS = 8
@@ -56,14 +62,14 @@ class Convergence:
 
 @dataclass(frozen=True)
 class Pick:
-    """One picked checkpoint: its place in the curve, and its returns over fresh episodes once evaluated."""
+    """One picked checkpoint: what was aimed at, its place in the curve, and its returns over fresh episodes."""
 
     name: str
-    target: float
+    target: str
     step: int
     estimate: float
     path: str
-    evaluation: Evaluation | None = None
+    evaluation: Evaluation
 
 
 @dataclass(frozen=True)
@@ -154,6 +160,7 @@ def pick_checkpoints(
     measure: Callable[[Path], Evaluation],
     task: str = "",
     levels: Sequence[str] = LEVELS,
+    medium: float | None = None,
 ) -> Selection:
     """Pick levels from a curve; every pick is measured on fresh episodes before it is accepted.
 
@@ -162,82 +169,86 @@ def pick_checkpoints(
       base: return at 0 % of the way.
       measure: evaluates a policy file on fresh episodes.
       levels: what to pick, of `LEVELS`.
+      medium: return that medium is to have; None: half of the way.
     """
-    picks: dict[str, tuple[Pick, ...]] = {}
-    reasons: dict[str, str] = {}
-    way = convergence.value - base
-    check = functools.cache(measure)
-
-    def share(value: float) -> float:
-        return (value - base) / way
-
+    way, check = convergence.value - base, functools.cache(measure)
     curve = [point for point in curve if point[2] is not None]
     if not curve or not way > 0:
         reason = convergence.reason or "the run has no evaluated checkpoint yet"
-        return Selection(task, base, convergence, {}, {level: reason for level in levels})
+        return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
+    found: dict[str, tuple[Pick, ...] | str] = {"expert": _expert(curve, base + EXPERT_SHARE * way, way, check)}
     if not convergence.converged:
-        reasons["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
-    else:
-        # Returns of 20 episodes are noisy: start a little below the line, fresh episodes decide.
-        candidates = [point for point in curve if share(point[1]) >= EXPERT_SHARE - 0.02]
-        for step, value, path in candidates:
-            evaluation = check(path)
-            # Beyond sampling error: a policy that falls now and then has a wide spread and is not an expert yet.
-            error = evaluation.std / np.sqrt(evaluation.episodes)
-            if share(evaluation.mean - 2 * error) >= EXPERT_SHARE:
-                picks["expert"] = (Pick("expert", EXPERT_SHARE, step, value, str(path), evaluation),)
-                break
-        else:
-            reasons["expert"] = (
-                f"none of {len(candidates)} candidates held {EXPERT_SHARE:.0%} of {convergence.value:.1f} "
-                "over fresh episodes; train longer (--resume)"
-            )
-    expert_step = picks["expert"][0].step if "expert" in picks else curve[-1][0]
-    before = [point for point in curve if point[0] <= expert_step]
-
-    def nearest(target: float, tolerance: float, taken: set[Path]) -> Pick | None:
-        close = sorted(before, key=lambda point: abs(share(point[1]) - target))
-        for step, value, path in close[:6]:
-            if path in taken or abs(share(value) - target) > tolerance * 1.5:
-                continue
-            evaluation = check(path)
-            if abs(share(evaluation.mean) - target) <= tolerance:
-                return Pick("", target, step, value, str(path), evaluation)
-        return None
-
-    medium = nearest(MEDIUM_SHARE, MEDIUM_TOLERANCE, set())
+        found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
+    last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
+    before = [point for point in curve if point[0] <= last]
     if medium is None:
-        got = min((abs(share(value) - MEDIUM_SHARE), share(value)) for _, value, _ in before)[1]
-        reasons["medium"] = (
-            f"no checkpoint held {MEDIUM_SHARE:.0%} +- {MEDIUM_TOLERANCE:.0%} of the way (nearest {got:.0%}); "
-            "evaluate more often"
-        )
+        found["medium"] = _medium(before, base + MEDIUM_SHARE * way, MEDIUM_TOLERANCE * way, check)
     else:
-        picks["medium"] = (Pick("medium", MEDIUM_SHARE, medium.step, medium.estimate, medium.path, medium.evaluation),)
-    if "mixed" not in levels:
-        return Selection(task, base, convergence, picks, reasons)
-    chosen, taken = [], set()
-    for index, target in enumerate(np.linspace(0, MEDIUM_SHARE, MIXED_COUNT)):
-        found = nearest(float(target), MIXED_TOLERANCE, taken)
-        if found is None:
-            reasons["mixed"] = (
-                f"no checkpoint near {target:.0%} of the way (number {index + 1} of {MIXED_COUNT}); evaluate more often"
-            )
+        found["medium"] = _medium(before, medium, PAPER_TOLERANCE * abs(medium), check)
+    if "mixed" in levels:
+        found["mixed"] = found["medium"]
+        if not isinstance(found["medium"], str):
+            found["mixed"] = _mixed(before, found["medium"][0].step, check)
+    picks = {level: picked for level, picked in found.items() if not isinstance(picked, str)}
+    return Selection(task, base, convergence, picks, {level: why for level, why in found.items() if level not in picks})
+
+
+def _expert(curve: Sequence[Point], goal: float, way: float, check: Callable) -> tuple[Pick, ...] | str:
+    """The first checkpoint that returns `goal` or more, or why there is none."""
+    # Returns of the curve's few episodes are noisy: start a little below the line, fresh episodes decide.
+    candidates = [point for point in curve if point[1] >= goal - 0.02 * way]
+    for step, value, path in candidates:
+        evaluation = check(path)
+        # Beyond sampling error: a policy that falls now and then has a wide spread and is not an expert yet.
+        error = evaluation.std / np.sqrt(evaluation.episodes)
+        if evaluation.mean - 2 * error >= goal:
+            return (Pick("expert", f"return {goal:.1f}", step, value, str(path), evaluation),)
+    return f"none of {len(candidates)} candidates held {goal:.1f} over fresh episodes; train longer (--resume)"
+
+
+def _medium(curve: Sequence[Point], goal: float, tolerance: float, check: Callable) -> tuple[Pick, ...] | str:
+    """The checkpoint whose return is nearest to `goal`, or why there is none within the tolerance."""
+    near = sorted(curve, key=lambda point: abs(point[1] - goal))[:CANDIDATES]
+    near = [point for point in near if abs(point[1] - goal) <= 1.5 * tolerance]
+    best, off = None, tolerance
+    for step, value, path in near:
+        evaluation = check(path)
+        if abs(evaluation.mean - goal) <= off:
+            best = Pick("medium", f"return {goal:.1f}", step, value, str(path), evaluation)
+            off = abs(evaluation.mean - goal)
+        if off <= CLOSE_ENOUGH * tolerance:
             break
-        taken.add(Path(found.path))
-        chosen.append(Pick(f"mixed_{index}", float(target), found.step, found.estimate, found.path, found.evaluation))
-    else:
-        picks["mixed"] = tuple(chosen)
-    return Selection(task, base, convergence, picks, reasons)
+    if best:
+        return (best,)
+    closest = min((value for _, value, _ in curve), key=lambda value: abs(value - goal))
+    return f"no checkpoint held {goal:.1f} +- {tolerance:.1f} (nearest {closest:.1f}); evaluate more often"
+
+
+def _mixed(curve: Sequence[Point], last: int, check: Callable) -> tuple[Pick, ...] | str:
+    """Eight checkpoints evenly spaced in training steps from the start to `last`, or which is missing."""
+    picks = []
+    for index, goal in enumerate(np.linspace(0, last, MIXED_COUNT)):
+        step, value, path = min(curve, key=lambda point: abs(point[0] - goal))
+        if abs(step - goal) > last / (MIXED_COUNT - 1) / 2:
+            return f"no checkpoint near step {goal:.0f} (number {index + 1} of {MIXED_COUNT}); evaluate more often"
+        picks.append(Pick(f"mixed_{index}", f"step {goal:.0f}", step, value, str(path), check(path)))
+    return tuple(picks)
 
 
 def select_checkpoints(
-    folder: str | Path, episodes: int = 100, seed: int = 20_000, deterministic: bool = True
+    folder: str | Path,
+    episodes: int = 100,
+    seed: int = 20_000,
+    deterministic: bool = True,
+    converged: float | None = None,
 ) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
 
     Also writes selection.json and curve.png. Works on a running run too; what cannot be picked yet is said
     in `reasons`, and earlier picks of that level are left alone.
+
+    Args:
+      converged: return at convergence, of a longer run, where this one ends before it; None: from the curve.
 
     Raises:
       DmcvbError: the folder holds no run.
@@ -248,7 +259,7 @@ def select_checkpoints(
     if not files:
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(files[0]).task)
-    mazes = task.return_range[1] <= 0
+    mazes = task.family == ANT_MAZE
     base = evaluate(random_policy(task), task, episodes, seed)[0].mean if mazes else 0.0
     measured: dict[Path, tuple[Policy, Evaluation]] = {}
 
@@ -258,11 +269,16 @@ def select_checkpoints(
             measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic)[0]
         return measured[path][1]
 
+    def pick() -> Selection:
+        end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
+        if converged is not None:
+            end = Convergence(converged, 0.0, True)
+        levels = MAZE_TRAINED_LEVELS if mazes else LEVELS
+        return pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id))
+
     for attempt in range(5):
-        convergence = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
         try:
-            levels = MAZE_LEVELS if mazes else LEVELS
-            selection = pick_checkpoints(curve, base, convergence, measure, task.id, levels)
+            selection = pick()
             break
         except PolicyFileError:
             curve, before = read_curve(folder), files
@@ -270,24 +286,26 @@ def select_checkpoints(
             # The run may have thinned a checkpoint away since the curve was read; a damaged one is a real error.
             if attempt == 4 or set(before) <= set(files):
                 raise
+    _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})
+    return selection
+
+
+def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:
+    """Write the picks, selection.json and curve.png into a run's folder."""
     for level, picks in selection.picks.items():
         for pick in picks:
-            policy = measured[Path(pick.path)][0]
+            policy = policies[pick.path]
             header: PolicyHeader = policy.header.model_copy(update={"level": level, "evaluation": pick.evaluation})
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
     write_json_atomically(folder / "selection.json", selection_json(selection))
     plot_selection(curve, selection, folder / "curve.png")
-    return selection
 
 
 def selection_json(selection: Selection) -> dict:
     """A selection as plain values."""
     levels = {}
     for level in LEVELS:
-        picks = [
-            asdict(pick) | {"evaluation": pick.evaluation and pick.evaluation.model_dump()}
-            for pick in selection.picks.get(level, ())
-        ]
+        picks = [asdict(pick) | {"evaluation": pick.evaluation.model_dump()} for pick in selection.picks.get(level, ())]
         levels[level] = {"picks": picks, "reason": selection.reasons.get(level)}
     return {
         "task": selection.task,

@@ -13,6 +13,9 @@ BINS = 100
 """Return levels that are told apart between the task's lowest and highest return."""
 PER_BIN = 3
 """Earliest checkpoints kept at each return level."""
+TEETH = 8
+"""Checkpoints kept of every doubling of the agent step, evenly spaced. Mixed wants the multiples of a seventh of a step
+that is not known before the run ends; none is then farther away than a sixteenth of that step."""
 
 
 def superfluous(curve: Mapping[int, float], return_range: tuple[float, float], limit: int = LIMIT) -> list[int]:
@@ -20,8 +23,9 @@ def superfluous(curve: Mapping[int, float], return_range: tuple[float, float], l
 
     Selection wants, for a return r that is not known before the run ends: the first checkpoint that reaches r, some
     after it in case fresh episodes disappoint, and checkpoints near r. So these stay: every checkpoint that was
-    better than all before it (the first to reach any r is one of them), the earliest few at each level of return,
-    and the newest. No more than `BINS * PER_BIN` checkpoints, the records and `RECENT` are ever left.
+    better than all before it (the first to reach any r is one of them), the earliest few at each level of return, a
+    comb of training steps, and the newest. No more than `BINS * PER_BIN` checkpoints, the records, `TEETH` a doubling
+    and `RECENT` are ever left.
 
     Args:
       curve: agent step -> return of the checkpoints that are there.
@@ -31,11 +35,15 @@ def superfluous(curve: Mapping[int, float], return_range: tuple[float, float], l
         return []
     low, high = return_range
     steps, best, level = sorted(curve), float("-inf"), defaultdict(int)
-    keep = set(steps[-RECENT:])
+    keep, teeth = set(steps[-RECENT:]), set()
     for step in steps:
         value = curve[step]
         if value > best:
             best = value
+            keep.add(step)
+        tooth = (step.bit_length(), (step * TEETH) >> max(step.bit_length() - 1, 0))
+        if tooth not in teeth:
+            teeth.add(tooth)
             keep.add(step)
         place = int(BINS * (value - low) / (high - low))
         if level[place] < PER_BIN:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 WALL_HEIGHT = 2.0
@@ -111,7 +112,9 @@ def build_arena(layout: Layout) -> Arena:
     frame.add("camera", name="follow", pos=[-1, 0, 2], zaxis=[-1, 0, 2])
     frame.add("camera", name="overhead", pos=[0, 0, 3])
     half = max(layout.shape) * CELL / 2
-    arena.top_camera.set_attributes(pos=[0, 0, TOP_HEIGHT], fovy=np.degrees(2 * np.arctan(half / TOP_HEIGHT)))
+    arena.top_camera.set_attributes(
+        pos=[0, 0, TOP_HEIGHT], fovy=np.degrees(2 * float(arithmetic.arctan2(half, TOP_HEIGHT)))
+    )
     goal = target_sphere.TargetSphere(radius=GOAL_RADIUS, height_above_ground=GOAL_HEIGHT)
     arena.attach(goal).mocap = "true"
 

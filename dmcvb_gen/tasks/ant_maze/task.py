@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.tasks.ant_maze.arena import (
     CAMERAS,
@@ -139,7 +140,7 @@ class AntMazeBatch(EpisodeBatch):
         layout, offsets, yaw = self.task.layout, rng.uniform(-1, 1, 5), rng.uniform(0, 2 * np.pi)
         self._qpos[sim] = 0  # joints too
         self._qpos[sim, :3] = np.append(layout.world(start), 0) + SPAWN_NOISE * offsets[:3]
-        self._qpos[sim, 3], self._qpos[sim, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+        self._qpos[sim, 6], self._qpos[sim, 3] = arithmetic.sin_cos(yaw / 2)
         self._mocap[sim, 0] = *(layout.world(goal) + GOAL_NOISE * offsets[3:]), 0
 
     def _refresh(self, ids):
@@ -248,7 +249,8 @@ class AntMazeBatch(EpisodeBatch):
 
     def _egocentric(self, vector: np.ndarray) -> np.ndarray:
         """(size, 3) of the world -> the same in the torso's frame."""
-        return np.einsum("ni,nij->nj", vector, self._xmat[:, self._torso].reshape(self.size, 3, 3))
+        frame = self._xmat[:, self._torso].reshape(self.size, 3, 3)
+        return arithmetic.total((vector[..., None] * frame).transpose(1, 0, 2))
 
     def _control_reward(self):
         return -np.clip(self.distance() / self._largest, 0.0, 1.0)

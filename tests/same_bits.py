@@ -1,0 +1,70 @@
+"""Digests of one short episode a task, as JSON: run by test_same_bits.py here and under emulated processors.
+
+python -m tests.same_bits <agent steps> <renderer or -> <task>...
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+
+import numpy as np
+
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
+from dmcvb_gen.behaviours.policies.policy_file import load_policy
+from dmcvb_gen.behaviours.policies.simulate import simulate
+from dmcvb_gen.distractors import load_backgrounds, make_exogenous
+from dmcvb_gen.names import LOCOMOTION, distractor_of
+from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.tasks import get_task
+
+EPISODES = 2
+
+
+def digest(*arrays: np.ndarray) -> str:
+    sha = hashlib.sha256()
+    for array in arrays:
+        sha.update(np.ascontiguousarray(array))
+    return sha.hexdigest()[:16]
+
+
+def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
+    """Of what an expert's episodes store: mean and drawn actions, physics, states, rewards, labels, pictures."""
+    task = get_task(task_id)
+    policy = load_policy(bundled_policies(task_id, "expert")[0], task)
+    names, episodes = (task_id, "same bits"), range(EPISODES)
+    out = simulate(task, [policy], episodes, 0, names, max_steps=steps)
+    drawn = simulate(task, [policy], episodes, 0, names, max_steps=2, deterministic=False)
+    found = {name: digest(getattr(out, name)) for name in ("action", "physics", "state", "reward")}
+    found["drawn actions"] = digest(drawn.action)
+    # Actions and labels once more from what is the same everywhere, whatever the steps of the physics gave.
+    batch = task.batch(EPISODES)
+    batch.reset([episode_stream(0, names, i, "initial_state") for i in episodes])
+    start = batch.physics()
+    found["start"] = digest(start)
+    found["action at the start"] = digest(policy.act(batch.behaviour_observation(), deterministic=True))
+    physics = np.repeat(start[:, None], steps + 1, axis=1)
+    for setting in ("none", "dynamic") if task.family == LOCOMOTION else ("visible",):
+        streams = {
+            name: [episode_stream(0, names, i, name) for i in episodes]
+            for name in STREAMS
+            if name not in ("initial_state", "policy")
+        }
+        distractors = distractor_of(task_id, setting)
+        backgrounds = load_backgrounds("builtin", "train") if distractors.kind != "none" else None
+        labels = make_exogenous(task, distractors, physics, streams, backgrounds, split="train")
+        found[f"labels {setting}"] = digest(*(value for _, value in labels.items()))
+        if renderer:
+            from dmcvb_gen.rendering import make_renderer
+
+            painter = make_renderer(renderer, task, 64, backgrounds=backgrounds)
+            frames = painter.render(start, labels[:, 0])
+            found[f"pictures {setting}"] = digest(frames)
+            painter.close()
+    return found
+
+
+if __name__ == "__main__":
+    given, painter, *tasks = sys.argv[1:]
+    print(json.dumps({task: digests(task, int(given), None if painter == "-" else painter) for task in tasks}))
