@@ -142,7 +142,7 @@ def norm(x, axis: int = -1, keepdims: bool = False) -> np.ndarray:
 
 
 def gaussian(uniform) -> np.ndarray:
-    """Standard normal numbers of uniform ones (Box and Muller 1958).
+    """Standard normal numbers of uniform ones, two of each pair of neighbors (Box and Muller 1958).
 
     Args:
       uniform: (..., 2 n) in [0, 1).
@@ -150,14 +150,14 @@ def gaussian(uniform) -> np.ndarray:
     Returns:
       (..., 2 n).
     """
-    first, second = np.split(np.asarray(uniform, np.float64), 2, axis=-1)
-    radius = np.sqrt(-2 * log(1 - first))
-    sine, cosine = sin_cos(2 * math.pi * second)
-    return np.concatenate([radius * cosine, radius * sine], axis=-1)
+    uniform = np.asarray(uniform, np.float64)
+    radius = np.sqrt(-2 * log(1 - uniform[..., 0::2]))
+    sine, cosine = sin_cos(2 * math.pi * uniform[..., 1::2])
+    return np.stack([radius * cosine, radius * sine], axis=-1).reshape(uniform.shape)
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Standard normal numbers from a stream.
+    """Standard normal numbers from a stream; fewer are the first of more.
 
     numpy's own take a logarithm from the system's mathematics library in their tail.
     """

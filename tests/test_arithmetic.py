@@ -49,3 +49,5 @@ def test_normal_numbers_are_normal_and_independent():
     assert stats.kstest(draws.ravel(), "norm").pvalue > 0.01
     assert np.abs(np.corrcoef(draws.T) - np.eye(5)).max() < 0.02
     assert arithmetic.normal(np.random.default_rng(0), (3, 3)).shape == (3, 3)
+    few, many = (arithmetic.normal(np.random.default_rng(0), (count, 3)) for count in (3, 8))
+    np.testing.assert_array_equal(few, many[:3])
