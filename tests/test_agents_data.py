@@ -228,10 +228,16 @@ def test_the_curve_has_losses_hold_out_and_scores():
     assert curve[-1]["loss"] < curve[0]["loss"]
 
 
-@pytest.mark.parametrize("decay", [False, True])
-def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, decay):
-    data, settings = make_data().states_only(), dataclasses.replace(SETTINGS, decay=decay)
-    whole = state_learner(data)
+def pixel_learner(data):
+    torch.manual_seed(0)
+    return BehaviorCloning(observation_encoder(data.channels, SIZE), 2)
+
+
+@pytest.mark.parametrize("decay, make_learner", [(False, state_learner), (True, state_learner), (False, pixel_learner)])
+def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, decay, make_learner):
+    data, settings = make_data(), dataclasses.replace(SETTINGS, decay=decay)
+    data = data if make_learner is pixel_learner else data.states_only()
+    whole = make_learner(data)
     wanted = train(whole, data, settings)
     monkeypatch.setattr(trainer, "SAVE_SECONDS", 0.0)
     made = []
@@ -242,8 +248,8 @@ def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, decay)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(state_learner(data), data, settings, folder=tmp_path, tick=stop)
-    resumed = state_learner(data)
+        train(make_learner(data), data, settings, folder=tmp_path, tick=stop)
+    resumed = make_learner(data)
     made.clear()
     curve = train(resumed, data, settings, folder=tmp_path, tick=made.append)
     assert made[0] == 6 and sum(made) == 12  # the state of step 6 was on disk
@@ -260,6 +266,15 @@ def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to():
         settings = dataclasses.replace(SETTINGS, steps=4, decay=decay)
         train(learner, data, settings, tick=lambda steps, group=group, seen=seen: seen.append(group["lr"]))
     assert rates == {True: pytest.approx([1e-3, 0.75e-3, 0.5e-3, 0.25e-3]), False: [1e-3] * 4}
+
+
+def test_a_rate_is_a_factor_of_the_learners_own():
+    data, seen = make_data().states_only(), []
+    learner = state_learner(data)
+    [group] = learner.optimizers["main"].param_groups
+    settings = dataclasses.replace(SETTINGS, steps=2, rate=3.0)
+    train(learner, data, settings, tick=lambda steps: seen.append(group["lr"]))
+    assert seen == [pytest.approx(3e-3)] * 2 and group["lr"] == 1e-3
 
 
 def test_a_damaged_state_is_refused_with_what_to_do(tmp_path):

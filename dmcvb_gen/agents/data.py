@@ -391,48 +391,75 @@ def load_data(
       DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
     """
     subsets = [source.subset for source in sources]
-    shapes = {(subset.task, subset.record.size, training_views(subset)) for subset in subsets}
-    if len({(task, size, len(views)) for task, size, views in shapes}) != 1:
-        raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or picture sizes differ")
-    names = [training_views(subset) for subset in subsets]
-    if pixels and not names[0]:
-        raise DmcvbError(f"{subsets[0].name} has no pictures that agents are trained on")
+    names = _picture_arrays(subsets, pixels)
     chosen = [choose_episodes(source, seed) for source in sources]
     lengths = [
         subset.lengths[np.searchsorted(subset.episodes, e)] for subset, (e, _) in zip(subsets, chosen, strict=True)
     ]
-    size = subsets[0].record.size
+    returns = [
+        subset.returns[np.searchsorted(subset.episodes, e)] for subset, (e, _) in zip(subsets, chosen, strict=True)
+    ]
+    size, channels = subsets[0].record.size, 3 * len(names[0])
     rows = int(sum((length + 1).sum() for length in lengths))
-    needed = rows * 3 * len(names[0]) * size * (size + 2 * PAD) if pixels else 0
+    needed = rows * channels * size * (size + 2 * PAD)
     hold = pixels and needed <= (default_memory(device) if memory is None else memory)
-    held = HeldFrames(rows, 3 * len(names[0]), size, device) if hold else None
-    tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
-    where, first, returns = [], 0, []
-    for index, (subset, (episodes, _), length) in enumerate(zip(subsets, chosen, lengths, strict=True)):
-        returns.append(subset.returns[np.searchsorted(subset.episodes, episodes)])
-        step = np.arange(int(length.max()) + 1)
-        for part in range(0, len(episodes), READ_EPISODES):
-            few = episodes[part : part + READ_EPISODES]
-            within = step[None] <= length[part : part + READ_EPISODES, None]
-            e, t = np.nonzero(within)
-            where.append(np.stack([np.full(len(e), index), few[e], t], axis=1))
-            for name, table in tables.items():
-                table.append(subset.read(name, few)[e, t])
-            if hold:
-                for view, name in enumerate(names[index]):
-                    pictures = torch.from_numpy(subset.read(name, few)[e, t])
-                    held.put(first, pictures.permute(0, 3, 1, 2), channel=3 * view)
-            first += len(e)
-    frames = StoredFrames(subsets, names, np.concatenate(where), size) if pixels and not hold else held
-    columns = {name: torch.from_numpy(np.concatenate(parts)).float().to(device) for name, parts in tables.items()}
+    held = HeldFrames(rows, channels, size, device) if hold else None
+    tables, where = _read_rows(subsets, names, [episodes for episodes, _ in chosen], lengths, held)
+    frames = StoredFrames(subsets, names, where, size) if pixels and not hold else held
     return TrainingData(
-        **columns,
+        **{name: torch.from_numpy(values).float().to(device) for name, values in tables.items()},
         lengths=np.concatenate(lengths).astype(np.int64),
         held_out=np.concatenate([out for _, out in chosen]),
         frames=frames,
         stack=stack,
         returns=np.concatenate(returns),
     )
+
+
+def _picture_arrays(subsets: Sequence[Subset], pixels: bool) -> list[tuple[str, ...]]:
+    """The picture arrays of each subset that agents see.
+
+    Raises:
+      DmcvbError: the subsets are of different tasks or picture sizes, or (with `pixels`) hold no pictures.
+    """
+    names = [training_views(subset) for subset in subsets]
+    if len({(subset.task, subset.record.size, len(n)) for subset, n in zip(subsets, names, strict=True)}) != 1:
+        raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or picture sizes differ")
+    if pixels and not names[0]:
+        raise DmcvbError(f"{subsets[0].name} has no pictures that agents are trained on")
+    return names
+
+
+def _read_rows(
+    subsets: Sequence[Subset],
+    names: Sequence[tuple[str, ...]],
+    chosen: Sequence[np.ndarray],
+    lengths: Sequence[np.ndarray],
+    held: HeldFrames | None,
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The rows of all chosen episodes, one after the other; pictures go into `held`.
+
+    Args:
+      chosen: (episode,) indices of each subset. lengths: (episode,) of those.
+
+    Returns:
+      Tables of (row, ...) values, and (row, 3): subset, episode and step of each.
+    """
+    tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
+    where, first = [], 0
+    for index, (subset, episodes, length) in enumerate(zip(subsets, chosen, lengths, strict=True)):
+        step = np.arange(int(length.max()) + 1)
+        for part in range(0, len(episodes), READ_EPISODES):
+            few = episodes[part : part + READ_EPISODES]
+            e, t = np.nonzero(step[None] <= length[part : part + READ_EPISODES, None])
+            where.append(np.stack([np.full(len(e), index), few[e], t], axis=1))
+            for name, table in tables.items():
+                table.append(subset.read(name, few)[e, t])
+            for view, name in enumerate(names[index] if held is not None else ()):
+                pictures = torch.from_numpy(subset.read(name, few)[e, t])
+                held.put(first, pictures.permute(0, 3, 1, 2), channel=3 * view)
+            first += len(e)
+    return {name: np.concatenate(parts) for name, parts in tables.items()}, np.concatenate(where)
 
 
 __all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data"]

@@ -227,7 +227,16 @@ def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float]:
                     index, entry = key.removeprefix(f"optimizer/{name}/").split("/")
                     states.setdefault(int(index), {})[entry] = value
             optimizer.load_state_dict(optimizer.state_dict() | {"state": states})
+            _lay_out(optimizer)
     except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise DmcvbError(f"cannot resume from {path} ({reason}); delete it to start that training again") from None
     return int(facts["step"]), facts["curve"], float(facts["seconds"])
+
+
+def _lay_out(optimizer: torch.optim.Optimizer) -> None:
+    """Put a loaded state into its parameters' order in memory: Adam's fused kernel walks both as they lie there."""
+    for parameter, state in optimizer.state.items():
+        for key, value in state.items():
+            if torch.is_tensor(value) and value.shape == parameter.shape:
+                state[key] = torch.empty_like(parameter, dtype=value.dtype, requires_grad=False).copy_(value)
