@@ -1,6 +1,6 @@
 """Adam steps a second of every agent's learners: float32, bfloat16, and compiled.
 
-python scripts/bench_agents.py --steps 10 --agents bc,id+bc,state-bc --batch-size 64
+python scripts/bench_agents.py --steps 10 --agents bc,id+bc,state-bc --batch-size 64 --network narrow --threads 1
 python scripts/bench_agents.py --device cuda --compile --memory
 
 Data are random, of walker's sizes (9 channels, 64 x 64, 24 states, 6 actions); drawing the batches is in the time.
@@ -17,6 +17,7 @@ import torch
 
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, make_pretrainer, parse_agent
 from dmcvb_gen.agents.data import HeldFrames, TrainingData
+from dmcvb_gen.agents.networks import NARROW, PAPER
 from dmcvb_gen.agents.trainer import TrainSettings, train
 
 AGENTS = "state-bc,state-td3-bc,bc,td3-bc,id+bc,lfd+bc,ae+bc,state+bc"
@@ -57,6 +58,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--batch-size", type=int, default=256)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--network", default="paper", choices=["paper", "narrow"])
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--workers", type=int, default=0, help="Threads that draw batches ahead.")
     parser.add_argument("--compile", action="store_true", help="Measure torch.compile too (takes minutes on a CPU).")
@@ -64,17 +66,20 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     data = random_data(options.device)
-    print(f"torch {torch.__version__}, {options.device}, {options.threads} threads, batch {options.batch_size}")
+    how = f"{options.threads} threads, batch {options.batch_size}, {options.network} network"
+    print(f"torch {torch.__version__}, {options.device}, {how}")
     print(f"{'learner':34s} {'float32':>9s} {'bfloat16':>9s} {'compiled':>9s}  Adam steps/s (best against float32)")
     for name in options.agents.split(","):
         agent = parse_agent(name)
         seen = data.states_only() if agent.sees_state else data
         parts = [("pre-training", make_pretrainer)] if agent.pretrain else []
+        network = {"paper": PAPER, "narrow": NARROW}[options.network]
         for part, make in [*parts, ("policy", make_policy)]:
             rates = []
             for half, compiled in [(False, False), (True, False)] + [(not agent.sees_state, True)] * options.compile:
                 torch.manual_seed(0)
-                learner = make(agent, make_encoder(agent, seen).to(options.device), seen).to(options.device)
+                encoder = make_encoder(agent, seen, architecture=network).to(options.device)
+                learner = make(agent, encoder, seen, network).to(options.device)
                 rates.append(steps_per_second(learner, seen, options, half, compiled))
             shown = "".join(f" {rate:9.2f}" for rate in rates) + " " * 10 * (3 - len(rates))
             print(f"{f'{name}, {part}':34s}{shown}  {max(rates) / rates[0]:.2f} x", flush=True)
