@@ -23,11 +23,13 @@ import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.release import transfer
-from dmcvb_gen.release.publish import CLAIM, INDEX, fetch, publish
+from dmcvb_gen.release.publish import CLAIM, fetch, publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.remote import public, reason
+from dmcvb_gen.store.writer import finish_release
 from tests.conftest import roll_out, small_recipe
 
 pytest.importorskip("s3fs")
@@ -159,9 +161,7 @@ def copy(tiny, tmp_path):
 
 
 def new_version(folder):
-    data = json.loads((folder / "manifest.json").read_text())
-    data["version"] = "1.0.1"
-    (folder / "manifest.json").write_text(json.dumps(data))
+    finish_release(folder, open_release(folder).manifest.model_copy(update={"version": "1.0.1"}))
 
 
 def test_a_round_trip_gives_the_same_release(s3, small_release, tmp_path):
@@ -386,7 +386,8 @@ def rewrite(folder, change):
         if path.is_file():
             file |= {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     index["manifest_sha256"] = hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
-    (folder / INDEX).write_text(json.dumps(index))
+    index["sha256"] = hashlib.sha256((json.dumps(index | {"sha256": None}, indent=1) + "\n").encode()).hexdigest()
+    (folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
 
 
 def leave_the_folder(index, folder):
@@ -425,7 +426,7 @@ def test_hostile_or_newer_releases_are_refused_and_write_nothing_outside(tiny, t
     with pytest.raises(StoreError, match=words):
         fetch(f"file://{tmp_path}/there", tmp_path / "deep/down/r")
     outside = {p.name for p in tmp_path.rglob("*") if p.is_file() and "there" not in p.parts}
-    assert not outside - {"manifest.json"} and not list((tmp_path / "deep").rglob("commits/**/*.json"))
+    assert not outside - {"manifest.json", ".lock"} and not list((tmp_path / "deep").rglob("commits/**/*.json"))
 
 
 def test_bad_requests_say_what_to_do(s3, tmp_path, small_release):
@@ -493,12 +494,12 @@ class FakeHub:
 def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(tiny, copy, monkeypatch, tmp_path):
     pytest.importorskip("huggingface_hub")
     from dmcvb_gen.release import hub
-    from dmcvb_gen.release.publish import make_index
+    from dmcvb_gen.release.publish import index_of
 
     monkeypatch.setattr(hub, "BATCH", 20)
     api, url = FakeHub(), "hf://datasets/me/tiny"
     manifest = open_release(tiny).manifest
-    index = make_index(tiny, manifest)
+    index = index_of(tiny, manifest)
     api.fail = 1
     with pytest.raises(StoreError, match="run the same command again") as caught:
         hub.publish_to_hub(tiny, manifest, index, url, api=api)
@@ -514,6 +515,6 @@ def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(ti
     new_version(copy)
     changed = open_release(copy).manifest
     with pytest.raises(StoreError, match="never changes"):
-        hub.publish_to_hub(copy, changed, make_index(copy, changed), url, api=api)
+        hub.publish_to_hub(copy, changed, index_of(copy, changed), url, api=api)
     with pytest.raises(StoreError, match="hf://datasets/OWNER/NAME"):
         hub.publish_to_hub(tiny, manifest, index, "hf://models/x", api=api)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 
 import numpy as np
 import pytest
 import zarr
+from click.testing import CliRunner
 
-from dmcvb_gen.release.verify import verify
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.card import write_card
+from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.index import is_card
 from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
 from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
+from tests.conftest import roll_out, small_recipe
 
 NAME = "walker-walk/random/dynamic"
 
@@ -55,6 +62,69 @@ def test_a_flipped_byte_is_found_by_its_digest(copy):
     (copy / file.path).write_bytes(data)
     [finding] = verify(copy).findings
     assert finding.check == "files" and "pixels" in finding.message and "shard 1" in finding.message
+
+
+@pytest.fixture(scope="module")
+def policy_release(tmp_path_factory):
+    """A release with a policy file and a card."""
+    folder = tmp_path_factory.mktemp("policies") / "release"
+    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 1}
+    roll_out(small_recipe(name="policies", subsets=[pattern]), folder)
+    write_card(folder)
+    return folder
+
+
+@pytest.mark.parametrize("which", ["walker", "maze"])
+def test_a_flipped_byte_in_any_file_is_found_and_named(policy_release, maze_release, which):
+    folder = policy_release if which == "walker" else maze_release
+    assert not list(check_files(folder))
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.stat().st_size]
+    names = {path.relative_to(folder).as_posix() for path in files}
+    assert {"manifest.json", "files.json"} <= names and any(name.endswith("/zarr.json") for name in names)
+    assert which == "maze" or any(name.startswith("policies/") for name in names)
+    for path in files:
+        data = path.read_bytes()
+        for place in {0, len(data) // 2, len(data) - 1}:
+            changed = bytearray(data)
+            changed[place] ^= 1
+            path.write_bytes(changed)
+            found = [str(finding) for finding in check_files(folder)]
+            path.write_bytes(data)
+            name = path.relative_to(folder).as_posix()
+            assert found and any(name in text for text in found), (name, place, found)
+    assert not list(check_files(folder))
+
+
+def test_the_root_digest_is_printed_and_covers_every_file_but_the_card(policy_release, tmp_path):
+    digest = open_release(policy_release).manifest.digest
+    lines = []
+    for path in sorted(policy_release.rglob("*"), key=lambda path: path.relative_to(policy_release).as_posix()):
+        name = path.relative_to(policy_release).as_posix()
+        if path.is_file() and path.name not in (".created", "files.json") and not is_card(name):
+            data = path.read_bytes()
+            if name == "manifest.json":
+                data = data.replace(f'"digest": "{digest}"'.encode(), b'"digest": null')
+            lines.append(f"{hashlib.sha256(data).hexdigest()}  {name}\n")
+    assert hashlib.sha256("".join(lines).encode()).hexdigest() == digest
+    for command in ("verify", "info"):
+        assert digest in CliRunner().invoke(main, [command, str(policy_release)]).output
+    assert digest in (policy_release / "README.md").read_text()
+
+
+def test_a_part_of_a_release_is_called_incomplete(copy, maze_release, tmp_path):
+    for shard in (0, 1):
+        (copy / commit_path(NAME, shard)).unlink()
+    finish_release(copy, open_release(copy).manifest)
+    result = CliRunner().invoke(main, ["verify", str(copy)])
+    assert result.exit_code == 3 and f"{NAME}: 0 of 3 episodes" in result.output
+    assert "incomplete: 6 of 9 episodes" in result.output
+    with pytest.raises(StoreError, match="none of its episodes are here"):
+        open_release(copy)[NAME]
+    shutil.copytree(maze_release, tmp_path / "maze")
+    (tmp_path / "maze" / commit_path("ant-maze-tiny/random/visible", 1)).unlink()
+    finish_release(tmp_path / "maze", open_release(tmp_path / "maze").manifest)
+    found = verify(tmp_path / "maze")
+    assert found.sound and found.incomplete == {"ant-maze-tiny/random/visible": (1, 2)}
 
 
 def test_a_truncated_shard_is_found(copy):

@@ -18,7 +18,8 @@ from dmcvb_gen.cli.common import background_source, format_bytes, json_option, l
 def verify(context, path, backgrounds, as_json):
     """Check that a release is what it says: digests, shapes, values, physics, pixels, returns.
 
-    Exit code 0 when sound, 1 when a check fails, 2 on bad usage.
+    Exit code 0 when sound and complete, 1 when a check fails, 2 on bad usage, 3 when what is here is sound but is not
+    the whole release (a rollout that is not finished, or a part that was fetched).
 
     \b
     dmcvb-gen verify releases/demo
@@ -29,15 +30,25 @@ def verify(context, path, backgrounds, as_json):
         result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()))
     if as_json:
         findings = [dataclasses.asdict(finding) for finding in result.findings]
-        print_json({"sound": result.sound, "checked": result.checked, "findings": findings})
+        facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
+        print_json(facts | {"checked": result.checked, "findings": findings, "incomplete": result.incomplete})
     else:
         for finding in result.findings[:50]:
             click.echo(f"FAIL {finding}")
         if len(result.findings) > 50:
             click.echo(f"... and {len(result.findings) - 50} more")
+        for name, (here, planned) in result.incomplete.items():
+            click.echo(f"{name}: {here:,} of {planned:,} episodes")
         checked = ", ".join(f"{count:,} {name}" for name, count in result.checked.items())
-        click.echo(f"{path}: {'sound' if result.sound else f'{len(result.findings)} findings'} ({checked})")
-    context.exit(0 if result.sound else 1)
+        verdict = "sound" if result.sound else f"{len(result.findings)} findings"
+        if result.incomplete:
+            here = result.checked["episodes"]
+            planned = here + sum(planned - count for count, planned in result.incomplete.values())
+            verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
+        click.echo(f"{path}: {verdict} ({checked})")
+        if result.digest:
+            click.echo(f"digest {result.digest}")
+    context.exit(1 if not result.sound else 3 if result.incomplete else 0)
 
 
 def parse_episodes(context, parameter, text):

@@ -345,6 +345,8 @@ def info(path, as_json):
     console.width = max(console.width, 152)  # a cut number is worse than a wrapped line
     console.print(table)
     console.print(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
+    if facts["digest"]:
+        console.print(f"digest {facts['digest']}", highlight=False)
 
 
 @click.command()

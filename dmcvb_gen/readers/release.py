@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.readers.blocks import choose, stream
 from dmcvb_gen.readers.source import StepSource
 from dmcvb_gen.store import Release, Subset, open_release
-from dmcvb_gen.store.remote import file_system, is_url, public, reason
 
 if TYPE_CHECKING:
     import xarray
@@ -85,15 +84,7 @@ class ReleaseReader(Release):
 
 def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseReader:
     """See `dmcvb_gen.open`."""
-    path = str(path)
-    if is_url(path):
-        if path.startswith("file:") and "://" not in path:
-            path = "file://" + path.removeprefix("file:")
-        file_system(path, storage_options)
-    try:
-        release = open_release(path, storage_options)
-    except (OSError, PermissionError) as error:
-        raise StoreError(f"cannot read {public(path)}: {reason(error)}") from None
+    release = open_release(path, storage_options)
     subsets = {
         name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
         for name, subset in release.subsets.items()

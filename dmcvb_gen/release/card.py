@@ -18,11 +18,11 @@ from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.croissant import croissant
-from dmcvb_gen.release.publish import CARD_FOLDER
 from dmcvb_gen.rollout.info import describe_release
 from dmcvb_gen.rollout.preview import contact_sheet
 from dmcvb_gen.rollout.recipe import distractor_of, is_maze
 from dmcvb_gen.store import Release, open_release
+from dmcvb_gen.store.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.store.manifest import Manifest
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
@@ -63,6 +63,8 @@ def write_card(root: str | Path, out: str | Path | None = None) -> list[Path]:
         Image.fromarray(_sheet(release)).save(folder / SHEET)
     except OSError as error:
         raise StoreError(f"cannot write the card to {folder}: {error.strerror or error}; give --out") from None
+    if folder.resolve() == release.path.resolve():
+        take_in_card(folder)
     return [folder / name for name in (*texts, PLOT, SHEET)]
 
 
@@ -164,7 +166,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
     lines += ["", "Names are task/level/distractor. A step is two control steps with the same action.", ""]
     lines += ["## Arrays", ""]
     rows = [
-        (f"`{name}`", str(first.array(name).dtype), " x ".join(map(str, first.array(name).metadata.dimension_names)))
+        (f"`{name}`", str(first.array(name).dtype), " x ".join(map(str, first.array(name).dimensions)))
         for name in first.arrays
     ]
     lines += _table(("array", "type", "dimensions"), rows)
@@ -205,6 +207,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
         "",
         "```bash",
         f"dmcvb-gen verify {manifest.name}",
+        f"# digest {manifest.digest or 'not finished'}",
         f"dmcvb-gen regenerate {manifest.name} --check      # simulates and paints everything again, compares digests",
         "```",
         "",

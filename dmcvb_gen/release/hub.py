@@ -10,11 +10,11 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.release.transfer import is_refusal, refused
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest
-from dmcvb_gen.store.remote import reason
-from dmcvb_gen.store.writer import sha256_file
+from dmcvb_gen.store.remote import is_refusal, reason, refused
 
 BATCH = 200
 """Files a commit."""
@@ -40,7 +40,7 @@ def publish_to_hub(
     """Put a release into a data set repository (made if it is not there); gives how many files were moved.
 
     Args:
-      index: the release's `publish.Index`.
+      index: the release's `store.index.Index`.
       api: a `huggingface_hub.HfApi`, for tests; by default one with the environment's token.
 
     Raises:
@@ -49,7 +49,7 @@ def publish_to_hub(
     try:
         from huggingface_hub import CommitOperationAdd, HfApi
     except ImportError:
-        raise StoreError('hf:// needs a package that is not installed: pip install "dmcvb-gen[hf]"') from None
+        raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
     repository, folder = parse_hub_url(url)
     api = api or HfApi()
     where = dict(repo_id=repository, repo_type="dataset")
@@ -76,7 +76,7 @@ def publish_to_hub(
             head = api.create_commit(**where, operations=operations, commit_message=message).oid
             tick(len(part))
         last = [
-            CommitOperationAdd(folder + "files.json", index.model_dump_json(indent=1).encode()),
+            CommitOperationAdd(folder + "files.json", files.json_bytes(index)),
             CommitOperationAdd(folder + MANIFEST, str(root / MANIFEST)),
         ]
         # Refused by the Hub if anyone else committed since: two publishers cannot both finish.

@@ -7,16 +7,14 @@ without a manifest is no release, so readers never see half of one.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import pydantic
-
+from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.regenerate import load_manifest
 from dmcvb_gen.release.transfer import (
@@ -28,34 +26,35 @@ from dmcvb_gen.release.transfer import (
     upload,
 )
 from dmcvb_gen.rollout.jobs import ShardKey, chosen_shards
+from dmcvb_gen.store.index import (
+    CARD_FILES,
+    CARD_FOLDER,
+    INDEX,
+    Index,
+    card_files,
+    data_files,
+    is_card,
+    parse_index,
+    read_index,
+    write_release,
+)
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
-    Digest,
     FileRecord,
     Manifest,
     SubsetRecord,
-    parse_commit,
+    checked_commit,
+    commit_path,
     parse_manifest,
-    write_json_atomically,
+    shard_count,
+    subset_path,
 )
-from dmcvb_gen.store.remote import file_system, public, reason
-from dmcvb_gen.store.writer import commit_path, read_commits, sha256_file, shard_count, subset_path
+from dmcvb_gen.store.remote import file_system, public, reason, storage_errors
+from dmcvb_gen.store.writer import LOCK, mark_created, only_writer, read_commits
 
-INDEX, CLAIM = "files.json", "publishing.json"
-CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
-CARD_FOLDER = "card"
-"""Pictures of the card."""
+CLAIM = "publishing.json"
 Tick = Callable[[int], None]
-
-
-class Index(pydantic.BaseModel):
-    """files.json: every file of a published release but its manifest."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-    format: Literal["dmcvb-gen files"] = "dmcvb-gen files"
-    manifest_sha256: Digest
-    files: tuple[FileRecord, ...]
 
 
 @dataclass(frozen=True)
@@ -67,39 +66,23 @@ class Moved:
     moved: int
 
 
-def small_files(root: Path, manifest: Manifest) -> list[str]:
-    """Paths of everything but shards and manifest: metadata, commit records, policies, card."""
-    found = []
-    for record in manifest.subsets:
-        folder = root / subset_path(record.name)
-        found += [path.relative_to(root).as_posix() for path in sorted(folder.rglob("zarr.json"))]
-        found += [commit_path(record.name, shard) for shard in range(shard_count(record))]
-        found += [policy.path for policy in record.policies if policy.path]
-    found += [name for name in CARD_FILES if (root / name).is_file()]
-    found += [f"{CARD_FOLDER}/{path.name}" for path in sorted((root / CARD_FOLDER).glob("*")) if path.is_file()]
-    return list(dict.fromkeys(found))
-
-
-def make_index(root: Path, manifest: Manifest) -> Index:
-    """The index of a complete release; digests of shards are those of its commit records.
+def index_of(root: Path, manifest: Manifest) -> Index:
+    """The index of a complete release: its own, or one made now for a release of version 1.
 
     Raises:
-      StoreError: a file is missing.
+      StoreError: a file is missing, or manifest and index do not belong together.
     """
-    files = {}
+    commits = {record.name: read_commits(root, record) for record in manifest.subsets}
     for record in manifest.subsets:
-        commits = read_commits(root, record)
-        if len(commits) != shard_count(record):
+        if len(commits[record.name]) != shard_count(record):
             raise StoreError(f"{record.name} has damaged or missing shards; run `dmcvb-gen regenerate {root}` first")
-        files |= {file.path: file for commit in commits.values() for file in commit.files}
-    for name in small_files(root, manifest):
-        path = root / name
-        if not path.is_file():
-            raise StoreError(f"{path} is missing; run `dmcvb-gen regenerate {root}` first")
-        files[name] = FileRecord(path=name, bytes=path.stat().st_size, sha256=sha256_file(path))
-    return Index(
-        manifest_sha256=sha256_file(root / MANIFEST), files=tuple(sorted(files.values(), key=lambda file: file.path))
-    )
+    digest, index = files.sha256_file(root / MANIFEST), read_index(root)
+    if index is None:
+        listed = sorted([*data_files(root, manifest, commits), *card_files(root)], key=lambda file: file.path)
+        return Index(manifest_sha256=digest, files=tuple(listed)).sealed()
+    if index.manifest_sha256 != digest:
+        raise StoreError(f"{root / MANIFEST} does not have the digest that {INDEX} says; `dmcvb-gen verify` says more")
+    return index
 
 
 # -- publish --------------------------------------------------------------------------------------
@@ -129,7 +112,7 @@ def publish(
     root, manifest = load_manifest(root)
     if not manifest.complete:
         raise StoreError(f"{root} is not complete; finish it with the same rollout, or `dmcvb-gen regenerate {root}`")
-    index = make_index(root, manifest)
+    index = index_of(root, manifest)
     total = sum(file.bytes for file in index.files)
     if url.startswith("hf://"):
         from dmcvb_gen.release.hub import publish_to_hub
@@ -147,7 +130,7 @@ def publish(
         workers,
         lambda result: tick(1),
     )
-    retry(place, INDEX, lambda: _put(filesystem, f"{base}/{INDEX}", index.model_dump_json(indent=1).encode()))
+    retry(place, INDEX, lambda: _put(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
     try:
         _create(filesystem, f"{base}/{MANIFEST}", (root / MANIFEST).read_bytes())
     except FileExistsError:
@@ -177,7 +160,7 @@ def _there(filesystem, place, base, digest: str, manifest: Manifest) -> bool:
     found = _read(filesystem, place, f"{base}/{MANIFEST}")
     if found is None:
         return False
-    if hashlib.sha256(found).hexdigest() == digest:
+    if files.sha256_bytes(found) == digest:
         return True
     try:
         other = parse_manifest(found, f"{place}/{MANIFEST}")
@@ -277,102 +260,119 @@ def fetch(
       StoreError: no release is there; a file has other bytes than its digest says; `out` holds something else;
         there is no room; access is refused.
     """
-    out, place = Path(out), public(url)
-    filesystem, base = file_system(url, options)
-    text = _read(filesystem, place, f"{base}/{MANIFEST}")
-    if text is None:
-        raise StoreError(f"{place} holds no release (no {MANIFEST}); check the URL, or it is still being published")
-    manifest = parse_manifest(text, f"{place}/{MANIFEST}")
-    index = _read_index(filesystem, place, base, text)
-    shards = chosen_shards(manifest, only, episodes)
-    records = {record.name: record for record in shards.values()}
-    listed = {file.path: file for file in index.files}
-    # Zarr finds the arrays in one consolidated file and beside them: all metadata of a subset comes.
-    metadata = [
-        path
-        for path in listed
-        for name in records
-        if path.startswith(f"{subset_path(name)}/") and path.endswith("/zarr.json")
-    ]
-    policies = [policy.path for record in records.values() for policy in record.policies if policy.path in listed]
-    cards = [path for path in listed if path in CARD_FILES or path.startswith(f"{CARD_FOLDER}/")]
-    commit_files = [_listed(listed, commit_path(*key), place) for key in shards]
-    _take_up(out, manifest, text)
-    try:
+    out, source = Path(out), _Source.find(url, options)
+    shards = chosen_shards(source.manifest, only, episodes)
+    wanted = source.metadata(shards.values())
+    commit_files = [source.listed(commit_path(*key)) for key in shards]
+    _take_up(out, source.manifest)
+    with storage_errors(out, "write to"):
         out.mkdir(parents=True, exist_ok=True)
-        commits = _fetch_commits(filesystem, place, base, commit_files, shards, workers, out)
-        wanted = [listed[path] for path in dict.fromkeys(metadata + policies + cards)]
-        wanted += [file for commit in commits.values() for file in commit.files]
-        total = sum(file.bytes for file in wanted)
-        _check_room(out, [file for file in wanted if not (out / file.path).exists()])
-        moved = in_parallel(
-            lambda file: (download(filesystem, place, f"{base}/{file.path}", out / file.path, file), file.bytes),
-            wanted,
-            workers,
-            lambda result: tick(result[1]),
-        )
-        _write_manifest(out, manifest, text, only, episodes, place)
-        for name in records:
-            (out / subset_path(name) / ".created").touch()
-        for commit in commits.values():  # a shard is there once its record is, and that comes after its files
-            write_json_atomically(out / commit_path(commit.subset, commit.shard), commit)
-        _write_manifest(out, manifest, text, only, episodes, place)
-    except OSError as error:
-        raise StoreError(f"cannot write to {out}: {error.strerror or error}; choose a writable --out") from None
-    return Moved(len(wanted), total, sum(count > 0 for count, _ in moved))
+        with only_writer(out):
+            commits = _fetch_commits(source, commit_files, shards, workers)
+            wanted += [file for _, commit in commits.values() for file in commit.files]
+            _check_room(out, [file for file in wanted if not (out / file.path).exists()])
+
+            def bring(file: FileRecord) -> tuple[int, int]:
+                remote = f"{source.base}/{file.path}"
+                return download(source.filesystem, source.place, remote, out / file.path, file), file.bytes
+
+            moved = in_parallel(bring, wanted, workers, lambda result: tick(result[1]))
+            _write_part(out, source, only, episodes)
+            for text, commit in commits.values():  # a shard is there once its record is, and that is after its files
+                files.write_bytes(out / commit_path(commit.subset, commit.shard), text)
+            _finish(out, source)
+    return Moved(len(wanted), sum(file.bytes for file in wanted), sum(count > 0 for count, _ in moved))
 
 
-def _read_index(filesystem, place, base, manifest_text: bytes) -> Index:
-    text = _read(filesystem, place, f"{base}/{INDEX}")
-    if text is None:
-        raise StoreError(f"{place} has no {INDEX}; it was not put there by `dmcvb-gen publish`, copy the folder whole")
-    try:
-        index = Index.model_validate_json(text)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the top"
-        raise StoreError(f"{place}/{INDEX} is not valid at {where}: {first['msg']}") from None
-    if index.manifest_sha256 != hashlib.sha256(manifest_text).hexdigest():
-        raise StoreError(f"{place}: {MANIFEST} does not have the digest that {INDEX} says; publish it again")
-    return index
+@dataclass(frozen=True)
+class _Source:
+    """A published release: where it lies, and what it says of itself."""
+
+    filesystem: Any
+    base: str
+    place: str
+    manifest_text: bytes
+    index_text: bytes
+    manifest: Manifest
+    index: Index
+
+    @classmethod
+    def find(cls, url: str, options: dict[str, Any] | None) -> _Source:
+        """Read manifest and index at a URL.
+
+        Raises:
+          StoreError: no release is there, or its manifest and index do not belong together.
+        """
+        place = public(url)
+        filesystem, base = file_system(url, options)
+        text = _read(filesystem, place, f"{base}/{MANIFEST}")
+        if text is None:
+            raise StoreError(f"{place} holds no release (no {MANIFEST}); check the URL, or it is still being published")
+        manifest = parse_manifest(text, f"{place}/{MANIFEST}")
+        listing = _read(filesystem, place, f"{base}/{INDEX}")
+        if listing is None:
+            raise StoreError(
+                f"{place} has no {INDEX}; it was not put there by `dmcvb-gen publish`, copy the folder whole"
+            )
+        index = parse_index(listing, f"{place}/{INDEX}")
+        if index.manifest_sha256 != files.sha256_bytes(text):
+            raise StoreError(f"{place}: {MANIFEST} does not have the digest that {INDEX} says; publish it again")
+        return cls(filesystem, base, place, text, listing, manifest, index)
+
+    def listed(self, path: str) -> FileRecord:
+        """What the index says of a file."""
+        for file in self.index.files:
+            if file.path == path:
+                return file
+        raise StoreError(f"{self.place}/{INDEX} does not list {path}; publish the release again")
+
+    def metadata(self, records: Iterable[SubsetRecord]) -> list[FileRecord]:
+        """Zarr metadata and policies of subsets, and the card: what comes whole with any part of the release.
+
+        Zarr finds the arrays in one consolidated file and beside them, so all metadata of a subset comes.
+        """
+        records = list({record.name: record for record in records}.values())
+        folders = tuple(f"{subset_path(record.name)}/" for record in records)
+        policies = {policy.path for record in records for policy in record.policies}
+        return [
+            file
+            for file in self.index.files
+            if (file.path.startswith(folders) and file.path.endswith("/zarr.json"))
+            or file.path in policies
+            or is_card(file.path)
+        ]
 
 
-def _listed(listed: dict[str, FileRecord], path: str, place: str) -> FileRecord:
-    if path not in listed:
-        raise StoreError(f"{place}/{INDEX} does not list {path}; publish the release again")
-    return listed[path]
-
-
-def _fetch_commits(filesystem, place, base, files, shards, workers, out) -> dict[ShardKey, CommitRecord]:
-    """The commit records of shards, checked: digests, and that their files lie in the subset's own folder."""
+def _fetch_commits(
+    source: _Source, listed: list[FileRecord], shards: dict[ShardKey, SubsetRecord], workers: int
+) -> dict[ShardKey, tuple[bytes, CommitRecord]]:
+    """The commit records of shards, as bytes and checked: digests, and that their files lie in the subset's folder."""
 
     def one(item):
         key, file = item
 
         def attempt():
-            data = filesystem.cat_file(f"{base}/{file.path}")
-            if hashlib.sha256(data).hexdigest() != file.sha256:
+            data = source.filesystem.cat_file(f"{source.base}/{file.path}")
+            if files.sha256_bytes(data) != file.sha256:
                 raise OSError(f"{file.path} does not have its digest")
             return data
 
-        commit = parse_commit(retry(place, file.path, attempt), f"{place}/{file.path}")
-        folder = f"{subset_path(key[0])}/"
-        strange = [f.path for f in commit.files if not f.path.startswith(folder)]
-        if (commit.subset, commit.shard) != key or strange:
-            raise StoreError(f"{place}/{file.path} names files outside of {folder}; do not trust this release")
-        return commit
+        text = retry(source.place, file.path, attempt)
+        return text, checked_commit(text, f"{source.place}/{file.path}", shards[key], key[1])
 
-    return dict(zip(shards, in_parallel(one, list(zip(shards, files, strict=True)), workers, lambda _: 0), strict=True))
+    found = in_parallel(one, list(zip(shards, listed, strict=True)), workers, lambda _: 0)
+    return dict(zip(shards, found, strict=True))
 
 
 def _same_release(one: Manifest, other: Manifest) -> bool:
     def identity(manifest: Manifest) -> tuple[str, str, Any, list[SubsetRecord]]:
-        return manifest.name, manifest.version, manifest.recipe, list(manifest.subsets)
+        bare = [record.model_copy(update={"digest": None}) for record in manifest.subsets]
+        return manifest.name, manifest.version, manifest.recipe, bare
 
     return identity(one) == identity(other)
 
 
-def _take_up(out: Path, manifest: Manifest, text: bytes) -> None:
+def _take_up(out: Path, manifest: Manifest) -> None:
     """Raises StoreError where `out` holds anything but a part of this release."""
     if (out / MANIFEST).is_file():
         old = parse_manifest((out / MANIFEST).read_bytes(), str(out / MANIFEST))
@@ -381,13 +381,13 @@ def _take_up(out: Path, manifest: Manifest, text: bytes) -> None:
                 f"{out} holds {old.name} {old.version} and not the {manifest.name} {manifest.version} of the URL; "
                 "choose another --out"
             )
-    elif out.exists() and (not out.is_dir() or any(path.suffix != ".partial" for path in _strangers(out, manifest))):
+    elif out.exists() and (not out.is_dir() or any(path.suffix != files.PARTIAL for path in _strangers(out, manifest))):
         raise StoreError(f"{out} is not empty and holds no release; choose an empty or new folder for --out")
 
 
 def _strangers(out: Path, manifest: Manifest) -> Iterable[Path]:
     """What lies in a folder and is no part of an interrupted fetch."""
-    ours = {record.name.split("/")[0] for record in manifest.subsets} | {"policies", "commits", CARD_FOLDER}
+    ours = {record.name.split("/")[0] for record in manifest.subsets} | {"policies", "commits", CARD_FOLDER, LOCK}
     return (path for path in out.iterdir() if path.name not in ours | set(CARD_FILES))
 
 
@@ -400,25 +400,34 @@ def _check_room(out: Path, files: list[FileRecord]) -> None:
         )
 
 
-def _write_manifest(out: Path, manifest: Manifest, text: bytes, only, episodes, place: str) -> None:
-    """The release's own manifest where everything is here; else one that says which part, and that it is one."""
-    whole = all(len(read_commits(out, record)) == shard_count(record) for record in manifest.subsets)
-    if whole:
-        temporary = out / f"{MANIFEST}.partial"
-        temporary.write_bytes(text)
-        temporary.replace(out / MANIFEST)
-        return
+def _write_part(out: Path, source: _Source, only, episodes) -> None:
+    """A manifest that says that this is a part, and which: what is here while files come, and until all are."""
     parts = []
     if (out / MANIFEST).is_file():
         parts = [entry for entry in parse_manifest((out / MANIFEST).read_bytes()).lineage if entry["kind"] == "fetch"]
     entry = {
         "kind": "fetch",
-        "from": place,
-        "manifest_sha256": hashlib.sha256(text).hexdigest(),
+        "from": source.place,
+        "manifest_sha256": source.index.manifest_sha256,
+        "digest": source.manifest.digest,
         "only": list(only),
         "episodes": list(episodes) if episodes else None,
     }
     if entry not in parts:
         parts.append(entry)
-    lineage = (*manifest.lineage, *parts)
-    write_json_atomically(out / MANIFEST, manifest.model_copy(update={"lineage": lineage, "complete": False}))
+    facts = {"lineage": (*source.manifest.lineage, *parts), "complete": False, "digest": None}
+    (out / INDEX).unlink(missing_ok=True)
+    files.write_json(out / MANIFEST, source.manifest.model_copy(update=facts))
+    for record in source.manifest.subsets:
+        if (out / subset_path(record.name)).is_dir():
+            mark_created(out, record)
+
+
+def _finish(out: Path, source: _Source) -> None:
+    """The release's own manifest and index where everything is here; else digests of the part."""
+    commits = {record.name: read_commits(out, record) for record in source.manifest.subsets}
+    if all(len(commits[record.name]) == shard_count(record) for record in source.manifest.subsets):
+        files.write_bytes(out / INDEX, source.index_text)
+        files.write_bytes(out / MANIFEST, source.manifest_text)
+        return
+    write_release(out, parse_manifest((out / MANIFEST).read_bytes()), commits)

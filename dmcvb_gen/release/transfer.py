@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import base64
-import errno
 import hashlib
 import logging
-import time
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import fsspec
+import tenacity
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.store.manifest import FileRecord
-from dmcvb_gen.store.remote import reason
-from dmcvb_gen.store.writer import sha256_file
+from dmcvb_gen.store.remote import NO_ROOM, is_refusal, reason, refused
 
 ATTEMPTS = 4
 """Tries of a file before giving up."""
@@ -40,48 +39,43 @@ def protocol(filesystem: fsspec.AbstractFileSystem) -> str:
     return filesystem.protocol if isinstance(filesystem.protocol, str) else filesystem.protocol[0]
 
 
-def is_refusal(error: BaseException) -> bool:
-    """Whether an error is about who is asking, so that trying again is of no use."""
-    words = f"{type(error).__name__} {error}"
-    return isinstance(error, PermissionError) or any(
-        word in words for word in ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "Unauthorized")
-    )
-
-
-def refused(place: str, error: BaseException) -> StoreError:
-    """The error for missing or wrong credentials."""
-    return StoreError(
-        f"{place} refuses access ({reason(error)}); set valid credentials in the environment or the provider's own "
-        "configuration (e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, gcloud, HF_TOKEN)"
-    )
-
-
 def retry(place: str, path: str, attempt):
     """Call `attempt` until it succeeds, at most ATTEMPTS times.
 
     Raises:
       StoreError: access is refused, the disk is full, or it never succeeded.
     """
-    for number in range(1, ATTEMPTS + 1):
-        try:
-            return attempt()
-        except StoreError:
-            raise
-        except Exception as error:  # file systems raise their clients' own kinds
-            if is_refusal(error):
-                raise refused(place, error) from None
-            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                raise StoreError(
-                    f"no room for {path} ({error.strerror}); what was moved stays, make room and run the same "
-                    "command again"
-                ) from None
-            if number == ATTEMPTS:
-                raise StoreError(
-                    f"cannot move {path} after {ATTEMPTS} tries ({reason(error)}); what was moved stays, run the same "
-                    "command again"
-                ) from None
-            log.info("try %d of %s failed: %s", number, path, reason(error))
-            time.sleep(PAUSE * 2 ** (number - 1))
+    attempts = tenacity.Retrying(
+        stop=tenacity.stop_after_attempt(ATTEMPTS),
+        wait=tenacity.wait_exponential(multiplier=PAUSE, min=0),
+        retry=tenacity.retry_if_exception(_may_pass),
+        before_sleep=lambda state: log.info(
+            "try %d of %s failed: %s", state.attempt_number, path, reason(state.outcome.exception())
+        ),
+        reraise=True,
+    )
+    try:
+        return attempts(attempt)
+    except StoreError:
+        raise
+    except Exception as error:  # file systems raise their clients' own kinds
+        if is_refusal(error):
+            raise refused(place, error) from None
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
+            raise StoreError(
+                f"no room for {path} ({error.strerror}); what was moved stays, make room and run the same command again"
+            ) from None
+        raise StoreError(
+            f"cannot move {path} after {ATTEMPTS} tries ({reason(error)}); what was moved stays, run the same command "
+            "again"
+        ) from None
+
+
+def _may_pass(error: BaseException) -> bool:
+    """Whether trying again may help."""
+    if isinstance(error, StoreError) or not isinstance(error, Exception) or is_refusal(error):
+        return False
+    return not (isinstance(error, OSError) and error.errno in NO_ROOM)
 
 
 def _etags(path: Path) -> set[str]:

@@ -7,21 +7,35 @@ simulated again and a sample of frames painted again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.release.import_tfds import MISSING
 from dmcvb_gen.rollout.jobs import video_source
 from dmcvb_gen.rollout.painting import renderer_for
-from dmcvb_gen.store import Release, Subset, open_release
+from dmcvb_gen.store import Subset, open_release
+from dmcvb_gen.store.index import INDEX, Index, read_index, root_digest
+from dmcvb_gen.store.manifest import (
+    MANIFEST,
+    FileRecord,
+    Manifest,
+    SubsetRecord,
+    checked_commit,
+    commit_path,
+    parse_manifest,
+    shard_count,
+    subset_path,
+)
 from dmcvb_gen.store.pictures import picture_of
+from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
-from dmcvb_gen.store.writer import read_commits, sha256_file, shard_count, subset_digest
+from dmcvb_gen.store.writer import subset_digest
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
@@ -53,34 +67,111 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was looked at, and what was found wrong."""
+    """What was looked at, and what was found wrong.
+
+    Attributes:
+      checked: how many subsets, episodes and steps.
+      findings: what is wrong.
+      incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
+      digest: the release's root digest, None while it is made (and of version 1).
+    """
 
     checked: dict[str, int]
     findings: tuple[Finding, ...]
+    incomplete: dict[str, tuple[int, int]] = field(default_factory=dict)
+    digest: str | None = None
 
     @property
     def sound(self) -> bool:
+        """Whether everything that is here is as it was made."""
         return not self.findings
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything that belongs to the release is here."""
+        return not self.incomplete
 
 
 def _sample(count: int, wanted: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
 
 
-def check_files(release: Release) -> Iterator[Finding]:
-    """Every committed file has its bytes; every shard of a complete release is there."""
-    for record in release.manifest.subsets:
-        commits = read_commits(release.path, record)
-        if release.manifest.complete:
-            for shard in range(shard_count(record)):
-                if shard not in commits:
-                    yield Finding("files", record.name, f"shard {shard} is missing or has files of another size")
-        for shard, commit in commits.items():
-            for file in commit.files:
-                if sha256_file(release.path / file.path) != file.sha256:
-                    yield Finding("files", record.name, f"{file.path} of shard {shard} does not have its digest")
-        if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
-            yield Finding("files", record.name, "its commit records do not give the digest of the manifest")
+# -- bytes ----------------------------------------------------------------------------------------
+
+
+def check_files(root: Path) -> Iterator[Finding]:
+    """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`."""
+    try:
+        manifest = parse_manifest((root / MANIFEST).read_bytes(), MANIFEST)
+    except StoreError as error:
+        yield Finding("files", MANIFEST, f"is damaged: {error}")
+        return
+    try:
+        index = read_index(root)
+    except StoreError as error:
+        yield Finding("files", INDEX, f"is damaged: {error}")
+        index = None
+    else:
+        if index is None and manifest.digest is not None:
+            yield Finding("files", INDEX, "is missing; fetch it again")
+    checked: set[str] = set()
+    for record in manifest.subsets:
+        yield from _check_shards(root, manifest, record, checked)
+    if index is not None:
+        yield from _check_index(root, manifest, index, checked)
+
+
+def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]) -> Iterator[Finding]:
+    for file in index.files:
+        if file.path not in checked:
+            yield from _check_file(root, file, _subset_of(manifest, file.path))
+    if sha256_file(root / MANIFEST) != index.manifest_sha256:
+        yield Finding("files", MANIFEST, f"does not have the digest that {INDEX} says")
+    elif manifest.digest is not None and root_digest(index.files, manifest) != manifest.digest:
+        yield Finding("files", MANIFEST, f"its root digest is not that of the files in {INDEX}")
+
+
+def _subset_of(manifest: Manifest, path: str) -> str:
+    """The subset that a file belongs to; the file itself where it belongs to none."""
+    for record in manifest.subsets:
+        if path.startswith((f"{subset_path(record.name)}/", f"commits/{record.name}/")):
+            return record.name
+    return path
+
+
+def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Iterator[Finding]:
+    path, name = root / file.path, file.path + what
+    with storage_errors(path):
+        if not path.is_file():
+            yield Finding("files", where, f"{name} is missing")
+        elif path.stat().st_size != file.bytes:
+            yield Finding("files", where, f"{name} has {path.stat().st_size} bytes instead of {file.bytes}")
+        elif sha256_file(path) != file.sha256:
+            yield Finding("files", where, f"{name} does not have its digest")
+
+
+def _check_shards(root: Path, manifest: Manifest, record: SubsetRecord, checked: set[str]) -> Iterator[Finding]:
+    """Commit records and their files, which are put into `checked`."""
+    commits = {}
+    for shard in range(shard_count(record)):
+        path = commit_path(record.name, shard)
+        if not (root / path).is_file():
+            if manifest.complete:
+                yield Finding("files", record.name, f"shard {shard} is missing: no {path}")
+            continue
+        try:
+            commit = commits[shard] = checked_commit((root / path).read_bytes(), path, record, shard)
+        except StoreError as error:
+            yield Finding("files", record.name, f"{path} is damaged: {error}")
+            continue
+        for file in commit.files:
+            checked.add(file.path)
+            yield from _check_file(root, file, record.name, f" of shard {shard}")
+    if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
+        yield Finding("files", record.name, "its commit records do not give the digest of the manifest")
+
+
+# -- values ---------------------------------------------------------------------------------------
 
 
 def is_imported(subset: Subset) -> bool:
@@ -217,25 +308,35 @@ def verify(
     Raises:
       DmcvbError: there is no release, or nothing is committed.
     """
-    release = open_release(path)
-    if not release.subsets:
-        raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
-    findings = list(check_files(release))
+    root = Path(path)
+    if not (root / MANIFEST).is_file():
+        open_release(path)  # says what is the matter
+    findings = list(check_files(root))
     damaged = {finding.subset for finding in findings}
     counts = {"subsets": 0, "episodes": 0, "steps": 0}
+    if damaged & {MANIFEST, INDEX}:
+        return Verification(counts, tuple(findings))  # nothing says what the rest should be
+    release = open_release(path, skip=damaged)
+    if not release.subsets and not findings:
+        raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
     for name, subset in release.subsets.items():
         tick(name)
         counts["subsets"] += 1
         counts["episodes"] += len(subset.episodes)
         counts["steps"] += subset.steps
-        if name in damaged:
-            continue  # its bytes cannot be trusted, so what they say is not worth reporting
+        findings += _check_subset(subset, backgrounds)
+    incomplete = {name: count for name, count in release.shortfalls.items() if name not in damaged}
+    return Verification(counts, tuple(findings), incomplete, release.manifest.digest)
+
+
+def _check_subset(subset: Subset, backgrounds: str | None) -> list[Finding]:
+    try:
         found = list(check_values(subset))
-        findings += found
-        if any(finding.check in ("shapes", "lengths") for finding in found):
-            continue
-        if is_imported(subset):
-            continue  # nothing to simulate or paint from
-        findings += check_physics(subset)
-        findings += check_pixels(subset, backgrounds)
-    return Verification(counts, tuple(findings))
+        if any(finding.check in ("shapes", "lengths") for finding in found) or is_imported(subset):
+            return found  # no values to go by, or nothing to simulate or paint from
+        found += check_physics(subset)
+        if subset.pixel_arrays:
+            found += check_pixels(subset, backgrounds)
+        return found
+    except StoreError as error:
+        return [Finding("files", subset.name, str(error))]

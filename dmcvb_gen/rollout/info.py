@@ -55,6 +55,7 @@ def describe_release(path: str | Path) -> dict[str, Any]:
         version=release.manifest.version,
         generator=release.manifest.generator,
         complete=release.manifest.complete,
+        digest=release.manifest.digest,
         steps=sum(subset["steps"] for subset in subsets),
         bytes=sum(subset["bytes"] for subset in subsets),
         subsets=subsets,

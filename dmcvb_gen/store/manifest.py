@@ -14,9 +14,10 @@ import pydantic
 
 from dmcvb_gen import __version__
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import write_json
+from dmcvb_gen.files import write_json as write_json_atomically
 from dmcvb_gen.store.schema import SCHEMA_VERSION
 
+__all__ = ["write_json_atomically"]
 MANIFEST = "manifest.json"
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
@@ -122,6 +123,7 @@ class Manifest(_Model):
       environments: versions and platform of every process that added to it, in order.
       lineage: for a release derived from another one (repaint, fetch, import): what from.
       complete: whether every shard of every subset is committed; `digest`s are set then.
+      digest: of every file of the release, see `dmcvb_gen.store.index`; None while it is made.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -135,7 +137,28 @@ class Manifest(_Model):
     environments: tuple[dict[str, str], ...] = ()
     lineage: tuple[dict[str, Any], ...] = ()
     complete: bool = False
+    digest: Digest | None = None
     format: Literal["dmcvb-gen release"] = "dmcvb-gen release"
+
+
+def subset_path(name: str) -> str:
+    """Folder of a subset's Zarr group inside the release."""
+    return f"{name}.zarr"
+
+
+def commit_path(name: str, shard: int) -> str:
+    """Commit record of a shard inside the release."""
+    return f"commits/{name}/{shard:05d}.json"
+
+
+def shard_count(subset: SubsetRecord) -> int:
+    return -(-subset.episodes // subset.episodes_per_shard)
+
+
+def shard_episodes(subset: SubsetRecord, shard: int) -> tuple[int, int]:
+    """First episode of a shard, and the one after its last."""
+    first = shard * subset.episodes_per_shard
+    return first, min(first + subset.episodes_per_shard, subset.episodes)
 
 
 def environment(device: str = "cpu") -> dict[str, str]:
@@ -179,6 +202,29 @@ def parse_manifest(text: str | bytes, where: str = MANIFEST) -> Manifest:
 def parse_commit(text: str | bytes, where: str = "commit record") -> CommitRecord:
     """A commit record from JSON, see `parse_manifest`."""
     return _parse(CommitRecord, text, where)
+
+
+def checked_commit(text: str | bytes, where: str, subset: SubsetRecord, shard: int) -> CommitRecord:
+    """A shard's commit record from JSON, wherever it was read.
+
+    Raises:
+      StoreError: it is damaged, another shard's, or names files outside of the subset's folder.
+    """
+    commit = parse_commit(text, where)
+    if (commit.subset, commit.shard, commit.episodes) != (subset.name, shard, shard_episodes(subset, shard)):
+        raise StoreError(
+            f"{where} is not the record of episodes {_span(shard_episodes(subset, shard))} of {subset.name} but of "
+            f"{_span(commit.episodes)} of {commit.subset}; put the release's own record back (`dmcvb-gen regenerate` "
+            "makes it again)"
+        )
+    folder = f"{subset_path(subset.name)}/"
+    if any(not file.path.startswith(folder) for file in commit.files):
+        raise StoreError(f"{where} names files outside of {folder}; do not trust this release")
+    return commit
+
+
+def _span(episodes: tuple[int, int]) -> str:
+    return f"{episodes[0]}:{episodes[1]}"
 
 
 def _parse(model, text, where):
@@ -230,8 +276,3 @@ def _goal_pairs_of_version_1(record: dict[str, Any], patterns: list[dict[str, An
         if record.get("task") in tasks and "fixed" in (pattern.get("settings") or ()) and per_goal:
             return {"fixed_goals": record.get("episodes", 0) // per_goal, "episodes_per_goal": per_goal}
     return {}
-
-
-def write_json_atomically(path: Path, value: pydantic.BaseModel | dict[str, Any]) -> None:
-    """Write JSON so that a reader (or a crash) sees the old file or the new one, never a part."""
-    write_json(path, value)

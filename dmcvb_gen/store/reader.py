@@ -3,18 +3,54 @@
 from __future__ import annotations
 
 import functools
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, parse_commit, parse_manifest
-from dmcvb_gen.store.writer import commit_path, read_commits, shard_count, subset_path
+from dmcvb_gen.store.manifest import (
+    MANIFEST,
+    CommitRecord,
+    Manifest,
+    SubsetRecord,
+    checked_commit,
+    commit_path,
+    parse_manifest,
+    shard_count,
+    subset_path,
+)
+from dmcvb_gen.store.remote import file_system, is_url, public, storage_errors
+from dmcvb_gen.store.writer import read_commits
+
+
+class StoredArray:
+    """One array of a subset, read as it is indexed; damaged bytes and lost connections are one line with a cure.
+
+    Attributes:
+      name: e.g. "pixels/top".
+      shape, dtype, ndim: as in numpy; an entry for each episode that the subset will have.
+      dimensions: names of the axes.
+    """
+
+    def __init__(self, array: zarr.Array, name: str, place: str):
+        self._array, self._place, self.name = array, place, name
+        self.shape, self.dtype, self.ndim = array.shape, array.dtype, array.ndim
+        self.dimensions = tuple(map(str, array.metadata.dimension_names or ()))
+
+    def __repr__(self) -> str:
+        return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
+
+    def __getitem__(self, selection) -> np.ndarray:
+        with storage_errors(self._place, decoding=True):
+            return self._array[selection]
+
+    def rows(self, episodes: np.ndarray) -> np.ndarray:
+        """(episode, ...) values of episodes in any order."""
+        with storage_errors(self._place, decoding=True):
+            return self._array.oindex[episodes]
 
 
 class Subset:
@@ -45,9 +81,14 @@ class Subset:
     @functools.cached_property
     def group(self) -> zarr.Group:
         """The Zarr group, read-only."""
-        path = f"{self.root}/{subset_path(self.name)}"
-        options = {"storage_options": self._storage_options} if "://" in self.root else {}
-        return zarr.open_group(path, mode="r", **options)
+        options = {"storage_options": self._storage_options} if is_url(self.root) else {}
+        with storage_errors(self.path, decoding=True):
+            return zarr.open_group(self.path, mode="r", **options)
+
+    @property
+    def path(self) -> str:
+        """Folder or URL of the Zarr group."""
+        return f"{self.root}/{subset_path(self.name)}"
 
     @property
     def attrs(self) -> dict[str, Any]:
@@ -56,23 +97,25 @@ class Subset:
     @functools.cached_property
     def paths(self) -> dict[str, str]:
         """Array name -> path in the Zarr group, see `schema.stored_name`."""
-        members = self.group.members(max_depth=None)
-        return {str(item.attrs.get("array", path)): path for path, item in members if isinstance(item, zarr.Array)}
+        with storage_errors(self.path, decoding=True):
+            members = self.group.members(max_depth=None)
+            return {str(item.attrs.get("array", path)): path for path, item in members if isinstance(item, zarr.Array)}
 
     @property
     def arrays(self) -> tuple[str, ...]:
         """Names of all arrays, e.g. "pixels", "pixels/top", "exogenous/camera_position"."""
         return tuple(sorted(self.paths))
 
-    def array(self, name: str) -> zarr.Array:
-        """One array, lazy, with an entry for each episode that the subset will have.
+    def array(self, name: str) -> StoredArray:
+        """One array, read when indexed, with an entry for each episode that the subset will have.
 
         Raises:
           UnknownNameError: the subset has no such array.
         """
         if name not in self.paths:
             raise UnknownNameError(f"array of {self.name}", name, self.arrays)
-        return self.group[self.paths[name]]
+        with storage_errors(self.path, decoding=True):
+            return StoredArray(self.group[self.paths[name]], name, f"{self.path}/{self.paths[name]}")
 
     @property
     def pixel_arrays(self) -> tuple[str, ...]:
@@ -128,7 +171,7 @@ class Subset:
             return np.zeros((0, *source.shape[1:]), source.dtype)
         if len(chosen) == chosen[-1] - chosen[0] + 1 and (np.diff(chosen) == 1).all():
             return source[int(chosen[0]) : int(chosen[-1]) + 1]
-        return source.oindex[chosen]
+        return source.rows(chosen)
 
     def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """One episode, cut to its length L.
@@ -164,65 +207,80 @@ class Release:
         return f"<Release {self.manifest.name} {self.manifest.version}: {len(self.subsets)} subsets>"
 
     def __getitem__(self, name: str) -> Subset:
+        if name in self.shortfalls and name not in self.subsets:
+            raise StoreError(
+                f"{name} belongs to {self.manifest.name}, but none of its episodes are here: not made or fetched yet, "
+                f"or damaged; `dmcvb-gen verify {public(self.root)}` says which"
+            )
         if name not in self.subsets:
             raise UnknownNameError("subset", name, self.subsets)
         return self.subsets[name]
 
     @property
+    def shortfalls(self) -> dict[str, tuple[int, int]]:
+        """Subsets of the manifest that are not whole here -> (episodes here, episodes that belong to them)."""
+        here = {record.name: 0 for record in self.manifest.subsets}
+        here |= {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        planned = {record.name: record.episodes for record in self.manifest.subsets}
+        return {name: (count, planned[name]) for name, count in here.items() if count < planned[name]}
+
+    @property
     def path(self) -> Path:
         """The folder of a local release."""
-        if "://" in self.root:
-            raise StoreError(f"{self.root} is not a local folder; fetch it first")
+        if is_url(self.root):
+            raise StoreError(f"{public(self.root)} is not a local folder; fetch it first")
         return Path(self.root)
 
 
-def open_release(path: str | Path, storage_options: dict | None = None) -> Release:
+def open_release(path: str | Path, storage_options: dict | None = None, skip: Collection[str] = frozenset()) -> Release:
     """Open a release for reading.
 
     Args:
       path: its folder, or an fsspec URL such as "s3://bucket/name".
       storage_options: passed to fsspec for a URL.
+      skip: subsets that are known to be damaged, to be left out.
 
     Raises:
       StoreError: there is no release, or its manifest or a commit record is damaged.
     """
-    path = str(path)
-    if "://" not in path:
+    path, options = str(path), storage_options or {}
+
+    def wanted(manifest: Manifest) -> list[SubsetRecord]:
+        return [record for record in manifest.subsets if record.name not in skip]
+
+    if not is_url(path):
         root = Path(path)
         if not (root / MANIFEST).is_file():
             raise StoreError(f"{path} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
-        manifest = parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
-        commits = {subset.name: read_commits(root, subset) for subset in manifest.subsets}
+        with storage_errors(root):
+            manifest = parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
+        commits = {subset.name: read_commits(root, subset) for subset in wanted(manifest)}
     else:
-        storage_options = storage_options or {}
-        try:
-            filesystem, base = fsspec.core.url_to_fs(path, **storage_options)
-            base = base.rstrip("/")
-            manifest = parse_manifest(filesystem.cat_file(f"{base}/{MANIFEST}"), f"{path}/{MANIFEST}")
-            commits = {subset.name: _remote_commits(filesystem, base, subset) for subset in manifest.subsets}
-        except FileNotFoundError:
-            raise StoreError(f"{path} holds no release (no {MANIFEST})") from None
-        except ImportError as error:
-            raise StoreError(f"cannot open {path}: {error}") from None
+        if path.startswith("file:") and "://" not in path:
+            path = "file://" + path.removeprefix("file:")
         path = path.rstrip("/")
-    subsets = {
-        record.name: Subset(path, record, commits[record.name], storage_options or {}) for record in manifest.subsets
-    }
+        filesystem, base = file_system(path, options)
+        with storage_errors(path):
+            try:
+                text = filesystem.cat_file(f"{base}/{MANIFEST}")
+            except FileNotFoundError:
+                raise StoreError(f"{public(path)} holds no release (no {MANIFEST}); check the URL") from None
+            manifest = parse_manifest(text, f"{public(path)}/{MANIFEST}")
+            commits = {subset.name: _remote_commits(filesystem, base, subset, path) for subset in wanted(manifest)}
+    subsets = {record.name: Subset(path, record, commits[record.name], options) for record in wanted(manifest)}
     return Release(path, manifest, {name: subset for name, subset in subsets.items() if len(subset.commits)})
 
 
-def _remote_commits(filesystem: fsspec.AbstractFileSystem, base: str, subset: SubsetRecord) -> dict[int, CommitRecord]:
+def _remote_commits(filesystem, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:
+    """The committed shards of a subset at a URL, shard -> record."""
     paths = {f"{base}/{commit_path(subset.name, shard)}": shard for shard in range(shard_count(subset))}
     found = filesystem.cat(list(paths), on_error="omit")
     if isinstance(found, bytes):  # fsspec gives bare bytes for a single path
         found = {next(iter(paths)): found}
+    shards = {path.lstrip("/"): shard for path, shard in paths.items()}  # some file systems give other slashes back
     commits = {}
     for path, text in found.items():
-        commit = parse_commit(text, path)
-        commits[commit.shard] = commit
+        shard = shards[path.lstrip("/")]
+        where = f"{public(place)}/{commit_path(subset.name, shard)}"
+        commits[shard] = checked_commit(text, where, subset, shard)
     return commits
-
-
-def to_json(record: Any) -> Any:
-    """A pydantic record as plain JSON values."""
-    return json.loads(record.model_dump_json())

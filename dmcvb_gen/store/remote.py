@@ -1,16 +1,37 @@
-"""Places outside: a URL in, its file system out; errors that say what to install, and never show a secret."""
+"""Places of data: a folder or URL in, its file system out; what storage raises in, one line with a cure out.
+
+`storage_errors` is the one place that turns errors of disks, networks, credentials, missing packages and damaged
+bytes into a `StoreError`; it never shows a secret. Whatever touches storage runs inside it::
+
+    with storage_errors(path, "read"):
+        ...
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import errno
 import re
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import fsspec
 
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import DmcvbError, StoreError
 
-EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "hf": "hf"}
-"""Protocol -> the extra of dmcvb-gen that brings its file system."""
+PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "hf": "huggingface_hub", "http": "aiohttp"}
+PACKAGES |= {"https": "aiohttp", "az": "adlfs", "abfs": "adlfs"}
+"""Protocol -> the package on PyPI that brings its file system."""
+CLIENTS = (
+    "aiobotocore aiohttp asyncio botocore fsspec gcsfs google httpcore httpx huggingface_hub requests s3fs ssl "
+    "urllib3 zarr numcodecs"
+).split()
+"""Packages whose exceptions come from storage."""
+REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "Unauthorized")
+"""Words of errors that are about who is asking."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def is_url(path: str) -> bool:
@@ -37,8 +58,8 @@ def file_system(url: str, options: dict[str, Any] | None = None) -> tuple[fsspec
     try:
         filesystem, base = fsspec.core.url_to_fs(url, **(options or {}))
     except ImportError as error:
-        extra = EXTRAS.get(protocol)
-        cure = f'pip install "dmcvb-gen[{extra}]"' if extra else str(error)
+        package = PACKAGES.get(protocol)
+        cure = f"pip install {package}" if package else str(error)
         raise StoreError(f"{protocol}:// needs a package that is not installed: {cure}") from None
     except ValueError as error:
         raise StoreError(
@@ -53,3 +74,70 @@ def reason(error: BaseException) -> str:
     text = re.sub(r"(?i)((?:secret|password|token|key|signature|credential)[\w-]*[\"']?\s*[=:]\s*)\S+", r"\1...", text)
     text = re.sub(r"([A-Za-z][\w+.-]*://)[^/\s@]*@", r"\1", text)
     return text[:300]
+
+
+def is_refusal(error: BaseException) -> bool:
+    """Whether an error is about who is asking, so that trying again is of no use."""
+    words = f"{type(error).__name__} {error}"
+    return isinstance(error, PermissionError) or any(word in words for word in REFUSALS)
+
+
+def refused(place: str, error: BaseException) -> StoreError:
+    """The error for missing or wrong credentials."""
+    return StoreError(
+        f"{place} refuses access ({reason(error)}); set valid credentials in the environment or the provider's own "
+        "configuration (e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, gcloud, HF_TOKEN)"
+    )
+
+
+def _explained(error: BaseException, place: str, doing: str) -> str:
+    """What went wrong at a place, and the cure."""
+    remote, writing = is_url(place), doing != "read"
+    if isinstance(error, ImportError):
+        name = error.name or reason(error)
+        return f"{name.split('.')[0]} is needed for {place} and not installed: pip install {name.split('.')[0]}"
+    number = error.errno if isinstance(error, OSError) else None
+    if number in NO_ROOM:
+        return f"no room to {doing} {place} ({error.strerror}); make room and run the same command again"
+    if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError) or "NotFound" in _kind(error):
+        cure = "create it first, or give another place" if writing else "check the path, or fetch or regenerate it"
+        return f"cannot {doing} {place}: it is not there or not a folder ({reason(error)}); {cure}"
+    if not remote and isinstance(error, PermissionError):
+        return f"cannot {doing} {place}: {error.strerror or reason(error)}; change its rights or choose another place"
+    if number == errno.EROFS:
+        return f"cannot {doing} {place}: {error.strerror}; choose a writable place"
+    if remote and (isinstance(error, OSError | asyncio.TimeoutError) or _kind(error).split(".")[0] in CLIENTS):
+        return f"cannot {doing} {place} ({reason(error)}); check the URL and the network, and run the command again"
+    if isinstance(error, OSError):
+        return f"cannot {doing} {place}: {error.strerror or reason(error)}"
+    return f"{place} is damaged ({reason(error)}); repair it with `dmcvb-gen regenerate`, or fetch it again"
+
+
+def _kind(error: BaseException) -> str:
+    return f"{type(error).__module__}.{type(error).__name__}"
+
+
+@contextlib.contextmanager
+def storage_errors(place: str | Path, doing: str = "read", decoding: bool = False) -> Iterator[None]:
+    """Turn what storage raises inside into one line with a cure; other exceptions pass.
+
+    Args:
+      place: folder, file or URL that is read or written.
+      doing: "read", "write to", ...: the word of the message.
+      decoding: nothing but storage is at work inside, so that whatever is raised (codecs raise anything) comes from
+        damaged bytes.
+
+    Raises:
+      StoreError: for errors of disk, network, credentials, missing packages, or damaged bytes.
+    """
+    try:
+        yield
+    except DmcvbError:
+        raise
+    except Exception as error:
+        shown = public(str(place)) if is_url(str(place)) else str(place)
+        if not (decoding or isinstance(error, OSError | ImportError) or _kind(error).split(".")[0] in CLIENTS):
+            raise
+        if is_url(shown) and is_refusal(error):
+            raise refused(shown, error) from None
+        raise StoreError(_explained(error, shown, doing)) from None

@@ -6,44 +6,63 @@ any moment leaves committed shards and rubbish without a record, which the next 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+import filelock
 import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import PARTIAL, copy_file, remove_partial
+from dmcvb_gen.files import PARTIAL, copy_file, remove_partial, sha256_file
+from dmcvb_gen.store.index import INDEX, write_release
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
     FileRecord,
     Manifest,
     SubsetRecord,
-    parse_commit,
+    checked_commit,
+    commit_path,
     parse_manifest,
+    shard_count,
+    shard_episodes,
+    subset_path,
     write_json_atomically,
 )
 from dmcvb_gen.store.manifest import environment as this_environment
+from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.schema import SCHEMA_VERSION, ArraySpec, create_arrays, picture_layout_for, stored_name
 
-
-def subset_path(name: str) -> str:
-    """Folder of a subset's Zarr group inside the release."""
-    return f"{name}.zarr"
-
-
-def commit_path(name: str, shard: int) -> str:
-    """Commit record of a shard inside the release."""
-    return f"commits/{name}/{shard:05d}.json"
+LOCK = ".lock"
+CREATED = ".created"
+"""Marker of a subset whose arrays are all there; no part of the release."""
 
 
-def sha256_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+@contextlib.contextmanager
+def only_writer(root: Path, wait: float = 0) -> Iterator[None]:
+    """Keep other writers out of a release's folder while the block runs; shards may be written beside it.
+
+    Args:
+      wait: seconds to wait for another writer.
+
+    Raises:
+      StoreError: another one is at work.
+    """
+    try:
+        with filelock.FileLock(root / LOCK, timeout=wait):
+            yield
+    except filelock.Timeout:
+        raise StoreError(f"another process is writing to {root}; wait for it, or stop it, and run this again") from None
+
+
+def mark_created(root: Path, subset: SubsetRecord) -> None:
+    """Say that all arrays of a subset are there."""
+    (root / subset_path(subset.name) / CREATED).touch()
 
 
 def start_release(root: Path, manifest: Manifest) -> Manifest:
@@ -53,7 +72,7 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
       StoreError: the folder holds something else, or another recipe's release, or cannot be written.
     """
     path = root / MANIFEST
-    try:
+    with storage_errors(root, "write to"):
         if path.exists():
             old = parse_manifest(path.read_bytes(), str(path))
             if (old.recipe, _asked(old)) != (manifest.recipe, _asked(manifest)):
@@ -65,14 +84,13 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
             for environment in manifest.environments:
                 if environment not in environments:
                     environments = (*environments, environment)
-            manifest = old.model_copy(update={"environments": environments})
-        elif root.exists() and any(not path.name.endswith(PARTIAL) for path in root.iterdir()):
+            manifest = old.model_copy(update={"environments": environments, "digest": None})
+            (root / INDEX).unlink(missing_ok=True)  # written again when the release is finished
+        elif root.exists() and any(path.name != LOCK and not path.name.endswith(PARTIAL) for path in root.iterdir()):
             raise StoreError(f"{root} is not empty and holds no release; choose an empty or new folder for --out")
         root.mkdir(parents=True, exist_ok=True)
         _clear(root)
         write_json_atomically(path, manifest)
-    except OSError as error:
-        raise StoreError(f"cannot write to {root}: {error.strerror or error}; choose a writable --out") from None
     return manifest
 
 
@@ -117,7 +135,7 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
       StoreError: the folder cannot be written.
     """
     path = root / subset_path(subset.name)
-    if (path / ".created").exists():
+    if (path / CREATED).exists():
         return
     version = attributes.get("schema_version", SCHEMA_VERSION)
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
@@ -131,12 +149,12 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
                     target = path / source.relative_to(folder)
                     if not target.exists():
                         copy_file(source, target)
-            (path / ".created").touch()
+            mark_created(root, subset)
             return
         group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
         create_arrays(group, specs, *shape, schema_version=version)
         zarr.consolidate_metadata(str(path))
-        (path / ".created").touch()  # an interrupted creation is done again from the start
+        mark_created(root, subset)  # an interrupted creation is done again from the start
     except OSError as error:
         raise StoreError(f"cannot write to {path}: {error.strerror or error}") from None
 
@@ -211,16 +229,6 @@ def find_array(group: zarr.Group, name: str) -> tuple[zarr.Array, str]:
     return group[path], path
 
 
-def shard_count(subset: SubsetRecord) -> int:
-    return -(-subset.episodes // subset.episodes_per_shard)
-
-
-def shard_episodes(subset: SubsetRecord, shard: int) -> tuple[int, int]:
-    """First episode of a shard, and the one after its last."""
-    first = shard * subset.episodes_per_shard
-    return first, min(first + subset.episodes_per_shard, subset.episodes)
-
-
 def read_commits(root: Path, subset: SubsetRecord) -> dict[int, CommitRecord]:
     """The committed shards of a subset, shard -> record (those whose files are all there at their size)."""
     commits = {}
@@ -233,13 +241,12 @@ def read_commits(root: Path, subset: SubsetRecord) -> dict[int, CommitRecord]:
 
 def _read_commit(root: Path, subset: SubsetRecord, shard: int) -> CommitRecord | None:
     path = root / commit_path(subset.name, shard)
-    try:
-        text = path.read_bytes()
-    except FileNotFoundError:
-        return None
-    commit = parse_commit(text, str(path))
-    if commit.subset != subset.name or commit.shard != shard or commit.episodes != shard_episodes(subset, shard):
-        raise StoreError(f"{path} is the record of another shard; delete it and run the rollout again")
+    with storage_errors(path):
+        try:
+            text = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        commit = checked_commit(text, str(path), subset, shard)
     return commit if all(_size(root / file.path) == file.bytes for file in commit.files) else None
 
 
@@ -260,10 +267,10 @@ def subset_digest(commits: Mapping[int, CommitRecord]) -> str:
 
 
 def finish_release(root: Path, manifest: Manifest) -> Manifest:
-    """Write digests of the subsets that are whole; the manifest is complete when all are."""
-    subsets, complete, made = [], True, []
+    """Write the digests: of every file, of the subsets that are whole; the manifest is complete when all are."""
+    subsets, complete, made, found = [], True, [], {}
     for subset in manifest.subsets:
-        commits = read_commits(root, subset)
+        commits = found[subset.name] = read_commits(root, subset)
         whole = len(commits) == shard_count(subset)
         complete &= whole
         made += [commits[shard].environment for shard in sorted(commits)]
@@ -271,16 +278,8 @@ def finish_release(root: Path, manifest: Manifest) -> Manifest:
     if not all(made):  # shards of version 1 do not say where they were made, the manifest did
         made = [*manifest.environments, *(environment for environment in made if environment)]
     environments = tuple(environment for i, environment in enumerate(made) if environment not in made[:i])
-    manifest = manifest.model_copy(
-        update={
-            "subsets": tuple(subsets),
-            "complete": complete,
-            "environments": environments or manifest.environments,
-        }
-    )
-    try:
-        write_json_atomically(root / MANIFEST, manifest)
+    facts = {"subsets": tuple(subsets), "complete": complete, "environments": environments or manifest.environments}
+    manifest = write_release(root, manifest.model_copy(update=facts), found)
+    with storage_errors(root, "write to"):
         remove_partial(root, foreign=complete)  # where all is committed, nobody has anything left to make
-    except OSError as error:
-        raise StoreError(f"cannot write {root / MANIFEST}: {error.strerror or error}") from None
     return manifest

@@ -1,0 +1,177 @@
+"""A digest for every file of a release, and one for them all: a folder in, `files.json` and the root digest out.
+
+`files.json` lists every file but itself and the manifest, holds the digest of the manifest's bytes, and a digest of its
+own content. The root digest is over the lines "<sha256>  <path>" of all data files in the order of their paths, the
+manifest among them (as it is but for that digest, which it holds). The card's files speak of the root digest, so they
+are listed, but no part of it::
+
+    files.json --digests--> shards, commit records, zarr.json, policies, card
+               --digest---> manifest.json --root digest--> all of these but the card
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+
+from dmcvb_gen import files
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.store.manifest import (
+    MANIFEST,
+    CommitRecord,
+    Digest,
+    FileRecord,
+    Manifest,
+    SubsetRecord,
+    commit_path,
+    subset_path,
+)
+from dmcvb_gen.store.remote import storage_errors
+
+INDEX = "files.json"
+CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
+CARD_FOLDER = "card"
+"""Pictures and tables of the card."""
+
+
+class Index(pydantic.BaseModel):
+    """files.json: every file of a release but its manifest and itself.
+
+    Attributes:
+      manifest_sha256: of the manifest's bytes.
+      files: in the order of their paths.
+      sha256: of this index's content; None in releases of version 1.
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    format: Literal["dmcvb-gen files"] = "dmcvb-gen files"
+    manifest_sha256: Digest
+    files: tuple[FileRecord, ...]
+    sha256: Digest | None = None
+
+    @property
+    def own_digest(self) -> str:
+        """What `sha256` must be."""
+        return files.sha256_bytes(files.json_bytes(self.model_copy(update={"sha256": None})))
+
+    def sealed(self) -> Index:
+        """With its own digest."""
+        return self.model_copy(update={"sha256": self.own_digest})
+
+
+def is_card(path: str) -> bool:
+    """Whether a file of a release belongs to its card."""
+    return path in CARD_FILES or path.startswith(f"{CARD_FOLDER}/")
+
+
+def parse_index(text: bytes, where: str = INDEX) -> Index:
+    """An index from JSON.
+
+    Raises:
+      StoreError: it is not valid, or its content does not have its digest.
+    """
+    try:
+        index = Index.model_validate_json(text)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the top"
+        raise StoreError(f"{where} is not valid at {place}: {first['msg']}") from None
+    if index.sha256 is not None and (index.own_digest != index.sha256 or files.json_bytes(index) != text):
+        raise StoreError(f"{where} does not have its own digest; fetch it again")
+    return index
+
+
+def read_index(root: Path) -> Index | None:
+    """A local release's index; None where there is none (while it is made, and in releases of version 1).
+
+    Raises:
+      StoreError: it is damaged.
+    """
+    path = root / INDEX
+    if not path.is_file():
+        return None
+    with storage_errors(path):
+        return parse_index(path.read_bytes(), str(path))
+
+
+def root_digest(listed: Iterable[FileRecord], manifest: Manifest) -> str:
+    """The one digest of a release, see the module."""
+    bare = files.sha256_bytes(files.json_bytes(manifest.model_copy(update={"digest": None})))
+    lines = {file.path: file.sha256 for file in listed if not is_card(file.path)} | {MANIFEST: bare}
+    digest = hashlib.sha256()
+    for path in sorted(lines):
+        digest.update(f"{lines[path]}  {path}\n".encode())
+    return digest.hexdigest()
+
+
+def data_files(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> list[FileRecord]:
+    """Every file that a release's data are made of, but manifest and index; shards as their records say.
+
+    Args:
+      commits: subset -> shard -> record of the shards that are there.
+
+    Raises:
+      StoreError: a file is missing or cannot be read.
+    """
+    found = {file.path: file for shards in commits.values() for commit in shards.values() for file in commit.files}
+    names = [commit_path(name, shard) for name, shards in commits.items() for shard in shards]
+    for record in manifest.subsets:
+        names += metadata_paths(root, record)
+        names += [policy.path for policy in record.policies if policy.path and commits.get(record.name)]
+    for name in dict.fromkeys(names):
+        found[name] = _record(root, name)
+    return [found[name] for name in sorted(found)]
+
+
+def metadata_paths(root: Path, record: SubsetRecord) -> list[str]:
+    """Paths of a subset's zarr.json files that are there."""
+    folder = root / subset_path(record.name)
+    here = [path for pattern in ("zarr.json", "*/zarr.json", "*/*/zarr.json") for path in folder.glob(pattern)]
+    return [path.relative_to(root).as_posix() for path in sorted(here)]
+
+
+def card_files(root: Path) -> list[FileRecord]:
+    """The files of the card that are there."""
+    names = [name for name in CARD_FILES if (root / name).is_file()]
+    names += [f"{CARD_FOLDER}/{path.name}" for path in sorted((root / CARD_FOLDER).glob("*")) if path.is_file()]
+    return [_record(root, name) for name in names]
+
+
+def _record(root: Path, name: str) -> FileRecord:
+    path = root / name
+    if not path.is_file():
+        raise StoreError(f"{path} is missing; run `dmcvb-gen regenerate {root}` first")
+    with storage_errors(path):
+        return FileRecord(path=name, bytes=path.stat().st_size, sha256=files.sha256_file(path))
+
+
+def write_release(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> Manifest:
+    """Give a release its digests: write `files.json`, then the manifest with the root digest.
+
+    Raises:
+      StoreError: a file is missing, or the folder cannot be written.
+    """
+    with storage_errors(root, "write to"):
+        listed = data_files(root, manifest, commits)
+        manifest = manifest.model_copy(update={"digest": root_digest(listed, manifest)})
+        everything = sorted([*listed, *card_files(root)], key=lambda file: file.path)
+        text = files.json_bytes(manifest)
+        index = Index(manifest_sha256=files.sha256_bytes(text), files=tuple(everything)).sealed()
+        files.write_json(root / INDEX, index)
+        files.write_bytes(root / MANIFEST, text)
+    return manifest
+
+
+def take_in_card(root: Path) -> None:
+    """List the card's files, as they are now, in a release's index (where it has one)."""
+    index = read_index(root)
+    if index is None or index.sha256 is None:
+        return
+    others = [file for file in index.files if not is_card(file.path)]
+    everything = sorted([*others, *card_files(root)], key=lambda file: file.path)
+    with storage_errors(root, "write to"):
+        files.write_json(root / INDEX, index.model_copy(update={"files": tuple(everything)}).sealed())
