@@ -24,12 +24,14 @@ from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import copy_inputs, create_groups
+from dmcvb_gen.store.index import restore_index, restored_commit
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment, parse_manifest
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     commit_path,
     find_array,
     finish_release,
+    mark_created,
     read_commits,
     shard_count,
     shard_episodes,
@@ -210,6 +212,9 @@ class Regeneration:
             outcomes = self._repair(root, manifest, shards, folder, tick)
         if not manifest.complete and any(outcome.repaired for outcome in outcomes):
             finish_release(root, manifest)
+        elif manifest.complete:
+            copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
+            restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})
         return Outcome(tuple(outcomes), environment_difference(manifest))
 
     def _repair(self, root, manifest, shards, folder, tick) -> list[ShardOutcome]:
@@ -219,7 +224,8 @@ class Regeneration:
         def settle(record, commit, was, equal):
             taken = equal is not False
             if taken:
-                _move_in(root, folder, commit)
+                kept = read_commit(root, record, commit.shard)
+                _move_in(root, folder, kept or restored_commit(root, manifest, commit))
             outcomes.append(_outcome(root, folder, record, commit, was, equal, repaired=taken))
 
         for commit in self._make(manifest, shards, folder, tick):
@@ -380,7 +386,7 @@ def _restore_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
         target = root / source.relative_to(folder)
         if not _is_json(target):
             copy_file(source, target)
-    (root / subset_path(record.name) / ".created").touch()
+    mark_created(root, record)
 
 
 def _move_in(root: Path, folder: Path, commit: CommitRecord) -> None:

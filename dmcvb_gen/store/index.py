@@ -34,6 +34,8 @@ from dmcvb_gen.store.remote import storage_errors
 
 INDEX = "files.json"
 CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
+VIDEOS = "backgrounds/"
+"""Folder of a release's own copies of videos, one folder a digest."""
 CARD_FOLDER = "card"
 """Pictures and tables of the card."""
 
@@ -121,7 +123,9 @@ def data_files(root: Path, manifest: Manifest, commits: dict[str, dict[int, Comm
     names = [commit_path(name, shard) for name, shards in commits.items() for shard in shards]
     for record in manifest.subsets:
         names += metadata_paths(root, record)
-        names += [policy.path for policy in record.policies if policy.path and commits.get(record.name)]
+        if commits.get(record.name):
+            names += [policy.path for policy in record.policies if policy.path]
+            names += video_paths(root, record)
     for name in dict.fromkeys(names):
         found[name] = _record(root, name)
     return [found[name] for name in sorted(found)]
@@ -132,6 +136,14 @@ def metadata_paths(root: Path, record: SubsetRecord) -> list[str]:
     folder = root / subset_path(record.name)
     here = [path for pattern in ("zarr.json", "*/zarr.json", "*/*/zarr.json") for path in folder.glob(pattern)]
     return [path.relative_to(root).as_posix() for path in sorted(here)]
+
+
+def video_paths(root: Path, record: SubsetRecord) -> list[str]:
+    """Paths of a release's own copies of the videos that a subset shows."""
+    source = (record.backgrounds or {}).get("source", "")
+    if not str(source).startswith(VIDEOS):
+        return []
+    return sorted(path.relative_to(root).as_posix() for path in (root / source).rglob("*") if path.is_file())
 
 
 def card_files(root: Path) -> list[FileRecord]:
@@ -175,3 +187,32 @@ def take_in_card(root: Path) -> None:
     everything = sorted([*others, *card_files(root)], key=lambda file: file.path)
     with storage_errors(root, "write to"):
         files.write_json(root / INDEX, index.model_copy(update={"files": tuple(everything)}).sealed())
+
+
+def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> None:
+    """Write a missing index again, if the files that are here give the root digest of the manifest."""
+    if manifest.digest is None or (root / INDEX).is_file():
+        return
+    listed = data_files(root, manifest, commits)
+    if root_digest(listed, manifest) == manifest.digest:
+        everything = sorted([*listed, *card_files(root)], key=lambda file: file.path)
+        digest = files.sha256_file(root / MANIFEST)
+        files.write_json(root / INDEX, Index(manifest_sha256=digest, files=tuple(everything)).sealed())
+
+
+def restored_commit(root: Path, manifest: Manifest, commit: CommitRecord) -> CommitRecord:
+    """The record of a shard that was made again with the bytes that it had: as it was, if that can be known.
+
+    Only the environment of a lost record is unknown; it is one of the manifest's, and the index has its digest.
+    """
+    path = commit_path(commit.subset, commit.shard)
+    try:
+        index = read_index(root)
+    except StoreError:
+        index = None
+    digests = {file.path: file.sha256 for file in index.files} if index else {}
+    for environment in manifest.environments if manifest.digest else ():
+        found = commit.model_copy(update={"environment": environment})
+        if digests.get(path) == files.sha256_bytes(files.json_bytes(found)) or len(manifest.environments) == 1:
+            return found
+    return commit

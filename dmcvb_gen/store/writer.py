@@ -38,7 +38,8 @@ from dmcvb_gen.store.manifest import environment as this_environment
 from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.schema import SCHEMA_VERSION, ArraySpec, create_arrays, picture_layout_for, stored_name
 
-LOCK = ".lock"
+LOCK, LOCK_SECONDS = ".lock", 60.0
+"""Held while a release's manifest is written, or the release is fetched; and how long a writer waits for it."""
 CREATED = ".created"
 """Marker of a subset whose arrays are all there; no part of the release."""
 
@@ -72,8 +73,9 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
       StoreError: the folder holds something else, or another recipe's release, or cannot be written.
     """
     path = root / MANIFEST
-    with storage_errors(root, "write to"):
+    with storage_errors(root, "write to"), contextlib.ExitStack() as stack:
         if path.exists():
+            stack.enter_context(only_writer(root, wait=LOCK_SECONDS))
             old = parse_manifest(path.read_bytes(), str(path))
             if (old.recipe, _asked(old)) != (manifest.recipe, _asked(manifest)):
                 raise StoreError(

@@ -106,4 +106,4 @@ def look(root: str) -> dict[str, list[int]]:
 
 def check(root: str) -> list[str]:
     """What is wrong with a release's files, in words."""
-    return [str(finding) for finding in check_files(open_release(root))]
+    return [str(finding) for finding in check_files(Path(root))]
