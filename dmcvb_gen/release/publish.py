@@ -334,11 +334,13 @@ class _Source:
         records = list({record.name: record for record in records}.values())
         folders = tuple(f"{subset_path(record.name)}/" for record in records)
         policies = {policy.path for record in records for policy in record.policies}
+        videos = tuple(f"{(record.backgrounds or {}).get('source')}/" for record in records)
         return [
             file
             for file in self.index.files
             if (file.path.startswith(folders) and file.path.endswith("/zarr.json"))
             or file.path in policies
+            or file.path.startswith(videos)
             or is_card(file.path)
         ]
 
@@ -387,7 +389,13 @@ def _take_up(out: Path, manifest: Manifest) -> None:
 
 def _strangers(out: Path, manifest: Manifest) -> Iterable[Path]:
     """What lies in a folder and is no part of an interrupted fetch."""
-    ours = {record.name.split("/")[0] for record in manifest.subsets} | {"policies", "commits", CARD_FOLDER, LOCK}
+    ours = {record.name.split("/")[0] for record in manifest.subsets} | {
+        "policies",
+        "commits",
+        "backgrounds",
+        CARD_FOLDER,
+        LOCK,
+    }
     return (path for path in out.iterdir() if path.name not in ours | set(CARD_FILES))
 
 

@@ -99,13 +99,13 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
     number = error.errno if isinstance(error, OSError) else None
     if number in NO_ROOM:
         return f"no room to {doing} {place} ({error.strerror}); make room and run the same command again"
+    if writing and not remote and isinstance(error, OSError):
+        return f"cannot {doing} {place}: {error.strerror or reason(error)}; choose a writable --out"
     if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError) or "NotFound" in _kind(error):
-        cure = "create it first, or give another place" if writing else "check the path, or fetch or regenerate it"
-        return f"cannot {doing} {place}: it is not there or not a folder ({reason(error)}); {cure}"
+        cure = "create the bucket first" if writing else "check the path, or fetch or regenerate it"
+        return f"cannot {doing} {place}: it is not there ({reason(error)}); {cure}"
     if not remote and isinstance(error, PermissionError):
-        return f"cannot {doing} {place}: {error.strerror or reason(error)}; change its rights or choose another place"
-    if number == errno.EROFS:
-        return f"cannot {doing} {place}: {error.strerror}; choose a writable place"
+        return f"cannot {doing} {place}: {error.strerror or reason(error)}; change its rights"
     if remote and (isinstance(error, OSError | asyncio.TimeoutError) or _kind(error).split(".")[0] in CLIENTS):
         return f"cannot {doing} {place} ({reason(error)}); check the URL and the network, and run the command again"
     if isinstance(error, OSError):
