@@ -66,3 +66,20 @@ def small_release(tmp_path_factory):
     folder = tmp_path_factory.mktemp("release") / "small"
     roll_out(small_recipe(), folder)
     return folder
+
+
+TINY_MAZE = "ant-maze-tiny:****/*..*/****"
+"""Two cells: even random actions find the goal now and then."""
+
+
+@pytest.fixture(scope="session")
+def small_mazes(tmp_path_factory):
+    """Folder of a finished release of a maze: the goal visible, hidden, and fixed with the start; 2 episodes each."""
+    pattern = {"tasks": TINY_MAZE, "levels": "random", "episodes_per_shard": 1}
+    subsets = [
+        pattern | {"settings": ["visible", "hidden"], "episodes": 2},
+        pattern | {"settings": ["fixed"], "fixed_goals": 2, "episodes_per_goal": 1},
+    ]
+    folder = tmp_path_factory.mktemp("mazes") / "mazes"
+    roll_out(small_recipe(name="mazes", subsets=subsets), folder)
+    return folder

@@ -6,6 +6,8 @@ import io
 import json
 import shutil
 import struct
+import sys
+from pathlib import Path
 
 import google_crc32c
 import numpy as np
@@ -17,11 +19,11 @@ from PIL import Image
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.release import export as package
 from dmcvb_gen.release.export import FORMATS, export, format_table
 from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
+from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
 
@@ -269,12 +271,110 @@ def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="none of the episodes 50:60"):
         export(small_release, "npz", tmp_path, episodes=(50, 60))
 
-    def missing(name):
-        raise ImportError("No module named 'h5py'", name="h5py")
-
-    monkeypatch.setattr(package.importlib, "import_module", missing)
-    with pytest.raises(DmcvbError, match=r"h5py.*pip install \"dmcvb-gen\[hdf5\]\""):
+    with pytest.raises(DmcvbError, match="--video is not for hdf5"):
+        export(small_release, "hdf5", tmp_path, video=True)
+    with pytest.raises(StoreError, match="s3://bucket/x is none"):
+        export(small_release, "npz", "s3://bucket/x")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(DmcvbError, match="h5py.*: pip install h5py$"):
         export(small_release, "hdf5", tmp_path)
+
+
+def test_workers_write_what_one_process_writes(small_release, small_mazes, tmp_path, monkeypatch):
+    """To a relative folder, which minari takes for one of its own."""
+    monkeypatch.chdir(tmp_path)
+    told = []
+    for folder, name in ((small_release, "walker-walk/random"), (small_mazes, "*/hidden"), (small_mazes, "*/fixed")):
+        export(str(folder), "npz", "one", [name])
+        export(str(folder), "npz", "two", [name], workers=2, tick=told.append)
+    assert sum(told) == 9 + 2 + 2
+    files = {path.relative_to("one"): path.read_bytes() for path in Path("one").rglob("*.npz")}
+    assert len(files) == 13
+    assert files == {path.relative_to("two"): path.read_bytes() for path in Path("two").rglob("*.npz")}
+    [folder] = export(str(small_release), "minari", "here", [NAME])
+    assert folder.is_absolute() and (folder / "data/metadata.json").is_file()
+    assert folder == tmp_path / "here/dmcvb_gen/walker-walk/random-static-v0"
+
+
+@pytest.mark.parametrize("release", ["small_release", "small_mazes"])
+def test_nothing_that_is_damaged_or_missing_is_left_out_silently(release, request, tmp_path):
+    source = request.getfixturevalue(release)
+    folder, names = tmp_path / "release", list(dmcvb_gen.open(str(source)).subsets)
+    shutil.copytree(source, folder)
+    name = names[1]
+    command = ["export", str(folder), "--to", "npz", "--out", str(tmp_path / "out")]
+
+    shard = max((folder / f"{name}.zarr").rglob("c/0/*/*/*/0"), key=lambda path: path.stat().st_size)
+    whole = shard.read_bytes()
+    shard.write_bytes(whole[:50] + bytes(255 - byte for byte in whole[50:90]) + whole[90:])
+    result = CliRunner().invoke(main, [*command, "--only", name])
+    assert result.exit_code == 2 and name in result.output and len(result.output.strip().splitlines()) <= 2
+    assert not list((tmp_path / "out").rglob("*.npz")) and not list((tmp_path / "out").rglob("*.partial"))
+    shard.write_bytes(whole)
+
+    record = sorted((folder / "commits" / name).glob("*.json"))[-1]
+    record.unlink()
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2 and f"{name} has" in result.output and "--episodes" in result.output
+    assert not list((tmp_path / "out").rglob("*.npz"))
+    result = CliRunner().invoke(main, [*command, "--only", name, "--episodes", "0:1"])
+    assert result.exit_code == 0, result.output
+
+    shutil.rmtree(folder / "commits" / name)
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2 and f"{name} has 0 of" in result.output
+
+
+@pytest.fixture(scope="module")
+def dmcvb_mazes(small_mazes, tmp_path_factory):
+    """Maze folders as DMC-VB has them: 165 numbers (no height, no activation), fixed goals a folder a seed."""
+    root = tmp_path_factory.mktemp("dmc_vb_mazes")
+    left_out = ("steps/observation/walker/body_height", "steps/observation/target_activated")
+    for setting in ("visible", "hidden", "fixed"):
+        for episodes in ((0, 1), (1, 2)) if setting == "fixed" else ((0, 2),):
+            out = root / f"made_{setting}_{episodes[0]}"
+            [made] = export(str(small_mazes), "rlds", out, [f"*/{setting}"], episodes)
+            for file in made.rglob("*.tfrecord*"):
+                examples = [read_example(file, *place) for place in offsets(file)]
+                thinned = [{k: v for k, v in example.items() if k not in left_out} for example in examples]
+                assert all(len(t) == len(e) - 2 for t, e in zip(thinned, examples, strict=True))
+                file.write_bytes(b"".join(record(encode_example(example)) for example in thinned))
+            place = f"antmaze_random_{setting}_goal/empty7x7/expert"
+            place = f"antmaze_fixed_hidden_goal/empty7x7/{episodes[0]}" if setting == "fixed" else place
+            (root / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(made, root / place)
+            shutil.rmtree(out)
+    return root
+
+
+def test_dmc_vbs_mazes_are_imported_by_the_names_of_their_fields(dmcvb_mazes, small_mazes, tmp_path):
+    import_tfds(dmcvb_mazes, tmp_path / "r")
+    release, ours = dmcvb_gen.open(str(tmp_path / "r")), open_release(small_mazes)
+    assert len(release.subsets) == 3 and release.manifest.complete
+    for setting in ("visible", "hidden", "fixed"):
+        subset, made = release[f"ant-maze-empty7x7/expert/{setting}"], ours[f"ant-maze-tiny/random/{setting}"]
+        assert subset.record.hidden_goal == (setting != "visible") and subset.record.views == made.record.views
+        assert subset.record.fixed_goals == (2 if setting == "fixed" else None)
+        root = "pixels" if setting == "visible" else "pixels_hidden_goal"
+        assert set(subset.pixel_arrays) == {f"{root}/{view}" for view in made.record.views}
+        for index in range(2):
+            found, expected = subset.episode(index), made.episode(index)
+            for name in (*subset.pixel_arrays, "state", "action", "reward", "discount", "terminated", "goal_pair"):
+                np.testing.assert_array_equal(found[name], expected[name])
+        batch = next(subset.batches(8, pictures=["top"]))
+        assert batch["pixels"].shape == (8, 9, 16, 16) and batch["state"].shape == (8, 167)
+    result = verify(tmp_path / "r")
+    assert result.sound, result.findings
+
+
+def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path):
+    shutil.copytree(dmcvb_mazes / "antmaze_random_hidden_goal/empty7x7/expert", tmp_path / "x")
+    with pytest.raises(StoreError, match="antmaze_fixed_hidden_goal/empty7x7/<seed>"):
+        import_tfds(tmp_path / "x", tmp_path / "r")
+    what = dict(task="ant-maze-empty7x7", level="expert")
+    with pytest.raises(StoreError, match="no picture observation/lowres_top_camera;"):
+        import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="visible")
+    import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="hidden")
 
 
 def test_the_table_of_formats_names_them_all():

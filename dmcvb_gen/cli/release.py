@@ -271,11 +271,16 @@ def card(context, path, check, out, as_json):
 @click.option("--to", required=True, help="hdf5, npz, replay-buffer, minari, lerobot or rlds.")
 @only_option
 @click.option("--episodes", metavar="A:B", callback=parse_episodes, help="Only the episodes A to B - 1.")
+@click.option("--merge", is_flag=True, help="lerobot: all subsets as the tasks of one data set.")
+@click.option("--video", is_flag=True, help="lerobot: pictures as mp4, smaller and with losses, not as PNG.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes, a subset each.")
 @click.option("--out", type=click.Path(), required=True, help="Folder of the exports, a folder a subset.")
 @option_option
 @json_option
-def export(path, to, only, episodes, out, options, as_json):
+def export(path, to, only, episodes, merge, video, workers, out, options, as_json):
     """Write subsets in another format: a folder a subset, nothing is written over.
+
+    A subset that is not whole is refused, unless --episodes names what is there.
 
     \b
     dmcvb-gen export releases/mini --to hdf5 --only 'walker-walk/*/none' --out exports/mini
@@ -283,7 +288,8 @@ def export(path, to, only, episodes, out, options, as_json):
     from dmcvb_gen.release.export import export as run
 
     with tqdm(unit=" episodes", disable=as_json or None) as bar:
-        folders = run(path, to, out, only, episodes, storage_options=options, tick=bar.update)
+        given = dict(merge=merge, video=video, workers=workers, storage_options=options, tick=bar.update)
+        folders = run(path, to, out, only, episodes, **given)
     if as_json:
         return print_json([str(folder) for folder in folders])
     click.echo("\n".join(str(folder) for folder in folders))
@@ -298,7 +304,7 @@ def export(path, to, only, episodes, out, options, as_json):
 @click.option("--out", type=click.Path(), required=True, help="Folder of the new release.")
 @json_option
 def import_command(folder, task, level, setting, name, out, as_json):
-    """Import DMC-VB's published TFDS folders (locomotion) into a release, without TensorFlow.
+    """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.
 
     \b
     dmcvb-gen import dmc_vb/locomotion --out releases/original

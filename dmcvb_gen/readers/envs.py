@@ -32,7 +32,7 @@ from dmcvb_gen.tasks.ant_maze import fixed_pairs
 PURPOSE = "evaluation"
 """Names the random streams: no episode here has those of released data."""
 FIXED_GOALS = 5
-"""Pairs of start and goal that "fixed" episodes go round (benchmark B3)."""
+"""Pairs of start and goal that "fixed" episodes go round by default (benchmark B3)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class Scene:
       backgrounds: "builtin" or a folder of videos.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
-      goal_pair: of "fixed": which of the pairs of start and goal; by default an episode takes the next one.
+      fixed_goals: of "fixed": how many pairs of start and goal there are; an episode takes the next one.
+      goal_pair: of "fixed": this pair in all episodes.
       goal_seed: of "fixed": the seed that the pairs are drawn from, as a recipe's seed.
       threads: of the simulation; the result does not depend on them.
     """
@@ -64,6 +65,7 @@ class Scene:
     backgrounds: str = "builtin"
     views: Sequence[str] | None = None
     max_steps: int | None = None
+    fixed_goals: int = FIXED_GOALS
     goal_pair: int | None = None
     goal_seed: int = 0
     threads: int = 1
@@ -171,7 +173,7 @@ class _Stage:
 def _pairs(task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """The (start, goal) cells that "fixed" episodes go round."""
     if scene.goal_pair is None:
-        return fixed_pairs(task.layout, FIXED_GOALS, scene.goal_seed)
+        return fixed_pairs(task.layout, scene.fixed_goals, scene.goal_seed)
     if scene.goal_pair < 0:
         raise DmcvbError(f"goal_pair is {scene.goal_pair}; give 0 for the first pair, 1 for the second, ...")
     return fixed_pairs(task.layout, scene.goal_pair + 1, scene.goal_seed)[-1:]

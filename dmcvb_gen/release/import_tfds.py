@@ -6,43 +6,56 @@ imported release can be read, checked and trained on, but not repainted or regen
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
-import struct
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.errors import StoreError
-from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD, LEVELS, is_maze, normalize_setting
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
+from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
+from dmcvb_gen.release.tfrecord import offsets, read_example
+from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD
 from dmcvb_gen.store.manifest import Manifest, SubsetRecord, environment
+from dmcvb_gen.store.pictures import picture_arrays, picture_of
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     create_subset,
     finish_release,
     read_commits,
-    sha256_file,
     shard_count,
     shard_episodes,
     start_release,
     write_shard,
 )
-from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 MISSING = ("physics", "exogenous/")
 """Arrays (by the beginnings of their names) that an imported subset has not."""
-MAX_RECORD = 2**31
-"""Bytes of an episode's record beyond which the file is taken to be damaged."""
 
 
-def imported_specs(task: Task, size: int) -> tuple[ArraySpec, ...]:
-    """Arrays of an imported subset."""
-    return tuple(spec for spec in array_specs(EpisodeShape.of(task), size) if not spec.name.startswith(MISSING))
+def imported_specs(record: SubsetRecord) -> tuple[ArraySpec, ...]:
+    """Arrays of an imported subset: its views show the goal or hide it, and are not there in both kinds."""
+    shape = dataclasses.replace(EpisodeShape.of(get_task(record.task)), views=record.views)
+    shown = picture_arrays(record.views, record.hidden_goal)
+    specs = [spec for spec in array_specs(shape, record.size) if not spec.name.startswith(MISSING)]
+    return tuple(spec for spec in specs if picture_of(spec.name) is None or spec.name in shown)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The folders of a subset, and what it will be; fixed goals have a folder a goal."""
+
+    record: SubsetRecord
+    folders: tuple[Path, ...]
 
 
 def import_tfds(
@@ -55,10 +68,10 @@ def import_tfds(
     name: str = "dmc-vb-original",
     tick: Callable[[int], None] = lambda episodes: None,
 ) -> Manifest:
-    """Import locomotion subsets; run again, it goes on where it stopped.
+    """Import subsets, of locomotion and of mazes; run again, it goes on where it stopped.
 
     Args:
-      folder: a TFDS folder (with features.json), or a tree of `<task>/<level>/<setting>` folders that hold such.
+      folder: a TFDS folder (with features.json), or a tree of DMC-VB's folders that hold such (see `parse_folder`).
       out: folder of the new release.
       task, level, setting: what a single folder holds, where its path does not say it.
       name: of the new release.
@@ -75,61 +88,96 @@ def import_tfds(
         raise StoreError(
             f"{folder} holds {len(found)} data sets; give the folder of one with --task, --level, --setting"
         )
-    sources = {}
-    for path in found:
-        record = _record(path, folder, task, level, setting)
-        if record.name in sources:
-            raise StoreError(f"{path} and {sources[record.name][0]} are both {record.name}; import one of them")
-        sources[record.name] = path, record
+    sources = _sources(found, task, level, setting)
     manifest = Manifest(
         name=name,
         version="1.0.0",
         license="CC-BY-4.0",
-        recipe={"name": name, "imported": sorted(sources)},
-        subsets=tuple(record for _, record in sources.values()),
+        recipe={"name": name, "imported": sorted(source.record.name for source in sources)},
+        subsets=tuple(source.record for source in sources),
         environments=(environment(),),
         lineage=(
             {
                 "kind": "import",
                 "from": "DMC-VB (Ortiz et al., NeurIPS 2024), TFDS folders",
-                "features_sha256": {key: sha256_file(path / "features.json") for key, (path, _) in sources.items()},
+                "features_sha256": {s.record.name: sha256_file(s.folders[0] / "features.json") for s in sources},
             },
         ),
     )
     manifest = start_release(out, manifest)
-    for path, record in sources.values():
-        _import_subset(path, out, record, tick)
+    for source in sources:
+        _import_subset(source, out, tick)
     return finish_release(out, manifest)
 
 
-def _record(path: Path, root: Path, task, level, setting) -> SubsetRecord:
-    parts = path.parts
-    if parts[-1][:1].isdigit() and "." in parts[-1]:
-        parts = parts[:-1]  # TFDS's folder of the version
-    guess = parts[-3:] if len(parts) >= 3 else ("", "", "")
-    task, level = task or guess[0].replace("_", "-"), level or guess[1]
-    setting = setting or guess[2]
-    if task not in LOCOMOTION_TASKS or level not in LEVELS or is_maze(task):
+def _sources(found: list[Path], task, level, setting) -> list[_Source]:
+    """The subsets that folders hold; the folders of a maze's fixed goals, one a goal, are one subset."""
+    grouped: dict[str, list[tuple[Path, tuple[str, str, str, int | None]]]] = {}
+    for path in found:
+        facts = _identify(path, task, level, setting)
+        grouped.setdefault(subset_name(*facts[:3]), []).append((path, facts))
+    sources = []
+    for name, members in grouped.items():
+        fixed = members[0][1][2] == FIXED
+        if len(members) > 1 and not fixed:
+            raise StoreError(f"{members[1][0]} and {members[0][0]} are both {name}; import one of them")
+        members.sort(key=lambda member: member[1][3] or 0)
+        folders = tuple(path for path, _ in members)
+        sources.append(_Source(_record(name, members[0][1][:3], folders), folders))
+    return sources
+
+
+def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | None]:
+    guess = parse_folder(path.parts) or ("", "", "", None)
+    task, level, setting = task or guess[0], level or guess[1], setting or guess[2]
+    try:
+        get_task(task)
+        setting = normalize_setting(task, setting)
+        known = level in LEVELS
+    except UnknownNameError:
+        known = False
+    if not known:
         raise StoreError(
-            f"{path} does not say what it is by .../<task>/<level>/<setting> (e.g. walker_walk/expert/static_medium); "
-            f"give --task ({', '.join(LOCOMOTION_TASKS)}), --level ({', '.join(LEVELS)}) and --setting"
+            f"{path} does not say what it is by .../walker_walk/expert/static_medium, "
+            ".../antmaze_random_hidden_goal/empty7x7/expert or .../antmaze_fixed_hidden_goal/empty7x7/<seed>; give "
+            f"--task, --level ({', '.join(LEVELS)}) and --setting"
         )
-    setting = normalize_setting(task, setting)
-    pixels = _step_features(path).get("observation/pixels", {}).get("image")
-    if not pixels:
-        raise StoreError(f"{path}/features.json has no picture observation/pixels; only locomotion data are imported")
-    episodes = sum(1 for file in _files(path) for _ in _offsets(file))
-    if not episodes:
-        raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
+    return task, level, setting, guess[3]
+
+
+def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -> SubsetRecord:
+    task, level, setting = facts
+    hidden = hides_goal(setting)
+    features = _step_features(folders[0])
+    pictures = {
+        view: features.get(f"observation/{picture_feature(task, view, hidden)}", {}).get("image")
+        for view in get_task(task).views
+    }
+    views = tuple(view for view, picture in pictures.items() if picture)
+    if not views:
+        wanted = picture_feature(task, get_task(task).views[0], hidden)
+        raise StoreError(f"{folders[0]}/features.json has no picture observation/{wanted}; it is no {name} of DMC-VB")
+    counts = [sum(1 for file in _files(path) for _ in offsets(file)) for path in folders]
+    for path, count in zip(folders, counts, strict=True):
+        if not count:
+            raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
+    family = get_task(task).family
+    fixed = setting == FIXED
     return SubsetRecord(
-        name=f"{task}/{level}/{setting}",
+        name=name,
         task=task,
         level=level,
         setting=setting,
-        episodes=episodes,
-        episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD["locomotion"], episodes),
-        size=int(pixels["shape"]["dimensions"][0]),
+        episodes=sum(counts),
+        episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD[family], sum(counts)),
+        size=int(pictures[views[0]]["shape"]["dimensions"][0]),
         renderer={"name": "imported"},
+        family=family,
+        views=views,
+        hidden_goal=hidden,
+        max_steps=get_task(task).max_steps,
+        fixed_goals=len(folders) if fixed else None,
+        episodes_per_goal=max(counts) if fixed else None,
     )
 
 
@@ -151,15 +199,26 @@ def _flatten(feature: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
         yield prefix, feature
 
 
-def _import_subset(path: Path, out: Path, record: SubsetRecord, tick) -> None:
+def _files(path: Path) -> list[Path]:
+    return sorted(file for file in path.glob("*.tfrecord*") if file.is_file())
+
+
+def _import_subset(source: _Source, out: Path, tick) -> None:
+    record = source.record
     task = get_task(record.task)
     rows = task.max_steps + 1
+    specs = imported_specs(record)
     attributes = {"task": record.task, "level": record.level, "setting": record.setting, "imported": "DMC-VB"}
     attributes["state_fields"] = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
-    specs = imported_specs(task, record.size)
+    attributes["views"] = list(record.views)
     create_subset(out, record, specs, rows, attributes)
     done = read_commits(out, record)
-    records = ((file, offset, length) for file in _files(path) for offset, length in _offsets(file))
+    records = (
+        (goal, file, *place)
+        for goal, folder in enumerate(source.folders)
+        for file in _files(folder)
+        for place in offsets(file)
+    )
     for shard in range(shard_count(record)):
         places = [next(records) for _ in range(*shard_episodes(record, shard))]
         if shard in done:
@@ -168,28 +227,30 @@ def _import_subset(path: Path, out: Path, record: SubsetRecord, tick) -> None:
             spec.name: np.zeros((len(places), *([rows] if spec.steps else []), *spec.shape), spec.dtype)
             for spec in specs
         }
-        arrays["goal_pair"][:] = -1
-        for row, place in enumerate(places):
-            _fill({name: array[row : row + 1] for name, array in arrays.items()}, _read(*place), task, place[0])
+        for row, (goal, *place) in enumerate(places):
+            _fill(
+                {name: array[row : row + 1] for name, array in arrays.items()}, read_example(*place), record, place[0]
+            )
+            arrays["goal_pair"][row] = goal if record.setting == FIXED else -1
             tick(1)
         write_shard(out, record, shard, arrays.items(), arrays["length"])
 
 
-def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], task: Task, file: Path) -> None:
+def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], record: SubsetRecord, file: Path) -> None:
     """Put one decoded episode into rows of a shard's arrays."""
+    task = get_task(record.task)
     try:
-        pictures = [np.asarray(Image.open(io.BytesIO(data))) for data in values["steps/observation/pixels"]]
-        count = len(pictures)
-        fields = [np.reshape(values[f"steps/observation/{name}"], (count, -1)) for name in task.state_slices]
-        state = np.concatenate(fields, axis=1)
+        count = len(values["steps/reward"])
         length = count - 1  # RLDS: the last step holds the last observation
-        if not 0 < length <= task.max_steps or state.shape[1] != task.state_size:
-            raise ValueError(f"{count} steps with states of {state.shape[1]}")
-        arrays["pixels"][0, :count] = pictures
-        arrays["state"][0, :count] = state
+        if not 0 < length <= task.max_steps:
+            raise ValueError(f"{count} steps")
+        terminated = bool(np.any(values["steps/is_terminal"])) if "steps/is_terminal" in values else False
+        arrays["state"][0, :count] = _state(task, values, count, terminated)
+        for view, name in zip(record.views, picture_arrays(record.views, record.hidden_goal), strict=True):
+            files = values[f"steps/observation/{picture_feature(task.id, view, record.hidden_goal)}"]
+            arrays[name][0, :count] = [np.asarray(Image.open(io.BytesIO(data))) for data in files]
         arrays["action"][0, :length] = np.reshape(values["steps/action"], (count, -1))[:length]
         arrays["reward"][0, :length] = np.asarray(values["steps/reward"])[:length]
-        terminated = bool(np.any(values["steps/is_terminal"])) if "steps/is_terminal" in values else False
         arrays["discount"][0, :length] = 1
         arrays["discount"][0, length - 1] = 0 if terminated else 1
     except (KeyError, ValueError, TypeError, OSError) as error:
@@ -198,80 +259,17 @@ def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], task: Task, fil
     arrays["return"][0] = arrays["reward"][0].astype(np.float64).sum()
 
 
-# -- bytes: TFRecord and tf.train.Example ----------------------------------------------------------
-
-
-def _files(path: Path) -> list[Path]:
-    return sorted(file for file in path.glob("*.tfrecord*") if file.is_file())
-
-
-def _offsets(file: Path) -> Iterator[tuple[int, int]]:
-    """Where each record's data begin, and how long they are."""
-    size, offset = file.stat().st_size, 0
-    with file.open("rb") as handle:
-        while offset < size:
-            handle.seek(offset)
-            head = handle.read(12)
-            length = struct.unpack("<Q", head[:8])[0] if len(head) == 12 else MAX_RECORD
-            if length >= MAX_RECORD or head[8:] != _masked_crc(head[:8]) or offset + 16 + length > size:
-                raise StoreError(f"{file} is damaged or cut short at byte {offset}; fetch it again")
-            yield offset + 12, length
-            offset += 16 + length
-
-
-def _masked_crc(data: bytes) -> bytes:
-    crc = google_crc32c.value(data)
-    return struct.pack("<I", (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF)
-
-
-def _read(file: Path, offset: int, length: int) -> dict[str, Any]:
-    """One episode: flat names -> float32 or int64 arrays, or lists of bytes."""
-    with file.open("rb") as handle:
-        handle.seek(offset)
-        data, crc = handle.read(length), handle.read(4)
-    if crc != _masked_crc(data):
-        raise StoreError(f"{file} is damaged at byte {offset}; fetch it again")
-    try:
-        return dict(_decode_feature(entry) for _, features in _fields(data) for _, entry in _fields(features))
-    except (IndexError, ValueError, KeyError, UnicodeDecodeError):
-        raise StoreError(f"{file} holds something else than tf.train.Example records at byte {offset}") from None
-
-
-def _varint(data: memoryview, place: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[place]
-        place += 1
-        value |= (byte & 127) << shift
-        if byte < 128:
-            return value, place
-        shift += 7
-
-
-def _fields(data) -> Iterator[tuple[int, memoryview]]:
-    """(number, content) of the length-delimited fields of a message."""
-    data, place = memoryview(data), 0
-    while place < len(data):
-        key, place = _varint(data, place)
-        if key & 7 != 2:
-            raise ValueError("not a length-delimited field")
-        size, place = _varint(data, place)
-        if place + size > len(data):
-            raise ValueError("a field is longer than its message")
-        yield key >> 3, data[place : place + size]
-        place += size
-
-
-def _decode_feature(entry: memoryview) -> tuple[str, Any]:
-    parts = dict(_fields(entry))
-    name, [(kind, content)] = bytes(parts[1]).decode(), list(_fields(parts[2])) or [(3, memoryview(b""))]
-    if kind == 1:
-        return name, [bytes(value) for _, value in _fields(content)]
-    packed = b"".join(bytes(value) for _, value in _fields(content))
-    if kind == 2:
-        return name, np.frombuffer(packed, "<f4")
-    numbers, place, view = [], 0, memoryview(packed)
-    while place < len(view):
-        number, place = _varint(view, place)
-        numbers.append(number - 2**64 if number >= 2**63 else number)
-    return name, np.array(numbers, np.int64)
+def _state(task: Task, values: dict[str, Any], count: int, terminated: bool) -> np.ndarray:
+    """(count, state): the fields by their names. DMC-VB's loader leaves two of a maze's out (165 numbers of 167),
+    and they follow from the rest: the torso's height, and that the goal was touched in the last state of an episode
+    that ended."""
+    found = {
+        field: np.reshape(value, (count, -1))
+        for field in task.state_fields
+        if (value := values.get(f"steps/observation/{state_feature(task.id, field)}")) is not None
+    }
+    if "target_activated" in task.state_fields and "target_activated" not in found:
+        found["target_activated"] = (np.arange(count) == count - 1)[:, None] & terminated
+    if "body_height" in task.state_fields and "body_height" not in found:
+        found["body_height"] = found["walker_position"][:, 2:]
+    return np.concatenate([found[field] for field in task.state_fields], axis=1)

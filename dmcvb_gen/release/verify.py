@@ -16,7 +16,7 @@ from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.release.import_tfds import MISSING
+from dmcvb_gen.release.import_tfds import imported_specs
 from dmcvb_gen.rollout.jobs import video_source
 from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.store import Subset, open_release
@@ -183,9 +183,8 @@ def check_values(subset: Subset) -> Iterator[Finding]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
     episodes = subset.episodes
-    for spec in array_specs(EpisodeShape.of(task), subset.record.size, pixels=bool(subset.pixel_arrays)):
-        if is_imported(subset) and spec.name.startswith(MISSING):
-            continue
+    specs = array_specs(EpisodeShape.of(task), subset.record.size, pixels=bool(subset.pixel_arrays))
+    for spec in imported_specs(subset.record) if is_imported(subset) else specs:
         if spec.name not in subset.arrays:
             yield Finding("shapes", subset.name, f"array {spec.name} is missing")
             return

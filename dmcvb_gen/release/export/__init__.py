@@ -7,11 +7,14 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.readers.release import open_for_reading
+from dmcvb_gen.names import select
+from dmcvb_gen.pool import ignore, open_pool
+from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
 from dmcvb_gen.release.export.episodes import Source
-from dmcvb_gen.rollout.recipe import select
+from dmcvb_gen.store.remote import is_url, public, reason
 
 
 @dataclass(frozen=True)
@@ -21,14 +24,16 @@ class Format:
     Attributes:
       module: where its `write(source, folder)` lives.
       keeps, drops: what of a subset is in it and what is not, in words.
-      extra: the extra of dmcvb-gen that it needs, None if none.
+      packages: what it needs beyond dmcvb-gen's own dependencies.
+      options: those of `export` that are for it.
     """
 
     module: str
     reader: str
     keeps: str
     drops: str
-    extra: str | None = None
+    packages: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
 
 
 FORMATS = {
@@ -37,7 +42,7 @@ FORMATS = {
         "V-D4RL's DrQ+BC loader (`observation`, `action`, `reward`, `discount`, `step_type`)",
         "pixels (channels first), states, actions, rewards, discounts",
         "physics, labels, seeds",
-        "hdf5",
+        ("h5py",),
     ),
     "npz": Format(
         "vd4rl:write_npz",
@@ -53,17 +58,18 @@ FORMATS = {
     ),
     "minari": Format(
         "minari_format:write",
-        "minari (`MinariDataset`, HDF5 storage, lossless pictures)",
+        "minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless pictures)",
         "pixels, states, actions, rewards, ends, seeds, the Gymnasium environment",
         "physics, labels",
-        "minari",
+        ("minari", "h5py"),
     ),
     "lerobot": Format(
         "lerobot:write",
-        "LeRobot v3 (Parquet with PNG pictures)",
+        "LeRobot v3 (Parquet with PNG pictures, or mp4), `datasets.load_dataset`",
         "pixels, states, actions, rewards, ends",
         "the last observation of each episode, physics, labels",
-        "lerobot",
+        ("pyarrow",),
+        ("merge", "video"),
     ),
     "rlds": Format(
         "rlds:write",
@@ -75,6 +81,21 @@ FORMATS = {
 """Name -> format."""
 
 
+KEPT = "the subsets that were written are whole: name the others with --only and run the command again"
+
+
+@dataclass(frozen=True)
+class _Work:
+    """A subset to be exported; travels to a worker."""
+
+    path: str
+    storage_options: dict | None
+    to: str
+    options: dict[str, Any]
+    subsets: tuple[tuple[str, tuple[int, ...]], ...]
+    folder: Path
+
+
 def export(
     path: str,
     to: str,
@@ -82,60 +103,123 @@ def export(
     only: Sequence[str] = (),
     episodes: tuple[int, int] | None = None,
     *,
+    merge: bool = False,
+    video: bool = False,
+    workers: int = 1,
     storage_options: dict | None = None,
-    tick: Callable[[int], None] = lambda episodes: None,
+    tick: Callable[[int], None] = ignore,
 ) -> list[Path]:
-    """Write subsets in another format.
+    """Write subsets in another format; each is there whole, or not at all.
 
     Args:
       path: a release, here or at a URL.
       to: a name out of `FORMATS`.
-      out: folder of the exports; each subset gets `<out>/<task>/<level>/<setting>`.
+      out: folder of the exports; each subset gets `<out>/<task>/<level>/<setting>` (minari: see its `folder_name`).
       only: subset patterns; episodes: (first, last + 1); all by default.
+      merge: lerobot: all subsets as the tasks of one data set, `out` itself.
+      video: lerobot: pictures as mp4 (smaller, with losses) and not as PNG.
+      workers: processes, a subset each.
       tick: told 1 for each episode.
 
     Returns:
       The folders.
 
     Raises:
-      UnknownNameError: no such format or subset. DmcvbError: its package is not installed. StoreError: there is
-      something at `out` already, or it cannot be written.
+      UnknownNameError: no such format or subset. DmcvbError: its package is not installed, or an option is not for
+      this format. StoreError: a subset is not whole (or lacks some of `episodes`), it is damaged, there is something
+      at `out` already, or it cannot be written.
     """
     if to not in FORMATS:
         raise UnknownNameError("format", to, FORMATS)
-    module, function = FORMATS[to].module.split(":")
-    try:
-        write = getattr(importlib.import_module(f"{__name__}.{module}"), function)
-    except ImportError as error:
-        cure = f'pip install "dmcvb-gen[{FORMATS[to].extra}]"'
-        raise DmcvbError(f"export to {to} needs a package that is not installed ({error.name}): {cure}") from None
+    if is_url(str(out)):
+        raise StoreError(f"exports are written to folders; {public(str(out))} is none: export to one and copy it there")
+    options = {name: True for name, given in (("video", video),) if given}
+    for name in (*options, *["merge"] * merge):
+        if name not in FORMATS[to].options:
+            raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
+    _writer(to)  # its package is missed now, and not in a worker
     release = open_for_reading(path, storage_options)
-    if not release.subsets:
-        raise StoreError(f"{path} has no committed episodes yet")
-    folders = []
-    for name in select(list(release.subsets), list(only)):
-        subset, folder = release[name], Path(out) / name
-        chosen = [int(e) for e in subset.episodes if episodes is None or episodes[0] <= e < episodes[1]]
-        if not chosen:
-            raise StoreError(f"{name} has none of the episodes {episodes[0]}:{episodes[1]} here")
+    names = select([record.name for record in release.manifest.subsets], list(only))
+    chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
+    folders = [Path(out).absolute()] if merge else [Path(out).absolute() / _folder_name(to)(release, n) for n in names]
+    works = [
+        _Work(str(path), storage_options, to, options, part, folder)
+        for part, folder in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
+    ]
+    for folder in folders:
         if folder.exists():
             raise StoreError(f"{folder} is there already; choose another --out")
-        partial = folder.with_name(folder.name + ".partial")
-        try:
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir(parents=True)
-            write(Source(release.manifest, subset, chosen, tick), partial)
-            partial.rename(folder)  # whole or not at all
-        except OSError as error:
-            raise StoreError(f"cannot write to {folder}: {error.strerror or error}; make room or give --out") from None
-        folders.append(folder)
+    with open_pool(min(workers, len(works)), tick=tick, kept=KEPT) as pool:
+        for work in works:
+            pool.submit(work.folder, _write, work)
+        for _ in pool.results():
+            pass
     return folders
+
+
+def _formats_with(option: str) -> list[str]:
+    return [name for name, kind in FORMATS.items() if option in kind.options]
+
+
+def _module(to: str):
+    return importlib.import_module(f"{__name__}.{FORMATS[to].module.split(':')[0]}")
+
+
+def _writer(to: str) -> Callable:
+    try:
+        for package in FORMATS[to].packages:
+            importlib.import_module(package)
+        return getattr(_module(to), FORMATS[to].module.split(":")[1])
+    except ImportError as error:
+        cure = f"pip install {' '.join(FORMATS[to].packages)}"
+        raise DmcvbError(f"export to {to} needs a package that is not installed ({error.name}): {cure}") from None
+
+
+def _folder_name(to: str) -> Callable[[ReleaseReader, str], str]:
+    return getattr(_module(to), "folder_name", lambda release, name: name)
+
+
+def _episodes(release: ReleaseReader, name: str, asked: tuple[int, int] | None) -> tuple[int, ...]:
+    """The episodes of a subset that are exported; all that are asked for must be there."""
+    record = next(record for record in release.manifest.subsets if record.name == name)
+    here = set(release.subsets[name].episodes.tolist()) if name in release.subsets else set()
+    first, last = asked or (0, record.episodes)
+    wanted = range(max(first, 0), min(last, record.episodes))
+    if not wanted:
+        raise StoreError(f"{name} has none of the episodes {first}:{last}; it has {record.episodes}")
+    missing = [episode for episode in wanted if episode not in here]
+    if missing:
+        raise StoreError(
+            f"{name} has {len(wanted) - len(missing)} of {len(wanted)} episodes here, episode {missing[0]} is not; "
+            "finish the rollout or fetch the rest, or name what is here with --only and --episodes"
+        )
+    return tuple(wanted)
+
+
+def _write(work: _Work, tick: Callable[[int], None] = ignore) -> None:
+    """Write one folder, whole or not at all."""
+    release = open_for_reading(work.path, work.storage_options)
+    sources = [Source(release, release[name], list(episodes), tick) for name, episodes in work.subsets]
+    partial = work.folder.with_name(f".{work.folder.name}.partial")
+    write = _writer(work.to)
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        write(sources if "merge" in FORMATS[work.to].options else sources[0], partial, **work.options)
+        partial.rename(work.folder)
+    except (OSError, ValueError, RuntimeError) as error:
+        if isinstance(error, DmcvbError):
+            raise
+        names = ", ".join(source.subset.name for source in sources)
+        raise StoreError(f"cannot export {names} to {work.folder}: {reason(error)}") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def format_table() -> str:
     """The formats as a Markdown table: which program reads them, what they keep and what they leave out."""
-    lines = ["| `--to` | read by | keeps | leaves out | extra |", "|---|---|---|---|---|"]
+    lines = ["| `--to` | read by | keeps | leaves out | needs |", "|---|---|---|---|---|"]
     for name, kind in FORMATS.items():
-        extra = f"`dmcvb-gen[{kind.extra}]`" if kind.extra else ""
-        lines.append(f"| `{name}` | {kind.reader} | {kind.keeps} | {kind.drops} | {extra} |")
+        needs = f"`pip install {' '.join(kind.packages)}`" if kind.packages else ""
+        lines.append(f"| `{name}` | {kind.reader} | {kind.keeps} | {kind.drops} | {needs} |")
     return "\n".join(lines)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image
 
-from dmcvb_gen.readers.release import SubsetReader
+from dmcvb_gen.readers.release import ReleaseReader, SubsetReader
 from dmcvb_gen.store import Manifest
 from dmcvb_gen.store.pictures import Pictures, shown
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
@@ -59,10 +61,14 @@ class ExportEpisode:
 class Source:
     """The chosen episodes of a subset, and what is known of them."""
 
-    manifest: Manifest
+    release: ReleaseReader
     subset: SubsetReader
     episodes: list[int]
     tick: Callable[[int], None]
+
+    @property
+    def manifest(self) -> Manifest:
+        return self.release.manifest
 
     @property
     def steps_per_second(self) -> float:
@@ -96,3 +102,10 @@ class Source:
                 **{name: values[name] for name in ("state", "action", "reward", "discount")},
             )
             self.tick(1)
+
+
+def png(frame: np.ndarray) -> bytes:
+    """(height, width, 3) uint8 as a PNG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, "PNG")
+    return buffer.getvalue()

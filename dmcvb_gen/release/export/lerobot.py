@@ -1,17 +1,22 @@
-"""LeRobot's dataset layout, version 3 (github.com/huggingface/lerobot): Parquet tables, pictures as PNG in them."""
+"""LeRobot's dataset layout, version 3 (github.com/huggingface/lerobot): Parquet tables with PNG pictures, or mp4.
+
+`datasets.load_dataset(folder)` reads the tables, too: their schema says that the pictures are pictures.
+"""
 
 from __future__ import annotations
 
-import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from PIL import Image
 
-from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
+from dmcvb_gen.tasks import get_task
 
 VERSION = "v3.0"
 CHUNK_FILES, DATA_MB, VIDEO_MB = 1000, 100, 500
@@ -20,43 +25,41 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 EPISODES_PER_FILE = 50
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
+"""Of videos: nearly without loss (crf), and a key frame every second frame, so that any frame is decoded quickly."""
 
 
-def write(source: Source, folder: Path) -> None:
-    """Write `meta/` (info.json, stats.json, tasks.parquet, episodes) and `data/`; the last observation of an episode
-    has no action and is left out, as LeRobot's frames all have one."""
-    subset = source.subset
-    names = {
-        view: "observation.image" if len(source.views) == 1 else f"observation.images.{view}" for view in source.views
-    }
-    task, rows, statistics = f"{subset.task} ({subset.level})", [], _Statistics()
-    pending: list[dict] = []
-    index = 0
+def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
+    """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
+
+    Several subsets are the tasks of one data set. The last observation of an episode has no action and is left out,
+    as LeRobot's frames all have one.
+
+    Raises:
+      StoreError: the subsets do not fit into one data set, or pictures of this size into a video.
+    """
+    layout = _Layout(sources, video)
     (folder / "meta").mkdir()
-    for number, episode in enumerate(source):
-        chunk, file = divmod(number // EPISODES_PER_FILE, CHUNK_FILES)
-        pending.append(_frames(episode, number, index, names, source.steps_per_second))
-        rows.append(
-            {
-                "episode_index": number,
-                "tasks": [task],
-                "length": episode.length,
-                "dataset_from_index": index,
-                "dataset_to_index": index + episode.length,
-                "data/chunk_index": chunk,
-                "data/file_index": file,
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-            }
-            | statistics.add(pending[-1], episode, names)
-        )
-        index += episode.length
-        if len(pending) == EPISODES_PER_FILE or number == len(source.episodes) - 1:
-            path = folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pq.write_table(_table(pending, names), path)
-            pending = []
-    tasks = pa.table({"task_index": pa.array([0], pa.int64()), "__index_level_0__": [task]})
+    files, statistics, rows, index = _Files(folder, layout), _Statistics(), [], 0
+    for source in sources:
+        task = layout.tasks.index(_task_text(source))
+        for episode in source:
+            columns = layout.frames(episode, len(rows), index, task)
+            row = {"episode_index": len(rows), "tasks": [layout.tasks[task]], "length": episode.length}
+            row |= {"dataset_from_index": index, "dataset_to_index": index + episode.length}
+            row |= files.add(columns, episode, len(rows))
+            rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
+            rows[-1] |= statistics.add(columns, layout.pictures(episode))
+            index += episode.length
+    files.close()
+    _write_meta(folder, layout, rows, index, statistics)
+
+
+def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, statistics: _Statistics) -> None:
+    (folder / EPISODES_PATH).parent.mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(rows), folder / EPISODES_PATH)
+    tasks = {"task_index": pa.array(range(len(layout.tasks)), pa.int64()), "__index_level_0__": layout.tasks}
     pandas = {
         "index_columns": ["__index_level_0__"],
         "column_indexes": [],
@@ -66,103 +69,236 @@ def write(source: Source, folder: Path) -> None:
         ],
         "pandas_version": "2.0.0",
     }
-    pq.write_table(tasks.replace_schema_metadata({"pandas": json.dumps(pandas)}), folder / "meta/tasks.parquet")
-    (folder / EPISODES_PATH).parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist(rows), folder / EPISODES_PATH)
+    table = pa.table(tasks).replace_schema_metadata({"pandas": json.dumps(pandas)})
+    pq.write_table(table, folder / "meta/tasks.parquet")
     (folder / "meta/stats.json").write_text(json.dumps(statistics.total(), indent=1))
     info = {
         "codebase_version": VERSION,
-        "robot_type": subset.task,
+        "robot_type": layout.robot,
         "total_episodes": len(rows),
-        "total_frames": index,
-        "total_tasks": 1,
+        "total_frames": frames,
+        "total_tasks": len(layout.tasks),
         "chunks_size": CHUNK_FILES,
         "data_files_size_in_mb": DATA_MB,
         "video_files_size_in_mb": VIDEO_MB,
-        "fps": round(source.steps_per_second),
+        "fps": layout.fps,
         "splits": {"train": f"0:{len(rows)}"},
         "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH,
-        "features": _features(subset, names),
+        "video_path": VIDEO_PATH if layout.video else None,
+        "features": layout.features,
     }
     (folder / "meta/info.json").write_text(json.dumps(info, indent=1))
+    (folder / "README.md").write_text(_card(layout))
 
 
-def _features(subset, names) -> dict:
-    size = subset.record.size
-    scalar = {"shape": [1], "names": None}
-    features = {
-        name: {"dtype": "image", "shape": [size, size, 3], "names": ["height", "width", "channel"]}
-        for name in names.values()
-    }
-    for name, array in (("observation.state", "state"), ("action", "action")):
-        features[name] = {"dtype": "float32", "shape": [subset.array(array).shape[-1]], "names": None}
-    features |= {"next.reward": {"dtype": "float32", **scalar}, "next.done": {"dtype": "bool", **scalar}}
-    features["timestamp"] = {"dtype": "float32", **scalar}
-    for name in ("frame_index", "episode_index", "index", "task_index"):
-        features[name] = {"dtype": "int64", **scalar}
-    return features
+def _card(layout: _Layout) -> str:
+    manifest = layout.sources[0].manifest
+    subsets = "\n".join(f"- {source.description}" for source in layout.sources)
+    return (
+        f"---\nlicense: {manifest.license.lower()}\ntask_categories:\n- robotics\ntags:\n- LeRobot\nconfigs:\n"
+        "- config_name: default\n  data_files: data/*/*.parquet\n---\n\n"
+        f"# {manifest.name} {manifest.version}\n\nA LeRobot data set ({VERSION}) of\n\n{subsets}\n"
+    )
 
 
-def _frames(episode: ExportEpisode, number: int, index: int, names, rate: float) -> dict[str, np.ndarray | list]:
-    length, steps = episode.length, np.arange(episode.length)
-    columns: dict[str, np.ndarray | list] = {
-        name: [_png(frame) for frame in episode.pixels[view][:length]] for view, name in names.items()
-    }
-    return columns | {
-        "observation.state": episode.state[:length],
-        "action": episode.action,
-        "next.reward": episode.reward,
-        "next.done": steps == length - 1,
-        "timestamp": (steps / rate).astype(np.float32),
-        "frame_index": steps,
-        "episode_index": np.full(length, number),
-        "index": index + steps,
-        "task_index": np.zeros(length, np.int64),
-    }
+def _task_text(source: Source) -> str:
+    return f"{source.subset.task} ({source.subset.level})"
 
 
-def _png(frame: np.ndarray) -> dict[str, bytes | None]:
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, "PNG")
-    return {"bytes": buffer.getvalue(), "path": None}
+class _Layout:
+    """What the data set's columns are.
 
+    Attributes:
+      tasks: their texts; `task_index` counts them. robot: what they have in common.
+      keys: view -> feature of its pictures.
+      features: as info.json says them.
+    """
 
-def _table(parts, names) -> pa.Table:
-    columns = {}
-    for name in parts[0]:
-        if name in names.values():
-            kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-            columns[name] = pa.array([value for part in parts for value in part[name]], kind)
-        else:
-            value = np.concatenate([part[name] for part in parts])
-            if value.ndim == 2:
-                flat = pa.array(value.ravel())
-                columns[name] = pa.FixedSizeListArray.from_arrays(flat, value.shape[1])
+    def __init__(self, sources: Sequence[Source], video: bool):
+        first = sources[0]
+        for source in sources:
+            if _shape(source) != _shape(first):
+                raise StoreError(
+                    f"{source.subset.name} and {first.subset.name} differ in views, size, state or action, so they "
+                    "do not fit into one data set; merge fewer with --only"
+                )
+        self.sources, self.video, self.size = sources, video, first.subset.record.size
+        if video and self.size % 2:
+            raise StoreError(f"videos need an even size, these pictures have {self.size} pixels; leave out --video")
+        self.tasks = list(dict.fromkeys(_task_text(source) for source in sources))
+        tasks = {source.subset.task for source in sources}
+        self.robot = tasks.pop() if len(tasks) == 1 else first.subset.record.family
+        self.rate, self.fps = first.steps_per_second, round(first.steps_per_second)
+        single = len(first.views) == 1
+        self.keys = {view: "observation.image" if single else f"observation.images.{view}" for view in first.views}
+        self.features = self._features(first)
+
+    def _features(self, source: Source) -> dict[str, Any]:
+        task, scalar = get_task(source.subset.task), {"shape": [1], "names": None}
+        picture = {"dtype": "image", "shape": [self.size, self.size, 3], "names": ["height", "width", "channel"]}
+        if self.video:
+            picture |= {"dtype": "video", "info": self._video_info()}
+        state = [f"{field}.{i}" for field, size in task.state_fields.items() for i in range(size)]
+        actions = [task.model.actuator(i).name or f"actuator.{i}" for i in range(task.action_size)]
+        return {
+            **{key: picture for key in self.keys.values()},
+            "observation.state": {"dtype": "float32", "shape": [len(state)], "names": state},
+            "action": {"dtype": "float32", "shape": [len(actions)], "names": actions},
+            "next.reward": {"dtype": "float32", **scalar},
+            "next.done": {"dtype": "bool", **scalar},
+            "next.success": {"dtype": "bool", **scalar},
+            "timestamp": {"dtype": "float32", **scalar},
+            **{n: {"dtype": "int64", **scalar} for n in ("frame_index", "episode_index", "index", "task_index")},
+        }
+
+    def _video_info(self) -> dict[str, Any]:
+        sizes = {"video.height": self.size, "video.width": self.size, "video.channels": 3}
+        codec = {"video.codec": "h264", "video.pix_fmt": PIXEL_FORMAT, "video.is_depth_map": False}
+        return sizes | codec | {"video.fps": self.fps, "has_audio": False}
+
+    def pictures(self, episode: ExportEpisode) -> dict[str, np.ndarray]:
+        """Feature -> (L, size, size, 3)."""
+        return {key: episode.pixels[view][: episode.length] for view, key in self.keys.items()}
+
+    def frames(self, episode: ExportEpisode, number: int, index: int, task: int) -> dict[str, np.ndarray]:
+        """The columns of an episode but its pictures, each with a row a frame."""
+        length, steps = episode.length, np.arange(episode.length)
+        return {
+            "observation.state": episode.state[:length],
+            "action": episode.action,
+            "next.reward": episode.reward,
+            "next.done": steps == length - 1,
+            "next.success": (steps == length - 1) & episode.terminated,
+            "timestamp": (steps / self.rate).astype(np.float32),
+            "frame_index": steps,
+            "episode_index": np.full(length, number),
+            "index": index + steps,
+            "task_index": np.full(length, task),
+        }
+
+    def schema(self) -> pa.Schema:
+        """Of the data tables, with what Hugging Face's `datasets` wants to know."""
+        fields, huggingface = [], {}
+        for name, feature in self.features.items():
+            if feature["dtype"] == "video":
+                continue
+            if feature["dtype"] == "image":
+                kind, told = pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
             else:
-                columns[name] = pa.array(value)
-    return pa.table(columns)
+                kind = {"float32": pa.float32(), "bool": pa.bool_(), "int64": pa.int64()}[feature["dtype"]]
+                told = {"dtype": feature["dtype"], "_type": "Value"}
+                if feature["names"]:
+                    kind = pa.list_(kind, feature["shape"][0])
+                    told = {"feature": told, "length": feature["shape"][0], "_type": "List"}
+            fields.append(pa.field(name, kind))
+            huggingface[name] = told
+        return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": huggingface}})})
+
+
+def _shape(source: Source) -> tuple:
+    subset = source.subset
+    sizes = (subset.array(name).shape[-1] for name in ("state", "action"))
+    return source.views, subset.record.size, *sizes, source.steps_per_second
+
+
+class _Files:
+    """The tables and videos, `EPISODES_PER_FILE` episodes a file, a row group an episode."""
+
+    def __init__(self, folder: Path, layout: _Layout):
+        self._folder, self._layout, self._schema = folder, layout, layout.schema()
+        self._table: pq.ParquetWriter | None = None
+        self._videos: dict[str, Any] = {}
+        self._frames = 0
+
+    def add(self, columns: dict[str, np.ndarray], episode: ExportEpisode, number: int) -> dict[str, Any]:
+        """Write an episode; gives where it is, as columns of the table of episodes."""
+        chunk, file = divmod(number // EPISODES_PER_FILE, CHUNK_FILES)
+        if number % EPISODES_PER_FILE == 0:
+            self.close()
+            self._open(chunk, file)
+        pictures = self._layout.pictures(episode)
+        place: dict[str, Any] = {"data/chunk_index": chunk, "data/file_index": file}
+        if self._layout.video:
+            for key, frames in pictures.items():
+                for frame in frames:
+                    self._videos[key].send(np.ascontiguousarray(frame))
+                place |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
+                place[f"videos/{key}/from_timestamp"] = self._frames / self._layout.fps
+                place[f"videos/{key}/to_timestamp"] = (self._frames + len(frames)) / self._layout.fps
+        self._table.write_table(self._rows(columns, {} if self._layout.video else pictures))
+        self._frames += episode.length
+        return place
+
+    def _rows(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> pa.Table:
+        arrays = []
+        for field in self._schema:
+            if field.name in pictures:
+                values = [{"bytes": png(frame), "path": None} for frame in pictures[field.name]]
+                arrays.append(pa.array(values, field.type))
+            elif columns[field.name].ndim == 2:
+                flat = pa.array(columns[field.name].ravel())
+                arrays.append(pa.FixedSizeListArray.from_arrays(flat, columns[field.name].shape[1]))
+            else:
+                arrays.append(pa.array(columns[field.name], field.type))
+        return pa.table(arrays, schema=self._schema)
+
+    def _open(self, chunk: int, file: int) -> None:
+        path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._table, self._frames = pq.ParquetWriter(path, self._schema), 0
+        for key in self._layout.keys.values() if self._layout.video else ():
+            path = self._folder / VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._videos[key] = _video(path, self._layout.size, self._layout.fps)
+
+    def close(self) -> None:
+        """End the files that are open."""
+        if self._table is not None:
+            self._table.close()
+        for video in self._videos.values():
+            video.close()
+        self._table, self._videos = None, {}
+
+
+def _video(path: Path, size: int, fps: int):
+    """An encoder that takes (size, size, 3) uint8 frames by `send`."""
+    import imageio_ffmpeg
+
+    options = ["-crf", str(QUALITY), "-g", str(KEY_FRAMES)]
+    encoder = imageio_ffmpeg.write_frames(
+        str(path),
+        (size, size),
+        fps=fps,
+        codec=CODEC,
+        quality=None,
+        pix_fmt_out=PIXEL_FORMAT,
+        macro_block_size=2,
+        output_params=options,
+    )
+    encoder.send(None)
+    return encoder
 
 
 class _Statistics:
-    """Minimum, maximum, mean, standard deviation and count of every feature, an episode at a time and in all."""
+    """Minimum, maximum, mean, standard deviation, quantiles and count of every feature, an episode at a time and in
+    all; the quantiles of all are the weighted means of the episodes', as LeRobot itself takes them together."""
 
     def __init__(self):
         self._parts: dict[str, list[dict[str, np.ndarray]]] = {}
 
-    def add(self, columns, episode: ExportEpisode, names) -> dict[str, list]:
+    def add(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> dict[str, list]:
         """Take an episode up; gives its own statistics as columns "stats/<feature>/<statistic>"."""
         flat = {}
-        for name in columns:
-            if name in names.values():
-                view = next(view for view, other in names.items() if other == name)
-                value = episode.pixels[view][: episode.length].astype(np.float64) / 255
-                axes, shape = (0, 1, 2), (3, 1, 1)  # LeRobot's pictures: a number a channel, in [0, 1]
+        for name, value in (columns | pictures).items():
+            if name in pictures:  # a number a channel, in [0, 1]
+                value, shape = value.reshape(-1, 3) / 255.0, (3, 1, 1)
             else:
-                value = np.asarray(columns[name], np.float64).reshape(episode.length, -1)
-                axes, shape = 0, (value.shape[1],)
-            part = {key: getattr(value, key)(axis=axes).reshape(shape) for key in ("min", "max", "mean", "std")}
-            part["count"] = np.array([episode.length])
+                value = np.asarray(value, np.float64).reshape(len(value), -1)
+                shape = (value.shape[1],)
+            part = {key: getattr(value, key)(axis=0).reshape(shape) for key in ("min", "max", "mean", "std")}
+            found = np.quantile(value, list(QUANTILES.values()), axis=0)
+            part |= {key: number.reshape(shape) for key, number in zip(QUANTILES, found, strict=True)}
+            part["count"] = np.array([len(columns["index"])])
             self._parts.setdefault(name, []).append(part)
             flat |= {f"stats/{name}/{key}": number.tolist() for key, number in part.items()}
         return flat
@@ -171,16 +307,12 @@ class _Statistics:
         """The statistics of all episodes together."""
         out = {}
         for name, parts in self._parts.items():
-            count = np.array([part["count"][0] for part in parts], np.float64)
+            stacked = {key: np.stack([part[key] for part in parts]) for key in parts[0]}
+            count = stacked.pop("count")[:, 0].astype(np.float64)
             weight = (count / count.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
-            means = np.stack([part["mean"] for part in parts])
-            mean = (weight * means).sum(axis=0)
-            variance = (weight * (np.stack([part["std"] for part in parts]) ** 2 + (means - mean) ** 2)).sum(axis=0)
-            out[name] = {
-                "min": np.min([part["min"] for part in parts], axis=0).tolist(),
-                "max": np.max([part["max"] for part in parts], axis=0).tolist(),
-                "mean": mean.tolist(),
-                "std": np.sqrt(variance).tolist(),
-                "count": [int(count.sum())],
-            }
+            mean = (weight * stacked["mean"]).sum(axis=0)
+            variance = (weight * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(axis=0)
+            total = {"min": stacked["min"].min(axis=0), "max": stacked["max"].max(axis=0), "mean": mean}
+            total |= {"std": np.sqrt(variance)} | {key: (weight * stacked[key]).sum(axis=0) for key in QUANTILES}
+            out[name] = {key: value.tolist() for key, value in total.items()} | {"count": [int(count.sum())]}
         return out

@@ -1,4 +1,7 @@
-"""Minari's layout, written with minari itself: HDF5 storage, pictures without loss."""
+"""Minari's layout, written with minari itself: HDF5 storage, pictures without loss, in the tree that minari looks for.
+
+`MINARI_DATASETS_PATH=<out>` and `minari.load_dataset("dmcvb_gen/walker-walk/expert-dynamic-v0")` then open it.
+"""
 
 from __future__ import annotations
 
@@ -8,57 +11,87 @@ import gymnasium
 import minari
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
-from dmcvb_gen.readers.register import NAMESPACE, environment_ids
+from dmcvb_gen import __version__, files
+from dmcvb_gen.names import ANT_MAZE, FIXED, DistractorSetting
+from dmcvb_gen.readers.register import ENTRY_POINT, NAMESPACE, environment_id
+from dmcvb_gen.readers.release import ReleaseReader
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+from dmcvb_gen.release.export.references import reference_returns
+
+
+def folder_name(release: ReleaseReader, subset: str) -> str:
+    """Where a subset's data set lies below the root of minari's data sets; its id, too."""
+    task, level, setting = subset.replace("_", "-").replace(".", "-").split("/")
+    return f"{NAMESPACE}/{task}/{level}-{setting}-v0"
 
 
 def write(source: Source, folder: Path) -> None:
-    """Write a dataset that `minari.MinariDataset(folder / "data")` opens; copied to
-    `~/.minari/datasets/dmcvb_gen/<task>/<level>-<setting>-v0/data`, it goes by that name."""
-    subset = source.subset
-    action = subset.array("action").shape[-1]
-    pictures = {
-        view: spaces.Box(0, 255, (subset.record.size, subset.record.size, 3), np.uint8) for view in source.views
-    }
+    """Write `<folder>/data`, and what minari keeps of the namespaces above it.
+
+    An observation is {"pixels": (size, size, 3 * view) uint8, "state"}, as the environment's.
+    """
+    subset, size = source.subset, source.subset.record.size
+    name = folder_name(source.release, subset.name)
+    picture = spaces.Box(0, 255, (size, size, 3 * len(source.views)), np.uint8)
     state = spaces.Box(-np.inf, np.inf, (subset.array("state").shape[-1],), np.float32)
     storage = MinariStorage.new(
         folder / "data",
-        observation_space=spaces.Dict({**pictures, "state": state}),
-        action_space=spaces.Box(-1.0, 1.0, (action,), np.float32),
-        env_spec=_environment(source),
+        observation_space=spaces.Dict({"pixels": picture, "state": state}),
+        action_space=spaces.Box(-1.0, 1.0, (subset.array("action").shape[-1],), np.float32),
+        env_spec=_environment(source, "train"),
         data_format="hdf5",
         jpeg_encoding=False,
     )
-    storage.update_metadata(
-        {
-            "dataset_id": f"{NAMESPACE}/{subset.task}/{subset.level}-{subset.setting.replace('_', '-')}-v0",
-            "minari_version": minari.__version__,
-            "algorithm_name": subset.level,
-            "author": set(source.manifest.authors),
-            "code_permalink": source.manifest.generator,
-            "description": source.description,
-        }
-    )
-    storage.update_episodes(_buffer(number, episode) for number, episode in enumerate(source))
-
-
-def _environment(source: Source):
-    """The registered environment that shows what the data show; None where there is none."""
-    record, name = source.subset.record, f"{NAMESPACE}/{source.subset.task}-{source.subset.setting.split('_')[0]}-v0"
-    if name not in environment_ids():
-        return None
-    spec = gymnasium.spec(name)
-    difficulty = source.subset.setting.partition("_")[2] or "medium"
-    spec.kwargs = {
-        **spec.kwargs,
-        "difficulty": difficulty,
-        "size": record.size,
-        "renderer": record.renderer["name"],
-        "samples": record.renderer.get("samples"),
+    algorithms = sorted({str(policy.header.get("algorithm", subset.level)) for policy in subset.record.policies})
+    facts = {
+        "dataset_id": name,
+        "minari_version": minari.__version__,
+        "algorithm_name": ", ".join(algorithms) or subset.level,
+        "author": set(source.manifest.authors),
+        "code_permalink": source.manifest.generator,
+        "description": source.description,
+        "requirements": [f"dmcvb-gen>={__version__}"],
+        "eval_env_spec": _environment(source, "val").to_json(),
+        **reference_returns(source.release, subset.record),
     }
+    storage.update_metadata(facts)
+    storage.update_episodes(_buffer(number, episode) for number, episode in enumerate(source))
+    storage.update_metadata({"dataset_size": storage.get_size()})
+    about = {"description": f"{source.manifest.name} {source.manifest.version} ({source.manifest.generator})"}
+    files.write_json(folder.parent.parent / "namespace_metadata.json", about)
+    files.write_json(folder.parent / "namespace_metadata.json", {"description": subset.task})
+
+
+def _environment(source: Source, split: str) -> EnvSpec:
+    """The environment that shows what the data show, with their videos and styles ("train") or others ("val")."""
+    record = source.subset.record
+    maze = record.family == ANT_MAZE
+    setting = record.setting if maze else DistractorSetting.parse(record.setting).kind
+    options = {
+        "task": record.task,
+        "distractor": setting,
+        "size": record.size,
+        "samples": record.renderer.get("samples"),
+        "split": split,
+    }
+    if record.renderer.get("name") not in (None, "imported"):
+        options["renderer"] = record.renderer["name"]
+    if not maze:
+        options["difficulty"] = DistractorSetting.parse(record.setting).difficulty
+    if maze:
+        options["views"] = list(source.views)
+    if split == "train":
+        options["max_steps"] = record.max_steps
+    if record.setting == FIXED:
+        options |= {"fixed_goals": record.fixed_goals, "goal_seed": int(source.manifest.recipe.get("seed", 0))}
+    name = environment_id(record.name.split("/")[0], setting)
+    registered = gymnasium.registry.get(name)
+    spec = EnvSpec(name, entry_point=registered.entry_point if registered else ENTRY_POINT, kwargs=options)
+    spec.order_enforce, spec.disable_env_checker = True, True
     return spec
 
 
@@ -68,7 +101,7 @@ def _buffer(number: int, episode: ExportEpisode) -> EpisodeBuffer:
     return EpisodeBuffer(
         id=number,
         seed=episode.seed % 2**63,  # minari keeps signed numbers
-        observations={**episode.pixels, "state": episode.state},
+        observations={"pixels": episode.stacked(), "state": episode.state},
         actions=episode.action,
         rewards=episode.reward,
         terminations=last & episode.terminated,

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import json
-import struct
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
-from PIL import Image
 
-from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+from dmcvb_gen.release.dmcvb_names import picture_feature, state_feature
+from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
+from dmcvb_gen.release.tfrecord import encode_example, record
 from dmcvb_gen.tasks import get_task
 
 EPISODES_PER_FILE = 50
@@ -25,8 +22,9 @@ def write(source: Source, folder: Path) -> None:
 
     A step has observation/<view>, observation/state, action, reward, discount, is_first, is_last, is_terminal, and
     the state's parts once more under the names and types of DMC-VB's own data set (observation/velocity, ...;
-    float64, numbers without an axis where dm_control gives such), so that its loader takes the folder. The last
-    step of an episode holds the last observation; its action is zeros and means nothing (RLDS).
+    float64, numbers without an axis where dm_control gives such); the views of mazes have its names alone
+    (observation/lowres_top_camera, ...). So its loader takes the folder. The last step of an episode holds the last
+    observation; its action is zeros and means nothing (RLDS).
     """
     subset, version = source.subset, source.manifest.version
     name = subset.name.replace("/", "_").replace("-", "_").replace(".", "_")
@@ -34,14 +32,13 @@ def write(source: Source, folder: Path) -> None:
     target.mkdir()
     count = -(-len(source.episodes) // EPISODES_PER_FILE)
     lengths, size, file = [0] * count, 0, None
-    fields = get_task(subset.task).state_slices
     for number, episode in enumerate(source):
         shard = number // EPISODES_PER_FILE
         if number % EPISODES_PER_FILE == 0:
             if file:
                 file.close()
             file = (target / f"{name}-train.tfrecord-{shard:05d}-of-{count:05d}").open("wb")
-        size += file.write(record(encode_example(_example(episode, fields))))
+        size += file.write(record(encode_example(_example(source, episode))))
         lengths[shard] += 1
     if file:
         file.close()
@@ -91,10 +88,11 @@ def _features(source: Source) -> dict[str, Any]:
         "pythonClassName": f"{_FEATURES}.image_feature.Image",
         "image": {"shape": {"dimensions": [size, size, "3"]}, "dtype": "uint8", "encodingFormat": "png"},
     }
-    observation = {view: picture for view in source.views}
+    observation = {_picture_name(source, view): picture for view in source.views}
     observation["state"] = _tensor("float32", subset.array("state").shape[-1])
     for name, part in get_task(subset.task).state_slices.items():
-        observation[name] = _tensor("float64", *([part.stop - part.start] if part.stop - part.start > 1 else []))
+        shape = [part.stop - part.start] if part.stop - part.start > 1 else []
+        observation[state_feature(subset.task, name)] = _tensor("float64", *shape)
     step = {
         "observation": _dict(observation),
         "action": _tensor("float32", subset.array("action").shape[-1]),
@@ -111,7 +109,12 @@ def _features(source: Source) -> dict[str, Any]:
     return _dict({"steps": steps, "episode_index": _tensor("int64")})
 
 
-def _example(episode: ExportEpisode, fields: dict[str, slice]) -> dict[str, np.ndarray | list[bytes]]:
+def _picture_name(source: Source, view: str) -> str:
+    return picture_feature(source.subset.task, view, source.pictures.hide_goal)
+
+
+def _example(source: Source, episode: ExportEpisode) -> dict[str, np.ndarray | list[bytes]]:
+    task = source.subset.task
     rows = episode.length + 1
     step = np.arange(rows)
 
@@ -119,9 +122,11 @@ def _example(episode: ExportEpisode, fields: dict[str, slice]) -> dict[str, np.n
         return np.concatenate([value, np.full((1, *value.shape[1:]), last, value.dtype)])
 
     values: dict[str, np.ndarray | list[bytes]] = {
-        f"steps/observation/{view}": [_png(frame) for frame in frames] for view, frames in episode.pixels.items()
+        f"steps/observation/{_picture_name(source, view)}": [png(frame) for frame in frames]
+        for view, frames in episode.pixels.items()
     }
-    values |= {f"steps/observation/{name}": episode.state[:, part] for name, part in fields.items()}
+    for name, part in get_task(task).state_slices.items():
+        values[f"steps/observation/{state_feature(task, name)}"] = episode.state[:, part]
     return values | {
         "steps/observation/state": episode.state,
         "steps/action": padded(episode.action, 0),
@@ -132,52 +137,3 @@ def _example(episode: ExportEpisode, fields: dict[str, slice]) -> dict[str, np.n
         "steps/is_terminal": (step == rows - 1) & episode.terminated,
         "episode_index": np.array([episode.index]),
     }
-
-
-def _png(frame: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
-# -- bytes: the TFRecord framing and the protocol buffer tf.train.Example --------------------------
-
-
-def record(data: bytes) -> bytes:
-    """One TFRecord: length, its masked CRC-32C, the data, their masked CRC-32C."""
-    length = struct.pack("<Q", len(data))
-    return length + _masked_crc(length) + data + _masked_crc(data)
-
-
-def _masked_crc(data: bytes) -> bytes:
-    crc = google_crc32c.value(data)
-    return struct.pack("<I", (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF)
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 127:
-        out.append(value & 127 | 128)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
-
-
-def _field(number: int, data: bytes) -> bytes:
-    """A length-delimited field."""
-    return _varint(number << 3 | 2) + _varint(len(data)) + data
-
-
-def encode_example(features: dict[str, np.ndarray | Iterable[bytes]]) -> bytes:
-    """A tf.train.Example: lists of bytes, floats (float arrays) or integers (integer and boolean arrays), flattened."""
-    entries = b""
-    for name, value in features.items():
-        if not isinstance(value, np.ndarray):
-            feature = _field(1, b"".join(_field(1, item) for item in value))
-        elif value.dtype.kind == "f":
-            feature = _field(2, _field(1, value.astype("<f4").tobytes()))
-        else:
-            numbers = b"".join(_varint(int(number) & (2**64 - 1)) for number in value.ravel())
-            feature = _field(3, _field(1, numbers))
-        entries += _field(1, _field(1, name.encode()) + _field(2, feature))
-    return _field(1, entries)

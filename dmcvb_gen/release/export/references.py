@@ -1,0 +1,50 @@
+"""What a score of a task is measured against: a release and a subset in; the returns of random and of expert out."""
+
+from __future__ import annotations
+
+from dmcvb_gen.behaviours.policies.actor import random_policy
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
+from dmcvb_gen.behaviours.policies.policy_file import read_header
+from dmcvb_gen.behaviours.policies.simulate import simulate
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import FIXED
+from dmcvb_gen.readers.release import ReleaseReader
+from dmcvb_gen.store.manifest import SubsetRecord
+from dmcvb_gen.tasks import get_task
+
+RANDOM_EPISODES, SEED, NAMES = 10, 0, ("reference",)
+"""Episodes of uniform actions that are simulated where the release has none of its own."""
+
+
+def reference_returns(release: ReleaseReader, record: SubsetRecord) -> dict[str, float]:
+    """`ref_min_score` and `ref_max_score`: mean returns of random actions and of the expert; nothing if one is unknown.
+
+    Those of the release's own subsets of the same task and setting; else random actions are simulated, and the
+    package's expert says what it was measured to return.
+    """
+    low, high = (_own(release, record, level) for level in ("random", "expert"))
+    if record.setting != FIXED:  # its pairs of start and goal have returns of their own
+        low = _simulated(record.task) if low is None else low
+        high = _bundled(record.task) if high is None else high
+    return {} if low is None or high is None else {"ref_min_score": low, "ref_max_score": high}
+
+
+def _own(release: ReleaseReader, record: SubsetRecord, level: str) -> float | None:
+    for subset in release.subsets.values():
+        if (subset.task, subset.level, subset.setting) == (record.task, level, record.setting):
+            return float(subset.returns.mean())
+    return None
+
+
+def _simulated(task_id: str) -> float:
+    task = get_task(task_id)
+    found = simulate(task, [random_policy(task)], list(range(RANDOM_EPISODES)), SEED, (*NAMES, task_id))
+    return float(found.reward.astype("float64").sum(axis=1).mean())
+
+
+def _bundled(task_id: str) -> float | None:
+    try:
+        header = read_header(bundled_policies(task_id, "expert")[0])
+    except DmcvbError:
+        return None
+    return header.evaluation.mean if header.evaluation else None

@@ -1,0 +1,111 @@
+"""What LeRobot's layout promises, read with `datasets`, pyarrow and a video decoder (LeRobot itself: by script)."""
+
+from __future__ import annotations
+
+import json
+
+import datasets
+import imageio.v3 as iio
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.release.export import export
+
+
+@pytest.fixture(scope="module")
+def exported(stored, tmp_path_factory):
+    root = tmp_path_factory.mktemp("lerobot")
+    return {name: export(str(one.folder), "lerobot", root, [name])[0] for name, one in stored.items()}
+
+
+def keys(one):
+    return ["observation.image"] if len(one.views) == 1 else [f"observation.images.{view}" for view in one.views]
+
+
+def test_load_dataset_gives_pictures_and_vectors(exported, stored, tmp_path):
+    for name, folder in exported.items():
+        table = datasets.load_dataset(str(folder), split="train", cache_dir=str(tmp_path))
+        episodes = [stored[name].episode(index) for index in range(len(set(table["episode_index"])))]
+        assert len(table) == sum(length for length, _, _ in episodes)
+        row = 0
+        for length, values, terminated in episodes:
+            for step in (0, length - 1):
+                item = table[row + step]
+                for view, key in enumerate(keys(stored[name])):
+                    np.testing.assert_array_equal(np.asarray(item[key]), values["pixels"][step, view])
+                np.testing.assert_array_equal(np.float32(item["observation.state"]), values["state"][step])
+                np.testing.assert_array_equal(np.float32(item["action"]), values["action"][step])
+                assert item["next.done"] == (step == length - 1) and item["next.success"] == (
+                    item["next.done"] and terminated
+                )
+            row += length
+
+
+def test_an_episode_is_a_row_group_and_statistics_have_quantiles(exported, stored):
+    name = "ant-maze-tiny/random/hidden"
+    folder, episodes = exported[name], [stored[name].episode(index) for index in range(2)]
+    file = pq.ParquetFile(folder / "data/chunk-000/file-000.parquet")
+    assert [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)] == [e[0] for e in episodes]
+    info = json.loads((folder / "meta/info.json").read_text())
+    state = info["features"]["observation.state"]
+    assert len(state["names"]) == state["shape"][0] == 167 and state["names"][1] == "target_position.0"
+    assert len(info["features"]["action"]["names"]) == 8 and info["video_path"] is None
+    rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    for (length, values, _), row in zip(episodes, rows, strict=True):
+        found = row["stats/action/q10"]
+        np.testing.assert_allclose(found, np.quantile(values["action"].astype(np.float64), 0.1, axis=0), rtol=1e-6)
+        top = values["pixels"][:length, 0].reshape(-1, 3) / 255
+        np.testing.assert_allclose(np.ravel(row["stats/observation.images.top/q99"]), np.quantile(top, 0.99, axis=0))
+    assert {"q01", "q10", "q50", "q90", "q99"} <= set(json.loads((folder / "meta/stats.json").read_text())["action"])
+
+
+def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):
+    release = str(stored["ant-maze-tiny/random/hidden"].folder)
+    [folder] = export(release, "lerobot", tmp_path / "all", ["*/hidden", "*/fixed"], merge=True)
+    assert folder == tmp_path / "all"
+    info = json.loads((folder / "meta/info.json").read_text())
+    lengths = [stored[f"ant-maze-tiny/random/{goal}"].episode(i)[0] for goal in ("hidden", "fixed") for i in range(2)]
+    assert info["total_episodes"] == 4 and info["total_frames"] == sum(lengths)
+    table = pq.read_table(folder / "data/chunk-000/file-000.parquet")
+    np.testing.assert_array_equal(table["index"], np.arange(sum(lengths)))
+    with pytest.raises(DmcvbError, match="--merge is not for npz; it is for lerobot"):
+        export(release, "npz", tmp_path / "x", merge=True)
+
+
+def test_videos_have_a_frame_a_step(stored, tmp_path):
+    name = "ant-maze-tiny/random/hidden"
+    [folder] = export(str(stored[name].folder), "lerobot", tmp_path, [name], video=True)
+    info = json.loads((folder / "meta/info.json").read_text())
+    rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    episodes = [stored[name].episode(index) for index in range(2)]
+    for view, key in enumerate(keys(stored[name])):
+        assert info["features"][key]["dtype"] == "video"
+        frames = iio.imread(
+            folder / info["video_path"].format(video_key=key, chunk_index=0, file_index=0), plugin="FFMPEG"
+        )
+        assert len(frames) == sum(length for length, _, _ in episodes)
+        start = 0
+        for row, (length, values, _) in zip(rows, episodes, strict=True):
+            assert row[f"videos/{key}/from_timestamp"] == start / info["fps"]
+            assert row[f"videos/{key}/to_timestamp"] == (start + length) / info["fps"]
+            painted = values["pixels"][:length, view].astype(float)
+            assert np.abs(frames[start : start + length] - painted).mean() < 12  # 4:2:0 of 16 pixels
+            start += length
+
+
+def test_odd_sizes_make_no_videos(stored, tmp_path, monkeypatch):
+    one = stored["walker-walk/random/static"]
+    from dmcvb_gen.release.export import lerobot
+
+    monkeypatch.setattr(lerobot, "_shape", lambda source: ())
+    real = lerobot._Layout.__init__
+
+    def odd(self, sources, video):
+        object.__setattr__(sources[0].subset, "record", sources[0].subset.record.model_copy(update={"size": 17}))
+        real(self, sources, video)
+
+    monkeypatch.setattr(lerobot._Layout, "__init__", odd)
+    with pytest.raises(StoreError, match="even size"):
+        export(str(one.folder), "lerobot", tmp_path, [one.name], video=True)
