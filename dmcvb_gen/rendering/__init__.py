@@ -8,7 +8,7 @@ from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks.base import Task
 
-RENDERERS = ("warp", "opengl")
+RENDERERS = ("native", "warp", "opengl")
 
 
 def make_renderer(
@@ -33,7 +33,9 @@ def make_renderer(
     Raises:
       UnknownNameError, RenderingError: no such renderer, or it cannot start here.
     """
-    if name == "warp":
+    if name == "native":
+        from dmcvb_gen.rendering.native import NativeRenderer as chosen
+    elif name == "warp":
         from dmcvb_gen.rendering.warp import WarpRenderer as chosen
     elif name == "opengl":
         from dmcvb_gen.rendering.opengl import OpenglRenderer as chosen

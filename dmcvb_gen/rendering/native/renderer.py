@@ -1,0 +1,215 @@
+"""The renderer 'native': physics states and labels in, pictures out; batches, looks, skies around `frame`."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import math
+import time
+from collections.abc import Iterator, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.labels import Exogenous
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
+from dmcvb_gen.rendering.native import frame as frame_module
+from dmcvb_gen.rendering.native import records as columns
+from dmcvb_gen.rendering.native.frame import Frames, Still, make_work
+from dmcvb_gen.rendering.native.scene import PLANE, Scene, look_of, scene_of
+from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
+from dmcvb_gen.rendering.native.visibility import sample_tables
+from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
+
+VERSION = 1
+"""Goes up when pictures change."""
+SAMPLES = 4
+CHUNK = 256
+"""Frames whose poses are held at a time."""
+
+_log = logging.getLogger(__name__)
+
+
+@functools.cache
+def _entry(name: str):
+    """A compiled entry point of `frame`, kept on disk by the digest of all of this package's source."""
+    source = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    digest = int.from_bytes(hashlib.sha256(source).digest()[:6], "little") | 1
+    return getattr(frame_module, name)(digest)
+
+
+def _call(name: str, *arguments) -> None:
+    """Call an entry point; say so where it is compiled first."""
+    entry = _entry(name)
+    if entry.signatures:
+        entry(*arguments)
+        return
+    started = time.perf_counter()
+    entry(*arguments)
+    seconds = time.perf_counter() - started
+    if sum(entry.stats.cache_misses.values()):
+        _log.info("compiled the painter in %.0f s; later runs read it from %s", seconds, entry.stats.cache_path)
+
+
+class NativeRenderer(Renderer):
+    """See the package and `Renderer`. One thread at a time may use a renderer; several renderers work side by side."""
+
+    name = "native"
+
+    def __init__(
+        self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
+    ):
+        check_size(size)
+        if device != "cpu":
+            raise RenderingError(f"renderer 'native' paints on the CPU, not on {device!r}; use --device cpu or warp")
+        if samples not in (None, SAMPLES):
+            raise RenderingError(f"renderer 'native' takes {SAMPLES} samples a pixel, not {samples}; give none")
+        self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
+        self._scene = scene_of(task)
+        self._angles = np.radians(task.model.cam_fovy[camera_ids(task)]).tolist()
+        finest = min(_finest_level(size, angle) for angle in self._angles)
+        self._textures = Textures(task.model, backgrounds, finest)
+        self._textures.make_ready(self._scene.sky)
+        self._looks: dict[int, int] = {}
+        self._records = np.zeros((0, len(self._scene.geoms), columns.RGB + 3))
+        fields = ["geom_xpos", "geom_xmat"] + (["light_xpos", "light_xdir"] if self._scene.lamp >= 0 else [])
+        self._kinematics = Kinematics(task, fields)
+        self._work = make_work(len(self._scene.geoms), size, self._scene.lines, columns.WIDTH)
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "version": VERSION,
+            "samples": SAMPLES,
+            "floor_alpha": self.floor_alpha,
+            "mujoco": metadata.version("mujoco"),
+        }
+
+    def render(
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
+    ) -> np.ndarray:
+        indices = check_frames(self.task, physics, exogenous, views)
+        out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
+        for rows, poses in self._parts(physics, exogenous):
+            picture = np.empty((len(rows), self.size, self.size, 3), np.uint8)
+            for column, view in enumerate(indices):
+                frames, still = self._frames(poses, exogenous[rows], view), self._still(view)
+                _call("painter", *still, *frames, *self._work, bool(hide_goal), picture)
+                out[rows, column] = picture
+        return out
+
+    def render_labels(
+        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
+        indices = check_frames(self.task, physics, exogenous, views)
+        shape = (len(physics), len(indices), self.size, self.size)
+        depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
+        numbers = np.append(self._scene.geoms, -1).astype(np.int16)
+        for rows, poses in self._parts(physics, exogenous):
+            deep = np.empty((len(rows), self.size, self.size), np.float32)
+            geom = np.empty((len(rows), self.size, self.size), np.int16)
+            for column, view in enumerate(indices):
+                frames, still = self._frames(poses, exogenous[rows], view), self._still(view, centers=True)
+                _call("labeler", *still, *frames, *self._work, deep, geom)
+                depth[rows, column], segmentation[rows, column] = deep, numbers[geom]
+        return {"depth": depth, "segmentation": segmentation}
+
+    # -- arguments ----------------------------------------------------------------------------
+
+    def _parts(self, physics: np.ndarray, exogenous: Exogenous) -> Iterator[tuple[np.ndarray, dict]]:
+        """Frames to paint together, with their poses: never more backgrounds than there is room for."""
+        order = np.lexsort((exogenous.background_frame, exogenous.background_video))
+        keys = np.stack([exogenous.background_video[order], exogenous.background_frame[order]], axis=1)
+        ordinal = np.concatenate([[0], np.cumsum((keys[1:] != keys[:-1]).any(axis=1))])
+        first = 0
+        while first < len(order):
+            past = int(np.searchsorted(ordinal, ordinal[first] + max(self._textures.slots, 1)))
+            rows = np.sort(order[first : min(past, first + CHUNK)])
+            yield rows, self._kinematics(physics[rows])
+            first += len(rows)
+
+    def _frames(self, poses: dict[str, np.ndarray], exogenous: Exogenous, view: int) -> Frames:
+        scene, count = self._scene, len(exogenous)
+        backgrounds = zip(exogenous.background_video.tolist(), exogenous.background_frame.tolist(), strict=True)
+        sky = [self._textures.background(*key) if key[0] >= 0 else scene.sky for key in backgrounds]
+        lamp = np.zeros((count, 6))
+        if scene.lamp >= 0:
+            lamp[:, :3], lamp[:, 3:] = poses["light_xpos"][:, scene.lamp], poses["light_xdir"][:, scene.lamp]
+        return Frames(
+            center=np.ascontiguousarray(poses["geom_xpos"][:, scene.geoms]),
+            turn=np.ascontiguousarray(poses["geom_xmat"][:, scene.geoms].reshape(count, -1, 3, 3)),
+            eye=np.ascontiguousarray(exogenous.camera_position[:, view], np.float64),
+            axes=np.ascontiguousarray(matrices(exogenous.camera_quaternion[:, view].astype(np.float64))),
+            lamp=lamp,
+            rgb=np.ascontiguousarray(exogenous.material_rgb, np.float64),
+            look=np.array([self._look(style) for style in exogenous.style.tolist()], np.int64),
+            sky=np.array(sky, np.int64),
+        )
+
+    def _look(self, style: int) -> int:
+        """Row of a style's records, its textures made ready."""
+        if style not in self._looks:
+            scene, look = self._scene, look_of(self.task, self._scene, style, self.floor_alpha)
+            for texture in np.unique(look.texture).tolist():
+                self._textures.make_ready(texture)
+            rec = np.zeros(self._records.shape[1:])
+            rec[:, columns.KIND], rec[:, columns.SIZE : columns.SIZE + 3] = scene.kind, scene.size
+            rec[:, columns.GOAL], rec[:, columns.BOXED] = scene.goal, _boxed(self.task, scene)
+            rec[:, columns.MATERIAL], rec[:, columns.OWN_OPACITY] = look.material, look.color[:, 3]
+            rec[:, columns.TEXTURE], rec[:, columns.REPEAT : columns.REPEAT + 2] = look.texture, look.repeat
+            rec[:, columns.SHARE], rec[:, columns.EXPONENT] = look.shine.T
+            rec[:, columns.RGB : columns.RGB + 3] = look.color[:, :3]
+            self._records = np.concatenate([self._records, rec[None]])
+            self._looks[style] = len(self._looks)
+        return self._looks[style]
+
+    def _still(self, view: int, centers: bool = False) -> Still:
+        """The constant arguments of a view; with `centers` all samples lie in the middle of their pixels."""
+        scene, angle = self._scene, self._angles[view]
+        step = 2 * math.tan(angle / 2) / self.size
+        xs, ys, offsets = sample_tables(self.size, step, centers)
+        constants = np.concatenate(
+            [
+                [step, scene.near, scene.far, scene.mirror, scene.reflectance],
+                scene.headlight,
+                scene.spot,
+                scene.cone,
+                scene.lines,
+            ]
+        )
+        return Still(
+            looks=self._records,
+            constants=constants,
+            boxes=scene.boxes,
+            grid=scene.grid,
+            texels=self._textures.texels,
+            table=self._textures.table,
+            xs=xs,
+            ys=ys,
+            offsets=offsets,
+        )
+
+
+def _finest_level(size: int, angle: float) -> int:
+    """The finest level of a sky that pictures of a size can show: the smallest footprint is at a rolled corner."""
+    half = math.tan(angle / 2)
+    corner = 1 + 2 * half * half  # squared length of the ray through the corner
+    rho = 0.5 * SKY_WIDTH * (2 * half / size) / corner / math.sqrt(2)
+    return max(int(math.floor(math.log2(rho) - 0.25)), 0) if rho > 1 else 0
+
+
+def _boxed(task: Task, scene: Scene) -> np.ndarray:
+    """(geom,) bool: planes that lie on a side of a box."""
+    place = task.model.geom_pos[scene.geoms][:, None]
+    touching = (scene.boxes[None, :, :3] - 1e-6 <= place) & (place <= scene.boxes[None, :, 3:] + 1e-6)
+    return (scene.kind == PLANE) & touching.all(axis=2).any(axis=1)

@@ -1,0 +1,162 @@
+"""Pictures in, mip levels as one flat buffer of texels out; a texel is a uint32, red in its lowest byte.
+
+The levels are those that Mesa's `glGenerateMipmap` makes: each side halved and rounded down, each texel the
+bilinear sample of the level before. Textures in sRGB are kept in linear light, as OpenGL samples them.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.rendering.native.records import FACES, FIRST, LEVELS
+
+SKY_WIDTH = 800
+"""Texels a side of a background on the sky (the skybox's own width, Distracting Control Suite)."""
+SKY_BYTES = 64 << 20
+"""Memory for the skies of a renderer; the least recently seen make room."""
+
+
+def level_sizes(width: int, height: int) -> list[tuple[int, int]]:
+    """(width, height) of every level, down to one texel."""
+    sizes = [(width, height)]
+    while max(sizes[-1]) > 1:
+        sizes.append(tuple(max(1, side // 2) for side in sizes[-1]))
+    return sizes
+
+
+def _taps(old: int, new: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each of `new` texels along a side: the two old ones it lies between, and the second one's weight."""
+    center = (np.arange(new) + 0.5) * old / new - 0.5
+    first = np.floor(center).astype(int)
+    return np.clip(first, 0, old - 1), np.clip(first + 1, 0, old - 1), (center - first).astype(np.float32)
+
+
+def halved(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(h, w, channel) float32 -> (height, width, channel) float32, the next level before rounding."""
+    top, bottom, down = _taps(picture.shape[0], height)
+    left, right, across = _taps(picture.shape[1], width)
+    down, across = down[:, None, None], across[None, :, None]
+    rows = picture[top] * (1 - down) + picture[bottom] * down
+    return rows[:, left] * (1 - across) + rows[:, right] * across
+
+
+def _linear_light(values: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 255] as linear light in [0, 1]."""
+    value = values / np.float32(255)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _display(linear: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] as sRGB in [0, 255]."""
+    return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+_LINEAR_OF = _linear_light(np.arange(256, dtype=np.float32)).astype(np.float32)
+
+
+def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) -> list[np.ndarray]:
+    """(h, w, 3) uint8 -> its mip levels, each uint8; sRGB ones as linear light in [0, 255]."""
+    out, current = [], picture
+    for width, height in level_sizes(picture.shape[1], picture.shape[0])[:count]:
+        if out:
+            source = _LINEAR_OF[current] if srgb else current.astype(np.float32)
+            smaller = halved(source, width, height)
+            current = np.floor((_display(smaller) if srgb else smaller) + 0.5).astype(np.uint8)
+        out.append(np.rint(255 * _LINEAR_OF[current]).astype(np.uint8) if srgb else current)
+    return out
+
+
+def packed(picture: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8 -> (h * w,) uint32 texels."""
+    wide = picture.reshape(-1, 3).astype(np.uint32)
+    return wide[:, 0] | wide[:, 1] << np.uint32(8) | wide[:, 2] << np.uint32(16)
+
+
+class Textures:
+    """The textures of a model and the skies of the backgrounds, each made ready when it is first asked for.
+
+    Args:
+      model: the MuJoCo model; its own sky counts as a texture of six faces.
+      backgrounds: the videos that labels may name, or None.
+      finest: the finest level of a background that pictures can show.
+
+    Attributes:
+      texels: (texel,) uint32, all levels of all textures.
+      table: (texture, column) int64, where they are: see `records.FIRST`. Backgrounds come after the model's own.
+      slots: how many backgrounds there is room for.
+    """
+
+    def __init__(self, model: mujoco.MjModel, backgrounds, finest: int):
+        self._model, self._backgrounds, self._finest = model, backgrounds, finest
+        self._ready: set[int] = set()
+        self._slot: OrderedDict[tuple[int, int], int] = OrderedDict()
+        cubes = model.tex_type != mujoco.mjtTexture.mjTEXTURE_2D
+        textures = [
+            (level_sizes(width, width if cube else height), 6 if cube else 1, 0)
+            for width, height, cube in zip(
+                model.tex_width.tolist(), model.tex_height.tolist(), cubes.tolist(), strict=True
+            )
+        ]
+        sky = level_sizes(SKY_WIDTH, SKY_WIDTH), 1, finest
+        each = 4 * sum(width * height for width, height in sky[0][finest:])
+        self.slots = int(np.clip(SKY_BYTES // each, 8, 256)) if backgrounds is not None else 0
+        textures += [sky] * self.slots
+        most = max((len(sizes) for sizes, _, _ in textures), default=0)
+        self.table = np.zeros((max(len(textures), 1), FIRST + 3 * most), np.int64)
+        total = 0
+        for row, (sizes, faces, first) in zip(self.table, textures, strict=False):
+            row[LEVELS], row[FACES] = len(sizes), faces
+            for level, (width, height) in enumerate(sizes):
+                row[FIRST + 3 * level : FIRST + 3 * level + 3] = total, width, height
+                total += faces * width * height if level >= first else 0
+        self.texels = np.empty(max(total, 1), np.uint32)  # memory is taken when a texture is written
+
+    def make_ready(self, index: int) -> None:
+        """Build the levels of one of the model's textures, once."""
+        if index < 0 or index in self._ready:
+            return
+        self._ready.add(index)
+        faces = int(self.table[index, FACES])
+        # OpenGL reads cubes as they are.
+        srgb = faces == 1 and self._model.tex_colorspace[index] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
+        for face, picture in enumerate(self._faces(index, faces)):
+            for level, smaller in enumerate(levels(picture, bool(srgb))):
+                self._write(index, level, smaller, face)
+
+    def background(self, video: int, frame: int) -> int:
+        """The texture of a video's frame, made now if need be; stays for the next `slots` - 1 others."""
+        key = video, frame
+        if key not in self._slot:
+            if self._backgrounds is None:
+                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
+            full = len(self._slot) >= self.slots
+            texture = self._slot.popitem(last=False)[1] if full else self._model.ntex + len(self._slot)
+            picture = Image.fromarray(self._backgrounds.frames(video)[frame])
+            wide = np.asarray(picture.resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR))
+            for level, smaller in enumerate(levels(wide)):
+                if level >= self._finest:
+                    self._write(texture, level, smaller)
+            self._slot[key] = texture
+        self._slot.move_to_end(key)
+        return self._slot[key]
+
+    def _write(self, texture: int, level: int, picture: np.ndarray, face: int = 0) -> None:
+        texels = packed(picture)
+        first = int(self.table[texture, FIRST + 3 * level]) + face * len(texels)
+        self.texels[first : first + len(texels)] = texels
+
+    def _faces(self, index: int, faces: int) -> list[np.ndarray]:
+        model = self._model
+        height, width, channels = (int(a[index]) for a in (model.tex_height, model.tex_width, model.tex_nchannel))
+        if channels not in (3, 4):
+            raise RenderingError(f"texture {model.texture(index).name!r} is not RGB; use --renderer warp")
+        address = int(model.tex_adr[index])
+        data = model.tex_data[address : address + height * width * channels].reshape(height, width, channels)[..., :3]
+        if faces == 1:
+            return [data]
+        return [data] * 6 if height == width else [data[face * width : (face + 1) * width] for face in range(6)]

@@ -1,0 +1,239 @@
+"""Geoms in the camera's frame in, the nearest geom of every sample out.
+
+Each pixel has four samples, side by side in memory, where OpenGL on a CPU has them. The ray of a sample is
+d = (x, y, -1) in the camera's frame (x right, y up), and what is kept of a hit is the inverse of its depth: larger
+is nearer, a plane's is affine in (x, y), and no kernel needs a division.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from dmcvb_gen.rendering.native.records import AXIS, FUNCTIONS, PLACE, SIZE, TURN
+from dmcvb_gen.rendering.native.sampling import part
+
+SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
+"""Where the four samples lie in a pixel: to the right and down."""
+NOTHING = 255
+"""The number in place of a geom where there is none: the sky."""
+
+
+def sample_tables(size: int, step: float, centers: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ray coordinates of all samples: x of (4 * column + sample), y of each row's upper edge, y offset as x.
+
+    Args:
+      step: of x and y from pixel to pixel.
+      centers: all samples in the middle of their pixels.
+    """
+    right, down = np.full((2, 4), 0.5) if centers else np.array(SAMPLES).T
+    x = ((np.arange(size)[:, None] + right) * step - size * step / 2).ravel()
+    y = size * step / 2 - np.arange(size) * step
+    return x.astype(np.float32), y.astype(np.float32), np.tile(-down * step, size).astype(np.float32)
+
+
+@part
+def slopes_of_ball(side, depth, radius):
+    """Least and greatest side / depth of the lines from the origin that touch a disc in the plane (side, depth)."""
+    square = depth * depth - radius * radius
+    if depth <= radius * 1.0001:
+        return -1e9, 1e9
+    root = radius * math.sqrt(side * side + square)
+    return (side * depth - root) / square, (side * depth + root) / square
+
+
+@part
+def screen_box(left, right, low, high, size, step):
+    """Columns and rows (first, past the last) of the pixels that slopes in these ranges touch."""
+    half = 0.5 * size
+    first_column = int(math.floor(min(max(left / step + half - 0.01, 0.0), size)))
+    past_column = int(math.ceil(min(max(right / step + half + 0.01, 0.0), size)))
+    first_row = int(math.floor(min(max(half - high / step - 0.01, 0.0), size)))
+    past_row = int(math.ceil(min(max(half - low / step + 0.01, 0.0), size)))
+    return first_column, past_column, first_row, past_row
+
+
+@part
+def box_of_body(rec, g, place, axis, half, size, step):
+    """Pixels that a ball (`half` 0) or capsule can touch; none if it is behind the camera.
+
+    Args:
+      place, axis: the columns of `rec` where its center and its axis are.
+    """
+    left, right, low, high = 1e9, -1e9, 1e9, -1e9
+    radius, behind = rec[g, SIZE], True
+    for end in range(2):
+        reach = half if end == 0 else -half
+        x, y = rec[g, place] + reach * rec[g, axis], rec[g, place + 1] + reach * rec[g, axis + 1]
+        depth = -(rec[g, place + 2] + reach * rec[g, axis + 2])
+        behind = behind and depth <= -radius
+        least, most = slopes_of_ball(x, depth, radius)
+        left, right = min(left, least), max(right, most)
+        least, most = slopes_of_ball(y, depth, radius)
+        low, high = min(low, least), max(high, most)
+    if behind:
+        return 0, 0, 0, 0
+    return screen_box(left, right, low, high, size, step)
+
+
+@part
+def draw_sphere(inverse, number, xs, ys, offsets, c0, c1, r0, r1, px, py, pz, radius, nearest, geom):
+    """Put a ball into the buffers, in columns c0 to c1 and rows r0 to r1.
+
+    Args:
+      px, py, pz: its center.
+      nearest: the largest inverse depth drawn.
+    """
+    inside = px * px + py * py + pz * pz - radius * radius
+    if inside <= 0.0:
+        return  # its back faces are not drawn
+    ex, ey, ez = np.float32(px), np.float32(py), np.float32(pz)
+    rr, unit, zero, one = np.float32(radius * radius), np.float32(1.0 / inside), np.float32(0), np.float32(1)
+    limit = np.float32(nearest)
+    first, past, width = 4 * c0, 4 * c1, ys.size
+    xr, dr = xs[first:past], offsets[first:past]
+    for row in range(r0, r1):
+        top = ys[row]
+        at = 4 * width * row
+        wr, nr = inverse[at + first : at + past], number[at + first : at + past]
+        for i in range(xr.size):
+            x, y = xr[i], top + dr[i]
+            ux, uy, uz = -ey - ez * y, ez * x + ex, ex * y - ey * x
+            square = rr * (one + x * x + y * y) - (ux * ux + uy * uy + uz * uz)
+            along = ex * x + ey * y - ez
+            w = (along + math.sqrt(max(square, zero))) * unit
+            seen = (square > zero) & (along > zero) & (w > wr[i]) & (w < limit)
+            wr[i] = w if seen else wr[i]
+            nr[i] = geom if seen else nr[i]
+
+
+@part
+def draw_capsule(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, place, axis, nearest, geom):
+    """Put a capsule into the buffers; see `draw_sphere` and `box_of_body`."""
+    zero, one = np.float32(0), np.float32(1)
+    radius, half = rec[g, SIZE], rec[g, SIZE + 1]
+    px, py, pz = rec[g, place], rec[g, place + 1], rec[g, place + 2]
+    dx, dy, dz = rec[g, axis], rec[g, axis + 1], rec[g, axis + 2]
+    ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
+    along_axis = px * dx + py * dy + pz * dz
+    mx, my, mz = py * dz - pz * dy, pz * dx - px * dz, px * dy - py * dx
+    moment = mx * mx + my * my + mz * mz - radius * radius
+    cx, cy, cz = np.float32(mx), np.float32(my), np.float32(mz)
+    rr, h, oa, limit = np.float32(radius * radius), np.float32(half), np.float32(along_axis), np.float32(nearest)
+    outside = moment > 0.0
+    unit = np.float32(1.0 / moment) if outside else zero
+    # The two ends' balls.
+    ux, uy, uz = np.float32(px + half * dx), np.float32(py + half * dy), np.float32(pz + half * dz)
+    lx, ly, lz = np.float32(px - half * dx), np.float32(py - half * dy), np.float32(pz - half * dz)
+    square_of_center = px * px + py * py + pz * pz + half * half - radius * radius
+    upper, lower = square_of_center + 2 * half * along_axis, square_of_center - 2 * half * along_axis
+    if not outside and (abs(along_axis) <= half or min(upper, lower) <= 0.0):
+        return  # the camera is inside
+    if upper <= 0.0 or lower <= 0.0:
+        return
+    upper_unit, lower_unit = np.float32(1.0 / upper), np.float32(1.0 / lower)
+    toward = along_axis < 0.0  # seen from inside the endless cylinder, the near end is this one
+    first, past, width = 4 * c0, 4 * c1, ys.size
+    xr, dr = xs[first:past], offsets[first:past]
+    for row in range(r0, r1):
+        top = ys[row]
+        at = 4 * width * row
+        wr, nr = inverse[at + first : at + past], number[at + first : at + past]
+        for i in range(xr.size):
+            x, y = xr[i], top + dr[i]
+            nx, ny, nz = y * az + ay, -ax - x * az, x * ay - y * ax  # d x axis
+            moment_along = cx * x + cy * y - cz
+            square = rr * (nx * nx + ny * ny + nz * nz) - moment_along * moment_along
+            w_side = (cx * nx + cy * ny + cz * nz + math.sqrt(max(square, zero))) * unit
+            place_along = ax * x + ay * y - az - w_side * oa  # times depth: along the axis
+            side = outside & (abs(place_along) <= h * w_side)
+            up = (place_along > zero) if outside else toward
+            ex, ey, ez = ux if up else lx, uy if up else ly, uz if up else lz
+            bx, by, bz = -ey - ez * y, ez * x + ex, ex * y - ey * x
+            ball = rr * (one + x * x + y * y) - (bx * bx + by * by + bz * bz)
+            along = ex * x + ey * y - ez
+            w_end = (along + math.sqrt(max(ball, zero))) * (upper_unit if up else lower_unit)
+            w = w_side if side else w_end
+            hit = (side & (square > zero)) | ((not side) & (ball > zero) & (along > zero))
+            seen = hit & (w > wr[i]) & (w < limit)
+            wr[i] = w if seen else wr[i]
+            nr[i] = geom if seen else nr[i]
+
+
+@part
+def draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, near, far, geom):
+    """Put a rectangle into the buffers, from its FUNCTIONS; `near` and `far`: the depths drawn."""
+    at = FUNCTIONS
+    a, b, c = np.float32(rec[g, at]), np.float32(rec[g, at + 1]), np.float32(rec[g, at + 2])
+    ua, ub, uc = np.float32(rec[g, at + 3]), np.float32(rec[g, at + 4]), np.float32(rec[g, at + 5])
+    va, vb, vc = np.float32(rec[g, at + 6]), np.float32(rec[g, at + 7]), np.float32(rec[g, at + 8])
+    least, most = np.float32(1.0 / far), np.float32(1.0 / near)
+    first, past, width = 4 * c0, 4 * c1, ys.size
+    xr, dr = xs[first:past], offsets[first:past]
+    for row in range(r0, r1):
+        top = ys[row]
+        at = 4 * width * row
+        wr, nr = inverse[at + first : at + past], number[at + first : at + past]
+        for i in range(xr.size):
+            x, y = xr[i], top + dr[i]
+            w = a * x + b * y + c
+            u, v = ua * x + ub * y + uc, va * x + vb * y + vc
+            seen = (w > wr[i]) & (w >= least) & (w <= most) & (abs(u) <= w) & (abs(v) <= w)
+            wr[i] = w if seen else wr[i]
+            nr[i] = geom if seen else nr[i]
+
+
+@part
+def plane_functions(rec, g):
+    """Fill a plane's FUNCTIONS: inverse depth, and its two coordinates over their half lengths times the inverse
+    depth, each as an affine function of the ray's (x, y). Gives whether the plane faces the camera."""
+    px, py, pz = rec[g, PLACE], rec[g, PLACE + 1], rec[g, PLACE + 2]
+    nx, ny, nz = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
+    toward = px * nx + py * ny + pz * nz
+    if toward == 0.0:
+        rec[g, FUNCTIONS : FUNCTIONS + 9] = 0.0
+        return False
+    a, b, c = nx / toward, ny / toward, -nz / toward
+    rec[g, FUNCTIONS], rec[g, FUNCTIONS + 1], rec[g, FUNCTIONS + 2] = a, b, c
+    for axis in range(2):
+        ex, ey, ez = rec[g, TURN + axis], rec[g, TURN + 3 + axis], rec[g, TURN + 6 + axis]
+        along, over = px * ex + py * ey + pz * ez, 1.0 / rec[g, SIZE + axis]
+        at = FUNCTIONS + 3 + 3 * axis
+        rec[g, at], rec[g, at + 1], rec[g, at + 2] = (
+            (ex - along * a) * over,
+            (ey - along * b) * over,
+            (-ez - along * c) * over,
+        )
+    return toward < 0.0
+
+
+@part
+def corner_of_plane(rec, g, corner):
+    """Side, height and depth of one of a rectangle's four corners, in turn."""
+    a = rec[g, SIZE] if corner == 1 or corner == 2 else -rec[g, SIZE]
+    b = rec[g, SIZE + 1] if corner == 2 or corner == 3 else -rec[g, SIZE + 1]
+    return (
+        rec[g, PLACE] + a * rec[g, TURN] + b * rec[g, TURN + 1],
+        rec[g, PLACE + 1] + a * rec[g, TURN + 3] + b * rec[g, TURN + 4],
+        -(rec[g, PLACE + 2] + a * rec[g, TURN + 6] + b * rec[g, TURN + 7]),
+    )
+
+
+@part
+def box_of_plane(rec, g, near, size, step):
+    """Pixels that a rectangle can touch: the outline of its corners, cut off at the near plane."""
+    left, right, low, high = 1e9, -1e9, 1e9, -1e9
+    for corner in range(4):
+        x, y, depth = corner_of_plane(rec, g, corner)
+        next_x, next_y, next_depth = corner_of_plane(rec, g, (corner + 1) & 3)
+        if depth >= near:
+            left, right = min(left, x / depth), max(right, x / depth)
+            low, high = min(low, y / depth), max(high, y / depth)
+        if (depth >= near) != (next_depth >= near):
+            share = (near - depth) / (next_depth - depth)
+            cut_x, cut_y = (x + share * (next_x - x)) / near, (y + share * (next_y - y)) / near
+            left, right, low, high = min(left, cut_x), max(right, cut_x), min(low, cut_y), max(high, cut_y)
+    if left > right:
+        return 0, 0, 0, 0
+    return screen_box(left, right, low, high, size, step)
