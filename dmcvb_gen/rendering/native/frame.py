@@ -1,4 +1,4 @@
-"""One frame's poses in, its picture out: the nearest surface of all samples first, then one shading a pixel and surface."""
+"""One frame's poses in, its picture out: what each sample shows first, then one shading a pixel and surface."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from dmcvb_gen.rendering.native.records import (
     BOXED,
     CONE,
     EYE,
-    FAR,
     GOAL,
     KIND,
     LAMP,
@@ -36,8 +35,8 @@ from dmcvb_gen.rendering.native.records import (
     WINDOW,
 )
 from dmcvb_gen.rendering.native.sampling import part
-from dmcvb_gen.rendering.native.scene import CAPSULE, PLANE
-from dmcvb_gen.rendering.native.shading import OPAQUE, shade_body, shade_plane, shade_sky
+from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
+from dmcvb_gen.rendering.native.shading import shade_body, shade_plane, shade_sky
 from dmcvb_gen.rendering.native.visibility import (
     NOTHING,
     box_of_body,
@@ -204,7 +203,7 @@ def draw_flat(inverse, number, xs, ys, offsets, k, rec, g):
     """Draw a plane."""
     c0, c1, r0, r1 = box_of_plane(rec, g, k[NEAR], ys.size, k[STEP])
     if c0 < c1 and r0 < r1:
-        draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, k[NEAR], k[FAR], np.uint8(g))
+        draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, k, rec, g, np.uint8(g))
 
 
 @part
@@ -358,6 +357,7 @@ def label_frames(
     k[: constants.size] = constants
     for f in range(look.size):
         pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
+        pose_camera(k, eye, axes, lamp, sky, f)
         rec[:, OWN_OPACITY] = 1.0 / BACK_OF_PLANE
         draw_front(inverse, number, xs, ys, offsets, k, rec, False, False)
         for row in range(ys.size):

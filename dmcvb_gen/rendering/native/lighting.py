@@ -14,9 +14,12 @@ from dmcvb_gen.rendering.native.records import (
     BOUNDS,
     CONE,
     EXPONENT,
+    EYE,
+    HEADLIGHT,
     KIND,
     LAMP,
     LINES,
+    OPACITY,
     PLACE,
     RGB,
     SHADOW,
@@ -27,7 +30,7 @@ from dmcvb_gen.rendering.native.records import (
     WINDOW,
 )
 from dmcvb_gen.rendering.native.sampling import part
-from dmcvb_gen.rendering.native.scene import CAPSULE, PLANE
+from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
 from dmcvb_gen.rendering.native.visibility import slopes_of_ball
 
 
@@ -221,7 +224,11 @@ def cone_slope(cosine, down):
 
 @part
 def light_vertices(k, rec, grid, vertices, g):
-    """Fill WINDOW, and `vertices` (vertex, vertex, 3) in it, with the lamp's color on plane g."""
+    """Fill WINDOW, and `vertices` (vertex, vertex, 3) in it, with the lamp's color on plane g.
+
+    An opaque plane is lit in two passes; on one that is seen through both lights are added before they are cut at 1.
+    """
+    together = rec[g, OPACITY] < OPAQUE
     dx, dy, dz = k[LAMP] - rec[g, PLACE], k[LAMP + 1] - rec[g, PLACE + 1], k[LAMP + 2] - rec[g, PLACE + 2]
     nx, ny, nz = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
     height = dx * nx + dy * ny + dz * nz
@@ -242,8 +249,14 @@ def light_vertices(k, rec, grid, vertices, g):
             py = rec[g, PLACE + 1] + grid[0, i] * rec[g, TURN + 3] + grid[1, j] * rec[g, TURN + 4]
             pz = rec[g, PLACE + 2] + grid[0, i] * rec[g, TURN + 6] + grid[1, j] * rec[g, TURN + 7]
             factor, diffuse, specular = lamp_terms(k, LAMP, px, py, pz, nx, ny, nz, exponent)
+            head, head_specular = headlight_terms(k, EYE, px, py, pz, nx, ny, nz, exponent)
             for c in range(3):
-                vertices[i, j, c] = min(lit(k, SPOT, c, rec[g, RGB + c], factor, diffuse, specular * share), 1.0)
+                own = rec[g, RGB + c]
+                color = min(lit(k, SPOT, c, own, factor, diffuse, specular * share), 1.0)
+                if together:
+                    first = min(lit(k, HEADLIGHT, c, own, 1.0, head, head_specular * share), 1.0)
+                    color = min(color, 1.0 - first)
+                vertices[i, j, c] = color
 
 
 @part

@@ -40,15 +40,16 @@ HEADLIGHT = 5  # 9: ambient, diffuse, specular RGB
 SPOT = 14  # 9: the lamp's
 CONE = 23  # 3: cosine of the cut-off angle (0: no lamp), exponent, tangent of the shadow map's half angle
 LINES = 26  # 2: vertices of the lit plane along its axes
+HORIZON = 28
 # what a frame says
-EYE = 28  # 3: direction of the headlight's light
-LAMP = 31  # 6: position, direction
-MIRRORED = 37  # 9: EYE and LAMP mirrored
-SHADOW = 46  # 9: right, up and forward directions of the shadow map
-WINDOW = 55  # 4: the vertices (first, past the last; two axes) that the lamp's cone reaches
-VIEW = 59  # 9: the camera's axes in the world, columns right, up, back
-SKY = 68  # texture of the sky, -1: none
-LENGTH = 69
+EYE = 29  # 3: direction of the headlight's light
+LAMP = 32  # 6: position, direction
+MIRRORED = 38  # 9: EYE and LAMP mirrored
+SHADOW = 47  # 9: right, up and forward directions of the shadow map
+WINDOW = 56  # 4: the vertices (first, past the last; two axes) that the lamp's cone reaches
+VIEW = 60  # 9: the camera's axes in the world, columns right, up, back
+SKY = 69  # texture of the sky, -1: none
+LENGTH = 70
 
 # -- columns of the table of textures (texture, ...), int64
 LEVELS = 0

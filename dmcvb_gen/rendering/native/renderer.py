@@ -185,6 +185,7 @@ class NativeRenderer(Renderer):
                 scene.spot,
                 scene.cone,
                 scene.lines,
+                [scene.horizon],
             ]
         )
         return Still(

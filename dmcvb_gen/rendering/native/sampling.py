@@ -60,7 +60,7 @@ def clamped(coordinate, size):
 def blend_of_four(texels, top, bottom, left, right, across, down):
     """Red and blue (in the halves of one integer), and green, of four texels, times 65536."""
     a, b, all_ = np.uint64(across), np.uint64(down), np.uint64(256)
-    mask, eight = np.uint64(0xFF00FF), np.uint64(8)
+    eight = np.uint64(8)
     one, two = np.uint64(texels[top + left]), np.uint64(texels[top + right])
     three, four = np.uint64(texels[bottom + left]), np.uint64(texels[bottom + right])
     low = np.uint64(0xFF)
@@ -163,7 +163,7 @@ def cube_level(texels, table, texture, level, face, s, t):
 
 @part
 def sample_cube(texels, table, texture, x, y, z, ux, uy, uz, vx, vy, vz):
-    """Color of a cube map in direction (x, y, z), which changes by u from pixel to pixel along a row, v along a column."""
+    """Color of a cube map in direction (x, y, z), changing by u from pixel to pixel in a row, by v upwards."""
     face, s, t, major = cube_face(x, y, z)
     over = 1.0 / major
     s, t = s * over, t * over

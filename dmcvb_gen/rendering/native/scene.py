@@ -12,10 +12,14 @@ from dmcvb_gen.tasks.base import Task
 
 PLANE, SPHERE, CAPSULE = 0, 2, 3
 """MuJoCo's numbers of the kinds of geoms painted here."""
+OPAQUE = 0.995
+"""OpenGL's border between opaque and blended, as MuJoCo draws it."""
 MAX_GEOMS = 250
 """Geoms are numbered in a byte a sample; the sky takes one number more."""
 SHOWN_GROUPS = 3
 """MuJoCo shows the geom groups 0, 1 and 2."""
+SKY_DISTANCE = 0.7
+"""MuJoCo draws the sky on an upright cylinder around the eye, of this share of the largest depth."""
 _OWN_COLOR = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 """A geom of this color takes its material's."""
 _MAX_GRID = 200
@@ -61,7 +65,8 @@ class Scene:
       lines: (2,) int64, how many there are along each axis.
       boxes: (box, 6) float64, lowest and highest corner of the solid boxes behind walls (not drawn themselves).
       sky: texture of the sky, or -1.
-      near, far: (clipping) distances, meters.
+      near, far: depths between which things are drawn, meters.
+      horizon: how far from the eye, in the world's horizontal plane, the sky hides what is beyond, meters.
     """
 
     geoms: np.ndarray
@@ -81,6 +86,7 @@ class Scene:
     sky: int
     near: float
     far: float
+    horizon: float
 
 
 def scene_of(task: Task) -> Scene:
@@ -121,6 +127,7 @@ def scene_of(task: Task) -> Scene:
         sky=int(skies[0]) if len(skies) else -1,
         near=float(model.vis.map.znear * model.stat.extent),
         far=float(model.vis.map.zfar * model.stat.extent),
+        horizon=SKY_DISTANCE * float(model.vis.map.zfar * model.stat.extent) if len(skies) else 1e9,
     )
 
 

@@ -1,4 +1,4 @@
-"""A surface and a pixel in, colors out: the headlight's pass and the lamp's, as OpenGL draws them one after the other."""
+"""A surface and a pixel in, colors out: of the headlight's pass and of the lamp's, which OpenGL draws after it."""
 
 from __future__ import annotations
 
@@ -39,10 +39,7 @@ from dmcvb_gen.rendering.native.records import (
     VIEW,
 )
 from dmcvb_gen.rendering.native.sampling import part, sample_cube, sample_repeating
-from dmcvb_gen.rendering.native.scene import CAPSULE
-
-OPAQUE = 0.995
-"""OpenGL's border between opaque and blended, as MuJoCo draws it."""
+from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE
 
 
 @part

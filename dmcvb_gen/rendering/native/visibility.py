@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from dmcvb_gen.rendering.native.records import AXIS, FUNCTIONS, PLACE, SIZE, TURN
+from dmcvb_gen.rendering.native.records import AXIS, FAR, FUNCTIONS, HORIZON, NEAR, PLACE, SIZE, TURN, VIEW
 from dmcvb_gen.rendering.native.sampling import part
 
 SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
@@ -162,13 +162,16 @@ def draw_capsule(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, place
 
 
 @part
-def draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, near, far, geom):
-    """Put a rectangle into the buffers, from its FUNCTIONS; `near` and `far`: the depths drawn."""
+def draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, k, rec, g, geom):
+    """Put a rectangle into the buffers, from its FUNCTIONS, as far as the sky does not hide it."""
     at = FUNCTIONS
     a, b, c = np.float32(rec[g, at]), np.float32(rec[g, at + 1]), np.float32(rec[g, at + 2])
     ua, ub, uc = np.float32(rec[g, at + 3]), np.float32(rec[g, at + 4]), np.float32(rec[g, at + 5])
     va, vb, vc = np.float32(rec[g, at + 6]), np.float32(rec[g, at + 7]), np.float32(rec[g, at + 8])
-    least, most = np.float32(1.0 / far), np.float32(1.0 / near)
+    least, most = np.float32(1.0 / k[FAR]), np.float32(1.0 / k[NEAR])
+    at, over = VIEW, 1.0 / k[HORIZON]  # a ray's run in the world's horizontal plane, over the horizon
+    ea, eb, ec = np.float32(k[at] * over), np.float32(k[at + 1] * over), np.float32(k[at + 2] * over)
+    na, nb, nc = np.float32(k[at + 3] * over), np.float32(k[at + 4] * over), np.float32(k[at + 5] * over)
     first, past, width = 4 * c0, 4 * c1, ys.size
     xr, dr = xs[first:past], offsets[first:past]
     for row in range(r0, r1):
@@ -179,7 +182,9 @@ def draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, near, f
             x, y = xr[i], top + dr[i]
             w = a * x + b * y + c
             u, v = ua * x + ub * y + uc, va * x + vb * y + vc
+            east, north = ea * x + eb * y - ec, na * x + nb * y - nc
             seen = (w > wr[i]) & (w >= least) & (w <= most) & (abs(u) <= w) & (abs(v) <= w)
+            seen &= east * east + north * north <= w * w
             wr[i] = w if seen else wr[i]
             nr[i] = geom if seen else nr[i]
 
