@@ -7,7 +7,8 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.learning.defaults import parse_settings, run_config
+from dmcvb_gen.behaviours.learning import runs
+from dmcvb_gen.behaviours.learning.defaults import default_run, parse_settings, run_config
 from dmcvb_gen.behaviours.learning.episodes import standing_states
 from dmcvb_gen.behaviours.learning.runs import RunConfig, check_same
 from dmcvb_gen.behaviours.learning.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
@@ -211,6 +212,7 @@ def test_standing_states_stand():
         (["walker-walk", "--steps", "0"], "x>=1"),
         (["walker-walk", "--steps", "100"], "all warm-up (5000 steps)"),
         (["walker-walk", "--config", "/nowhere.yaml"], "nowhere"),
+        (["walker-walk", "--set", "buffer_size=4000"], "buffer_size 4000 holds fewer steps than warmup_steps 5000"),
     ],
 )
 def test_bad_commands_say_what_is_wrong(tmp_path, arguments, words):
@@ -248,3 +250,23 @@ def test_the_class_and_the_config_name_the_same_run(tmp_path):
     assert SacRun(tmp_path, config()).header.command.startswith(
         "dmcvb-gen train-behaviour cheetah-run --algo sac --steps 160"
     )
+
+
+@pytest.mark.parametrize("task_id", ["walker-walk", "ant-maze-empty7x7"])
+def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp_path, monkeypatch, task_id):
+    """Counted from outside: agent steps that evaluations were asked to simulate, for those that were trained."""
+    asked, evaluate = [], runs.evaluate
+
+    def counted(policy, task, episodes=100, **given):
+        asked.append(episodes * task.max_steps)
+        return evaluate(policy, task, 2, **given)
+
+    monkeypatch.setattr(runs, "evaluate", counted)
+    monkeypatch.setattr(SacRun, "_base", 0.0, raising=False)
+    run = open_run(tmp_path / "run", config(task=task_id, steps=1600, evaluate_every=400, evaluate_sparse=400), False)
+    run.train()
+    share = runs.EVALUATION_STEPS[run.task.family]
+    assert len(asked) == 4 and all(run.task.max_steps <= steps <= share * 400 for steps in asked)
+    assert sum(asked) > 0.5 * share * 1600
+    defaults = default_run("walker-walk")["evaluate_every"]
+    assert share * defaults / 500 > 4  # enough episodes for a curve that medium is picked from

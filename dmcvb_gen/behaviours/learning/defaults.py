@@ -14,6 +14,7 @@ import yaml
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.settings import check_settings
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import ANT_MAZE, family_of
 
 
 @functools.cache
@@ -27,7 +28,7 @@ def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
     `settings` of the file are sac's; another algorithm's are under `algorithms: {<name>: {...}}` of "all" and of
     the task, on top of that algorithm's own defaults; its budget, where it differs, under the task's `runs`.
     """
-    family = "ant-maze" if task_id.startswith("ant-maze") else task_id
+    family = ANT_MAZE if family_of(task_id) == ANT_MAZE else task_id
     general, own = _all()["all"], _all().get(family, {})
     values = {name: value for name, value in (general | own).items() if name not in ("algorithms", "runs")}
     values |= (own.get("runs") or {}).get(algorithm) or {}

@@ -30,6 +30,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from dmcvb_gen.behaviours.learning.networks import as_arrays
@@ -42,11 +43,15 @@ from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.behaviours.policies.policy_file import save_policy
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.store.manifest import environment
 from dmcvb_gen.tasks import get_task
 
 EVALUATION_EPISODES = 20
-"""Episodes of the evaluations along the way; selection evaluates its picks again on 100."""
+"""Episodes of an evaluation along the way, at most; selection evaluates its picks again on 100."""
+EVALUATION_STEPS = {LOCOMOTION: 8.0, ANT_MAZE: 4.0}
+"""Agent steps simulated in evaluations for each one trained, at most: about a fifth of a run's time. Counted in steps,
+not in seconds, so that a run gives the same bits however busy its machine is."""
 DENSE_SHARE = 0.2
 """Share of the way from the paper's medium return to its expert's below which evaluations are dense: medium and mixed
 are picked from there."""
@@ -182,6 +187,10 @@ class Run(abc.ABC):
     def warmup(self) -> int:
         """Agent steps before anything is learned."""
 
+    def problem(self) -> str | None:
+        """Why a run with these settings would come to nothing, and the cure; None where nothing is wrong."""
+        return None
+
     @abc.abstractmethod
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
         """Train until `config.steps`, from a saved state where there is one."""
@@ -228,7 +237,7 @@ class Run(abc.ABC):
         self.seconds += time.time() - self._started
         header = self.header.model_copy(update={"agent_step": self.step})
         arrays = as_arrays(weights)
-        evaluation, _ = evaluate(Policy(header, arrays, ""), self.task, EVALUATION_EPISODES, seed=self.step)
+        evaluation, _ = evaluate(Policy(header, arrays, ""), self.task, self.evaluation_episodes(), seed=self.step)
         trained = header.training | {"seconds": round(self.seconds, 1)}
         header = header.model_copy(update={"evaluation": evaluation, "training": trained})
         save_policy(self._checkpoint(self.step), header, arrays)
@@ -238,6 +247,12 @@ class Run(abc.ABC):
         report(progress)
         self._started = time.time()
         return progress
+
+    def evaluation_episodes(self) -> int:
+        """Episodes of the evaluation after the steps trained since the one before, so that all keep to their share."""
+        since = self.step - max((step for step in self._log.curve if step < self.step), default=0)
+        affordable = EVALUATION_STEPS[self.task.family] * since / self.task.max_steps
+        return int(np.clip(affordable, 1, EVALUATION_EPISODES))
 
     def next_evaluation(self, evaluation: Evaluation, planned: int) -> int:
         """The agent step of the evaluation after this one: the planned one, where the run ended before it."""

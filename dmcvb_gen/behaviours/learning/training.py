@@ -48,80 +48,115 @@ class SacRun(Run):
     def warmup(self) -> int:
         return 0 if self.config.init_from else self.settings.warmup_steps
 
+    def problem(self) -> str | None:
+        settings = self.settings
+        if settings.buffer_size < settings.warmup_steps:
+            return (
+                f"buffer_size {settings.buffer_size} holds fewer steps than warmup_steps {settings.warmup_steps}, so "
+                "nothing would ever be learned; give --set buffer_size of at least that"
+            )
+        return None
+
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
-        settings, task, config = self.settings, self.task, self.config
-        learner = Sac(self.header, settings, config.seed)
-        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
-        buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, self.folder / "resume")
-        rng = np.random.default_rng([config.seed, 0xB0FF])
-        owed, next_evaluation = 0.0, config.evaluate_every
+        loop, next_evaluation = SacLoop(self, saved), self.config.evaluate_every
         if saved:
-            _fit(f"{self.folder} cannot be resumed", learner.load_state, saved["learner"])
-            buffer.restore(saved["buffer"]["position"], saved["buffer"]["full"], saved["buffer"].get("size"))
-            rng.bit_generator.state = json.loads(saved["rng"])
-            next_evaluation = (self.step // config.evaluate_every + 1) * config.evaluate_every
-            owed, next_evaluation = saved.get("owed", 0.0), saved.get("next_evaluation", next_evaluation)
-        elif config.init_from:
-            _start_from(learner, config.init_from)
-        episodes = Episodes(self, rng)
-        if saved and "episodes" in saved:
-            observation = episodes.restore(saved["episodes"])
-        else:
-            observation = episodes.start(np.arange(settings.simulations))
-        shaping = shaping_of(task)
+            next_evaluation = (self.step // self.config.evaluate_every + 1) * self.config.evaluate_every
+            next_evaluation = saved.get("next_evaluation", next_evaluation)
         last_saved = self._started
-
-        def save() -> None:
-            buffer.flush()
-            self.save(
-                {
-                    "learner": learner.state(),
-                    "buffer": {"position": buffer.position, "full": buffer.full, "size": buffer.size},
-                    "rng": json.dumps(rng.bit_generator.state),
-                    "episodes": episodes.saved(observation),
-                    "owed": owed,
-                    "next_evaluation": next_evaluation,
-                }
-            )
-
-        while self.step < config.steps:
-            learner.norm.update(observation)
-            if len(buffer) < settings.warmup_steps and not config.init_from:
-                action = rng.uniform(-1, 1, (settings.simulations, task.action_size)).astype(np.float32)
-            else:
-                action = learner.act(observation)
-            before = episodes.batch.path_length() if settings.progress else 0.0
-            result = episodes.batch.step(action)
-            reward = result.reward
-            if settings.progress:
-                reward = reward + settings.progress * (before - episodes.batch.path_length())
-            if settings.shaping:
-                reward = reward + settings.shaping * shaping(result.state)
-            reached = episodes.batch.behaviour_observation()
-            buffer.add(
-                observation=observation,
-                next_observation=reached,
-                action=action,
-                reward=reward,
-                terminated=result.terminated,
-            )
-            self.step += settings.simulations
-            observation = episodes.restart_ended(reached, result.terminated)
-            learner.sync_norm()
-            learner.sharpen(self.step)
-            if len(buffer) >= settings.warmup_steps:
-                owed += settings.updates_per_step * settings.simulations
-                while owed >= 1:
-                    learner.update(buffer.sample(rng, settings.batch_size))
-                    owed -= 1
-            tick(settings.simulations)
+        while self.step < self.config.steps:
+            loop.collect()
+            loop.learn()
+            tick(self.settings.simulations)
             if self.step >= min(next_evaluation, self.config.steps):
+                learner = loop.learner
                 progress = self.record(learner.actor.state_dict(), learner.updates, learner.metrics(), report)
                 next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
-                    save()
+                    self.save(loop.state() | {"next_evaluation": next_evaluation})
                     last_saved = self._started
-        save()
+        self.save(loop.state() | {"next_evaluation": next_evaluation})
+
+
+class SacLoop:
+    """What a run of SAC goes round: episodes fill the buffer, the learner learns from it; its state can be saved.
+
+    Args:
+      saved: `state()` to go on from; None at the start.
+    """
+
+    def __init__(self, run: SacRun, saved: dict[str, Any] | None):
+        settings, task, config = run.settings, run.task, run.config
+        self.run, self.learner = run, Sac(run.header, settings, config.seed)
+        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
+        self.buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, run.folder / "resume")
+        self.rng = np.random.default_rng([config.seed, 0xB0FF])
+        self._owed = 0.0  # updates
+        if saved:
+            place = saved["buffer"]
+            _fit(f"{run.folder} cannot be resumed", self.learner.load_state, saved["learner"])
+            self.buffer.restore(place["position"], place["full"], place.get("size"))
+            self.rng.bit_generator.state = json.loads(saved["rng"])
+            self._owed = saved.get("owed", 0.0)
+        elif config.init_from:
+            _start_from(self.learner, config.init_from)
+        self.episodes, self._shaping = Episodes(run, self.rng), shaping_of(task)
+        if saved and "episodes" in saved:
+            self.observation = self.episodes.restore(saved["episodes"])
+        else:
+            self.observation = self.episodes.start(np.arange(settings.simulations))
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the run goes on from."""
+        buffer = self.buffer
+        buffer.flush()
+        return {
+            "learner": self.learner.state(),
+            "buffer": {"position": buffer.position, "full": buffer.full, "size": buffer.size},
+            "rng": json.dumps(self.rng.bit_generator.state),
+            "episodes": self.episodes.saved(self.observation),
+            "owed": self._owed,
+        }
+
+    def _action(self) -> np.ndarray:
+        settings = self.run.settings
+        if len(self.buffer) < settings.warmup_steps and not self.run.config.init_from:
+            return self.rng.uniform(-1, 1, (settings.simulations, self.run.task.action_size)).astype(np.float32)
+        return self.learner.act(self.observation)
+
+    def collect(self) -> None:
+        """One agent step of every simulation, into the buffer."""
+        settings, batch, observation = self.run.settings, self.episodes.batch, self.observation
+        self.learner.norm.update(observation)
+        action = self._action()
+        before = batch.path_length() if settings.progress else 0.0
+        result = batch.step(action)
+        reward = result.reward
+        if settings.progress:
+            reward = reward + settings.progress * (before - batch.path_length())
+        if settings.shaping:
+            reward = reward + settings.shaping * self._shaping(result.state)
+        reached = batch.behaviour_observation()
+        self.buffer.add(
+            observation=observation,
+            next_observation=reached,
+            action=action,
+            reward=reward,
+            terminated=result.terminated,
+        )
+        self.run.step += settings.simulations
+        self.observation = self.episodes.restart_ended(reached, result.terminated)
+
+    def learn(self) -> None:
+        """The updates that the steps so far are owed."""
+        settings = self.run.settings
+        self.learner.sync_norm()
+        self.learner.sharpen(self.run.step)
+        if len(self.buffer) < settings.warmup_steps:
+            return
+        self._owed += settings.updates_per_step * settings.simulations
+        while self._owed >= 1:
+            self.learner.update(self.buffer.sample(self.rng, settings.batch_size))
+            self._owed -= 1
 
 
 def _fit(what: str, load: Callable[[Any], None], state: Any) -> None:
@@ -185,6 +220,8 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         raise DmcvbError(
             f"{config.steps} steps are all warm-up ({run.warmup()} steps), nothing would be learned; give more --steps"
         )
+    if problem := run.problem():
+        raise DmcvbError(problem)
     folder.mkdir(parents=True, exist_ok=True)
     if shutil.disk_usage(folder).free < 1e9:
         raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")

@@ -19,6 +19,7 @@ from safetensors.numpy import save as dump_safetensors
 from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
 from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -111,4 +112,4 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
 
 def _same_family(first: str, second: str) -> bool:
     """Ant-maze policies never see the layout, so one may be used (and warm-started) in another maze."""
-    return first.startswith("ant-maze") and second.startswith("ant-maze")
+    return family_of(first) == family_of(second) == ANT_MAZE

@@ -83,6 +83,25 @@ def _actions(
     return actions
 
 
+def _empty(task: Task, episodes: np.ndarray, limit: int) -> Simulation:
+    """Episodes of `limit` steps that have not begun, all zeros."""
+    size, rows = len(episodes), limit + 1
+    return Simulation(
+        episodes=episodes,
+        state=np.zeros((size, rows, task.state_size), np.float32),
+        action=np.zeros((size, rows, task.action_size), np.float32),
+        reward=np.zeros((size, rows), np.float32),
+        discount=np.zeros((size, rows), np.float32),
+        physics=np.zeros((size, rows, task.physics_size)),
+        length=np.full(size, limit, np.int32),
+        terminated=np.zeros(size, bool),
+        seed=np.zeros(size, np.uint64),
+        behaviour=np.zeros(size, np.int16),
+        goal_pair=np.full(size, -1, np.int16),
+        seconds={"physics": 0.0, "policy": 0.0},
+    )
+
+
 def simulate(
     task: Task,
     policies: Sequence[Policy],
@@ -113,31 +132,18 @@ def simulate(
     }
     behaviour = (episodes % len(policies)).astype(np.int16)
     pair = np.full(size, -1, np.int16) if goal_pairs is None else (episodes // episodes_per_goal).astype(np.int16)
-    seconds = {"physics": 0.0, "policy": 0.0}
-
     started = time.perf_counter()
     batch = task.batch(size, threads)
     if goal_pairs is None:
         state = batch.reset(streams["initial_state"])
     else:
         state = batch.reset_fixed(streams["initial_state"], [goal_pairs[k] for k in pair])
-    seconds["physics"] += time.perf_counter() - started
+    begun = time.perf_counter() - started
 
-    rows = limit + 1
-    out = Simulation(
-        episodes=episodes,
-        state=np.zeros((size, rows, task.state_size), np.float32),
-        action=np.zeros((size, rows, task.action_size), np.float32),
-        reward=np.zeros((size, rows), np.float32),
-        discount=np.zeros((size, rows), np.float32),
-        physics=np.zeros((size, rows, task.physics_size)),
-        length=np.full(size, limit, np.int32),
-        terminated=np.zeros(size, bool),
-        seed=np.array([episode_seed(seed, names, int(i)) for i in episodes], np.uint64),
-        behaviour=behaviour,
-        goal_pair=pair,
-        seconds=seconds,
-    )
+    out = _empty(task, episodes, limit)
+    out.behaviour[:], out.goal_pair[:] = behaviour, pair
+    out.seed[:] = [episode_seed(seed, names, int(i)) for i in episodes]
+    out.seconds["physics"] += begun
     active = np.ones(size, bool)
     for step in range(limit + 1):
         out.state[active, step] = state[active]
@@ -150,8 +156,8 @@ def simulate(
         actions = _actions(policies, behaviour, streams["policy"], seen, active, task.action_size, deterministic)
         acted = time.perf_counter()
         result = batch.step(actions, active)
-        seconds["policy"] += acted - started
-        seconds["physics"] += time.perf_counter() - acted
+        out.seconds["policy"] += acted - started
+        out.seconds["physics"] += time.perf_counter() - acted
         state, ended = result.state, result.terminated
         out.action[active, step] = actions[active]
         out.reward[active, step] = result.reward[active]
