@@ -202,6 +202,7 @@ def test_imported_data_are_checked_trained_on_and_evaluated_by_our_renderer(smal
     assert result.exit_code == 0, result.output
     facts = json.loads((tmp_path / "out" / "report.json").read_text())
     assert facts["sound"] and {r["cell"]["agent_name"] for r in facts["results"]} == {"bc", "state-bc"}
+    assert "The data were painted elsewhere (imported)" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_names_are_text_on_the_page(report, release):

@@ -22,7 +22,7 @@ from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pret
 from dmcvb_gen.agents.data import Source, TrainingData, load_data
 from dmcvb_gen.agents.learners import ObservationReadout, Policy, StateReadout
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, hold_out_losses, train
-from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed
+from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import Profile
@@ -239,6 +239,7 @@ def _facts(
         "paper": paper and {"mean": paper[0], "stderr": paper[1]},
         "data": dataclasses.asdict(data_score(subset, data)),
         "episodes": len(data.lengths),
+        "renderers": {"data": subset.record.renderer["name"], "evaluation": renderer_choice(subset)["name"]},
         "curve": [_thin(point) for point in curve],
         "seconds": seconds,
         "steps_per_second": policy_steps(profile, agent) / max(seconds["training"], 1e-9),

@@ -83,13 +83,13 @@ def protocol(
     """
     facts: dict[str, Any] = {"steps": evaluation_steps(get_task(subset.task), max_steps), "goals": pair}
     if pictures:
-        facts |= {"size": subset.record.size, "renderer": _renderer_choice(subset), "backgrounds": None}
+        facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
         if distractor_of(subset.task, subset.setting).kind != "none":
             facts["backgrounds"] = load_backgrounds(video_source(subset.root, subset.record, backgrounds), SPLIT).digest
     return facts
 
 
-def _renderer_choice(subset: Subset) -> dict[str, Any]:
+def renderer_choice(subset: Subset) -> dict[str, Any]:
     """Name and samples of the renderer: the data's own, or the default one where they were painted elsewhere."""
     if is_imported(subset):
         default = RendererChoice()
@@ -150,7 +150,7 @@ class Evaluator:
         self.device, self.normalization, self.stack = torch.device(device), normalization, stack
         self.pair, self.renderer = pair, None
         if pixels:
-            choice, source = _renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
+            choice, source = renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
             on = "cuda" if self.device.type == "cuda" and choice["name"] == "warp" else "cpu"
             self.renderer, self._videos = renderer_for(subset.record, source, SPLIT, on, **choice)
             if hasattr(self.renderer, "worlds"):

@@ -309,6 +309,12 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
                 f"Evaluations are cut at {evaluated:,} agent steps, the data at {data:,}: their returns cannot be "
                 "compared where the end is not reached before."
             )
+    for data, evaluation in sorted({(r["renderers"]["data"], r["renderers"]["evaluation"]) for r in results}):
+        if data != evaluation:
+            notes.append(
+                f"The data were painted elsewhere ({data}), the evaluations here by renderer {evaluation}: agents with "
+                "pictures are scored on other pictures than they learned from."
+            )
     if any(result["score"]["success"] is not None for result in results):
         notes.append(
             "Success is the share of episodes that reach the goal; the speed is the distance to the goal at the start "
