@@ -56,7 +56,7 @@ def test_rollout_info_preview_verify_one_after_the_other(tmp_path):
 def test_the_same_command_with_other_options_is_refused(tmp_path):
     assert run(*SMALL, "--out", tmp_path / "demo").exit_code == 0
     result = run(*SMALL, "--seed", "1", "--out", tmp_path / "demo")
-    assert result.exit_code == 2 and "another recipe's release" in result.output
+    assert result.exit_code == 2 and "seed 0, asked for 1" in result.output
 
 
 def test_dry_run_shows_the_plan_and_writes_nothing(tmp_path):

@@ -26,6 +26,7 @@ from dmcvb_gen.release.transfer import (
     upload,
 )
 from dmcvb_gen.rollout.jobs import ShardKey, chosen_shards
+from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import (
     CARD_FILES,
     CARD_FOLDER,
@@ -120,24 +121,37 @@ def publish(
         return Moved(len(index.files), total, publish_to_hub(root, manifest, index, url, tick))
     filesystem, base = file_system(url, options)
     place = public(url)
-    if _there(filesystem, place, base, index.manifest_sha256, manifest):
+    before = _published(filesystem, place, base, index.manifest_sha256, manifest)
+    if before == ():
         return Moved(len(index.files), total, 0)
     fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
-    fresh = fresh and _read(filesystem, place, f"{base}/{INDEX}") is None
-    results = in_parallel(
-        lambda file: upload(filesystem, place, root / file.path, f"{base}/{file.path}", file, fresh),
-        index.files,
-        workers,
-        lambda result: tick(1),
-    )
+    fresh = fresh and before is None and _read(filesystem, place, f"{base}/{INDEX}") is None
+    kept = set(before or ())
+    results = []
+    for part in _in_order([file for file in index.files if file not in kept]):
+        results += in_parallel(
+            lambda file: upload(filesystem, place, root / file.path, f"{base}/{file.path}", file, fresh),
+            part,
+            workers,
+            lambda result: tick(1),
+        )
     retry(place, INDEX, lambda: _put(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
-    try:
-        _create(filesystem, f"{base}/{MANIFEST}", (root / MANIFEST).read_bytes())
-    except FileExistsError:
-        if not _there(filesystem, place, base, index.manifest_sha256, manifest):
-            raise
+    text = (root / MANIFEST).read_bytes()
+    if before is not None:
+        retry(place, MANIFEST, lambda: _put(filesystem, f"{base}/{MANIFEST}", text))
+    else:
+        try:
+            _create(filesystem, f"{base}/{MANIFEST}", text)
+        except FileExistsError:
+            _published(filesystem, place, base, index.manifest_sha256, manifest)  # another one's raises
     retry(place, CLAIM, lambda: filesystem.rm_file(f"{base}/{CLAIM}"))
     return Moved(len(index.files), total, sum(results))
+
+
+def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
+    """Files in the order in which they go up: new ones first, then those that take the place of an older version's."""
+    late = [file for file in todo if file.path.endswith("/zarr.json") or is_card(file.path)]
+    return [part for part in ([file for file in todo if file not in set(late)], late) if part]
 
 
 def _read(filesystem, place, path) -> bytes | None:
@@ -151,22 +165,25 @@ def _read(filesystem, place, path) -> bytes | None:
     return retry(place, path.rsplit("/", 1)[-1], attempt)
 
 
-def _there(filesystem, place, base, digest: str, manifest: Manifest) -> bool:
-    """Whether this very release is published there.
+def _published(filesystem, place, base, digest: str, manifest: Manifest) -> tuple[FileRecord, ...] | None:
+    """The files of an older version that this one has grown from; () for this very one, None where none is.
 
     Raises:
-      StoreError: another one is.
+      StoreError: another release is there.
     """
     found = _read(filesystem, place, f"{base}/{MANIFEST}")
     if found is None:
-        return False
+        return None
     if files.sha256_bytes(found) == digest:
-        return True
+        return ()
+    what = "something else"
     try:
         other = parse_manifest(found, f"{place}/{MANIFEST}")
         what = f"{other.name} {other.version}"
+        if is_grown_from(manifest, other):
+            return parse_index(_read(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
     except StoreError:
-        what = "something else"
+        pass
     raise StoreError(
         f"{place} already holds {what}, and a published version never changes; publish {manifest.name} "
         f"{manifest.version} to another URL (a changed byte is a new version)"

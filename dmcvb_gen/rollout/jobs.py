@@ -114,16 +114,16 @@ def make_jobs(
     Raises:
       RecipeError: the manifest does not say the goals of a subset with fixed ones.
     """
-    seed = manifest.recipe.get("seed", 0)
     groups: dict[tuple, list[SubsetRecord]] = {}
     for (name, shard), record in shards.items():
         if record.setting == FIXED and not (record.fixed_goals and record.episodes_per_goal):
             raise RecipeError(f"the manifest does not say the goals of {name}; make it from its recipe again")
         where = device or record.renderer.get("device") or "cpu"
-        groups.setdefault((*_trajectory(manifest, record), shard, inputs[name], where), []).append(record)
+        seed = manifest.recipe_of(name).get("seed", 0)
+        groups.setdefault((*_trajectory(manifest, record), seed, shard, inputs[name], where), []).append(record)
     return tuple(
         Job(str(target), tuple(records), shard, given, seed, names, where)
-        for (names, *_, shard, given, where), records in groups.items()
+        for (names, *_, seed, shard, given, where), records in groups.items()
     )
 
 
@@ -150,7 +150,7 @@ def stream_names(manifest: Manifest, record: SubsetRecord) -> tuple[str, ...]:
     for entry in reversed(manifest.lineage):
         if record.name in entry.get("streams", {}):
             return tuple(entry["streams"][record.name])
-    return trajectory_names(manifest.recipe.get("trajectories", "shared"), record)
+    return trajectory_names(manifest.recipe_of(record.name).get("trajectories", "shared"), record)
 
 
 # -- what a release is made from, found again -----------------------------------------------------

@@ -17,6 +17,7 @@ from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, chosen_shards, make_jobs
 from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
+from dmcvb_gen.store.growth import taken_up
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
@@ -71,16 +72,20 @@ def make_plan(
     """
     root = Path(out)
     manifest, inputs = describe(recipe, device)
-    names = {record.name for record in chosen_shards(manifest, only).values()}
+    asked = {record.name for record in manifest.subsets}
+    grown = taken_up(root, manifest)
+    records = tuple(record for record in grown.subsets if record.name in asked)
+    grown = grown.model_copy(update={"subsets": records})
+    names = {record.name for record in chosen_shards(grown, only).values()}
     done: dict[str, set[int]] = {}
     if (root / MANIFEST).exists():
-        done = {r.name: set(read_commits(root, r)) for r in manifest.subsets if r.name in names}
+        done = {r.name: set(read_commits(root, r)) for r in records if r.name in names}
     shards = {
         (name, shard): record
-        for (name, shard), record in chosen_shards(manifest, only, episodes).items()
+        for (name, shard), record in chosen_shards(grown, only, episodes).items()
         if shard not in done.get(name, ())
     }
-    jobs = make_jobs(manifest, shards, root, inputs, device)
+    jobs = make_jobs(grown, shards, root, inputs, device)
     return Plan(root, manifest, inputs, jobs, sum(map(len, done.values())))
 
 
@@ -196,7 +201,7 @@ def prepare(plan: Plan, expected_bytes: float = 0) -> Plan:
     """Create the release's folder, manifest, policies and empty arrays; a plan whose manifest is the folder's.
 
     Raises:
-      StoreError: the folder holds another recipe's release, cannot be written, or the disk lacks the room.
+      StoreError: the folder holds what contradicts this recipe, cannot be written, or the disk lacks the room.
     """
     root = plan.root
     manifest = start_release(root, plan.manifest)

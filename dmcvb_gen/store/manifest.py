@@ -115,11 +115,28 @@ class SubsetRecord(_Model):
     digest: Digest | None = None
 
 
+class Addition(_Model):
+    """What a release was grown by.
+
+    Attributes:
+      version: of the release since then.
+      recipe: the resolved recipe that was added.
+      generator: what added it.
+      subsets: name -> (first, last + 1) of the episodes that it added.
+    """
+
+    version: str
+    recipe: dict[str, Any]
+    generator: str
+    subsets: dict[RelativePath, tuple[int, int]]
+
+
 class Manifest(_Model):
     """The release's manifest.json.
 
     Attributes:
-      recipe: the resolved recipe that made it.
+      recipe: the resolved recipe that made it, in its first version.
+      additions: what it was grown by since, in order.
       environments: versions and platform of every process that added to it, in order.
       lineage: for a release derived from another one (repaint, fetch, import): what from.
       complete: whether every shard of every subset is committed; `digest`s are set then.
@@ -133,12 +150,20 @@ class Manifest(_Model):
     authors: tuple[str, ...] = ()
     generator: str = f"dmcvb-gen {__version__}"
     recipe: dict[str, Any]
+    additions: tuple[Addition, ...] = ()
     subsets: tuple[SubsetRecord, ...]
     environments: tuple[dict[str, str], ...] = ()
     lineage: tuple[dict[str, Any], ...] = ()
     complete: bool = False
     digest: Digest | None = None
     format: Literal["dmcvb-gen release"] = "dmcvb-gen release"
+
+    def recipe_of(self, subset: str) -> dict[str, Any]:
+        """The recipe that a subset's first episode was made by; those added later agree with it."""
+        for addition in self.additions:
+            if addition.subsets.get(subset, (1, 1))[0] == 0:
+                return addition.recipe
+        return self.recipe
 
 
 def subset_path(name: str) -> str:

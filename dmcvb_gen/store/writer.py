@@ -12,6 +12,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import filelock
 import numpy as np
@@ -19,6 +20,7 @@ import zarr
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, copy_file, remove_partial, sha256_file
+from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX, write_release
 from dmcvb_gen.store.manifest import (
     MANIFEST,
@@ -67,21 +69,16 @@ def mark_created(root: Path, subset: SubsetRecord) -> None:
 
 
 def start_release(root: Path, manifest: Manifest) -> Manifest:
-    """Create a release folder, or take up the one that is there.
+    """Create a release folder, or take up the one that is there, grown by what is new.
 
     Raises:
-      StoreError: the folder holds something else, or another recipe's release, or cannot be written.
+      StoreError: the folder holds something else, or what contradicts this release, or cannot be written.
     """
     path = root / MANIFEST
     with storage_errors(root, "write to"), contextlib.ExitStack() as stack:
         if path.exists():
             stack.enter_context(only_writer(root, wait=LOCK_SECONDS))
-            old = parse_manifest(path.read_bytes(), str(path))
-            if (old.recipe, _asked(old)) != (manifest.recipe, _asked(manifest)):
-                raise StoreError(
-                    f"{root} holds another recipe's release ({_difference(old, manifest)}); "
-                    "choose another --out, or delete the folder if it is not needed"
-                )
+            old = merged(parse_manifest(path.read_bytes(), str(path)), manifest, str(root))
             environments = old.environments
             for environment in manifest.environments:
                 if environment not in environments:
@@ -102,29 +99,6 @@ def _clear(root: Path) -> None:
     remove_partial(root / "commits")
 
 
-def _asked(manifest: Manifest) -> list[SubsetRecord]:
-    return [subset.model_copy(update={"digest": None}) for subset in manifest.subsets]
-
-
-def _difference(old: Manifest, new: Manifest) -> str:
-    for key in sorted(set(old.recipe) | set(new.recipe)):
-        if old.recipe.get(key) != new.recipe.get(key):
-            return f"its {key} is {_short(old.recipe.get(key))}, asked for {_short(new.recipe.get(key))}"
-    before = {subset.name: subset for subset in _asked(old)}
-    for subset in _asked(new):
-        if subset.name not in before:
-            return f"it has no {subset.name}"
-        for field in SubsetRecord.model_fields:
-            if getattr(before[subset.name], field) != getattr(subset, field):
-                return f"{field} of {subset.name} differs"
-    return "its subsets differ"
-
-
-def _short(value) -> str:
-    text = str(value)
-    return text if len(text) < 80 else text[:77] + "..."
-
-
 def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
     """Create a subset's group and arrays (metadata alone), unless they are there already.
 
@@ -138,6 +112,8 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
     """
     path = root / subset_path(subset.name)
     if (path / CREATED).exists():
+        with storage_errors(path, "write to"):
+            _grow(path, subset, attributes)
         return
     version = attributes.get("schema_version", SCHEMA_VERSION)
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
@@ -159,6 +135,19 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
         mark_created(root, subset)  # an interrupted creation is done again from the start
     except OSError as error:
         raise StoreError(f"cannot write to {path}: {error.strerror or error}") from None
+
+
+def _grow(path: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> None:
+    """Make room for more episodes in the arrays that are there: metadata alone."""
+    group = zarr.open_group(str(path), mode="r+", use_consolidated=False)
+    arrays = [array for _, array in group.members(max_depth=None) if isinstance(array, zarr.Array)]
+    small = [array for array in arrays if array.shape[0] < subset.episodes]
+    if not small:
+        return
+    for array in small:
+        array.resize((subset.episodes, *array.shape[1:]))
+    group.attrs["release"] = attributes.get("release", "")
+    zarr.consolidate_metadata(str(path))
 
 
 def write_shard(

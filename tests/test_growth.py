@@ -1,0 +1,131 @@
+"""Releases that grow: what was there stays byte for byte, what contradicts is refused, the old version stays whole."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.publish import fetch, publish
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rollout.plan import make_plan
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.growth import next_version
+from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
+
+WALKER = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "episodes_per_shard": 1}
+
+
+def walker(*patterns, **changes):
+    return small_recipe(subsets=[WALKER | pattern for pattern in patterns or ({},)], **changes)
+
+
+def shards_of(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if "/c/" in p.as_posix() and p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory):
+    """A release of one walker episode, then grown by an episode, another setting and a maze; and copies of both."""
+    folder = tmp_path_factory.mktemp("grown") / "release"
+    roll_out(walker(), folder)
+    shutil.copytree(folder, folder.parent / "before")
+    roll_out(walker({"episodes": 2}, {"settings": "static", "episodes": 2}), folder)
+    maze = {"tasks": TINY_MAZE, "levels": "random", "settings": "hidden", "episodes": 1}
+    roll_out(small_recipe(seed=8, subsets=[maze]), folder)
+    return folder
+
+
+def test_what_was_there_stays_and_the_rest_is_what_one_rollout_gives(grown, tmp_path):
+    before, after = shards_of(grown.parent / "before"), shards_of(grown)
+    assert before and before.items() <= after.items() and verify(grown).sound and verify(grown).complete
+    manifest = open_release(grown).manifest
+    assert manifest.version == "1.2.0" and [addition.version for addition in manifest.additions] == ["1.1.0", "1.2.0"]
+    assert manifest.additions[0].subsets == {"walker-walk/random/none": (1, 2), "walker-walk/random/static": (0, 2)}
+    assert manifest.recipe_of("ant-maze-tiny/random/hidden")["seed"] == 8
+    at_once = roll_out(walker({"episodes": 2}, {"settings": "static", "episodes": 2}), tmp_path / "once")
+    digests = {record.name: record.digest for record in manifest.subsets}
+    assert {record.name: record.digest for record in at_once.subsets}.items() <= digests.items()
+
+
+def test_an_old_recipe_run_again_changes_nothing(grown):
+    manifest = (grown / "manifest.json").read_bytes()
+    assert not make_plan(walker(), grown).jobs
+    roll_out(walker(), grown)
+    assert (grown / "manifest.json").read_bytes() == manifest
+
+
+@pytest.mark.parametrize(
+    "recipe, words",
+    [
+        (lambda: walker(seed=4), "seed 3, asked for 4"),
+        (lambda: walker(size=32), "size 16, asked for 32"),
+        (lambda: walker(split="val"), "split train, asked for val"),
+        (lambda: walker({"settings": "static", "episodes": 1}), "never shrinks"),
+    ],
+)
+def test_what_contradicts_is_refused_by_name_before_any_work(grown, recipe, words):
+    before = {path: path.read_bytes() for path in grown.rglob("*") if path.is_file()}
+    with pytest.raises(StoreError, match=words) as caught:
+        make_plan(recipe(), grown)
+    assert "walker-walk/random/" in str(caught.value) and "delete" not in str(caught.value)
+    assert before == {path: path.read_bytes() for path in grown.rglob("*") if path.is_file()}
+
+
+def test_a_shard_that_is_not_full_or_fixed_goals_cannot_grow(tmp_path):
+    three = {"episodes": 3, "episodes_per_shard": 2}
+    plan_of = lambda recipe: make_plan(recipe, tmp_path / "r")  # noqa: E731
+    (tmp_path / "r").mkdir()
+    manifest = plan_of(walker(three)).manifest
+    (tmp_path / "r/manifest.json").write_text(manifest.model_dump_json())
+    with pytest.raises(StoreError, match="last shard has 1 of 2"):
+        plan_of(walker(three | {"episodes": 5}))
+    fixed = {"settings": ["fixed"], "episodes": None, "episodes_per_goal": 1}
+    manifest = plan_of(maze_recipe(**fixed, fixed_goals=1)).manifest
+    (tmp_path / "r/manifest.json").write_text(manifest.model_dump_json())
+    with pytest.raises(StoreError, match="fixed_goals 1, asked for 2|number does not grow"):
+        plan_of(maze_recipe(**fixed, fixed_goals=2))
+
+
+def test_versions_count_up():
+    assert [next_version(version) for version in ("1.0.0", "1.9.3", "2.0")] == ["1.1.0", "1.10.0", "2.1.0"]
+
+
+def test_a_published_release_grows_by_its_new_shards_alone(grown, tmp_path):
+    url, there = f"file://{tmp_path}/there", tmp_path / "there"
+    publish(grown.parent / "before", url)
+    old = {path: path.stat().st_mtime_ns for path in there.rglob("*") if "/c/" in path.as_posix()}
+    moved = publish(grown, url)
+    new = shards_of(grown).keys() - shards_of(grown.parent / "before").keys()
+    assert len(new) <= moved.moved < moved.files
+    assert old == {path: path.stat().st_mtime_ns for path in old}
+    assert verify(there).sound and open_release(url).manifest == open_release(grown).manifest
+    fetch(url, tmp_path / "back", ["*/*/hidden"])
+    assert verify(tmp_path / "back").sound
+    with pytest.raises(StoreError, match="never changes"):
+        publish(grown.parent / "before", url)
+
+
+def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there(grown, tmp_path, monkeypatch):
+    from dmcvb_gen.release import publish as module
+
+    url, put = f"file://{tmp_path}/there", module._put
+    publish(grown.parent / "before", url)
+
+    def stop(filesystem, path, data):
+        if path.endswith("manifest.json"):
+            raise StoreError("cut off")
+        put(filesystem, path, data)
+
+    monkeypatch.setattr(module, "_put", stop)
+    with pytest.raises(StoreError, match="cut off"):
+        publish(grown, url)
+    old = open_release(url)
+    assert old.manifest.version == "1.0.0" and list(old.subsets) == ["walker-walk/random/none"]
+    assert json.dumps(old["walker-walk/random/none"].episode(0)["reward"].tolist())
+    assert list(old["walker-walk/random/none"].episodes) == [0]
+    monkeypatch.setattr(module, "_put", put)
+    publish(grown, url)
+    assert open_release(url).manifest.version == "1.2.0" and verify(tmp_path / "there").sound
