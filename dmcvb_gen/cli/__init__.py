@@ -22,6 +22,7 @@ COMMANDS = {
     "validate": ("validate:validate", "Check a release, run the paper's benchmarks, report both."),
     "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
     "repaint": ("release:repaint", "New pixels from stored physics states: distractor, size, renderer."),
+    "diff": ("release:diff_command", "Which subsets, episodes and digests differ between two releases."),
     "card": ("release:card", "Write a release's card: README.md, croissant.json, pictures."),
     "publish": ("release:publish", "Put a release at a URL: s3://, gs://, hf://, file: or any other of fsspec."),
     "fetch": ("release:fetch", "Bring a published release, or a part of it."),

@@ -46,3 +46,29 @@ def format_bytes(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     raise AssertionError("unreachable")
+
+
+SECRETS = ("key", "secret", "token", "password", "credential")
+
+
+def parse_options(context, parameter, pairs):
+    """("endpoint_url=http://...",) -> {"endpoint_url": "http://..."}; a click callback that takes no secrets."""
+    options = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise click.UsageError(f"--option {name!r} is not NAME=VALUE, e.g. endpoint_url=http://localhost:9000")
+        if any(word in name.lower() for word in SECRETS):
+            raise click.UsageError(f"Give {name} in the environment: others can read the command line.")
+        options[name] = {"true": True, "false": False}.get(value.lower(), value)
+    return options
+
+
+remote_option = click.option(
+    "--option",
+    "options",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=parse_options,
+    help="Of the file system (fsspec), e.g. endpoint_url=http://localhost:9000. Repeatable.",
+)

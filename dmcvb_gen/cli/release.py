@@ -7,16 +7,25 @@ import dataclasses
 import click
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json
+from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json, remote_option
+
+
+def parse_folder(context, parameter, text):
+    """A folder here, or None; a click callback that takes no URL."""
+    return None if text is None else str(local_folder(text))
 
 
 @click.command()
-@click.argument("path")
+@click.argument("path", metavar="RELEASE|URL")
+@click.option("--all", "everything", is_flag=True, help="At a URL, read every file; a sample by default.")
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
+@remote_option
 @json_option
 @click.pass_context
-def verify(context, path, backgrounds, as_json):
+def verify(context, path, everything, backgrounds, options, as_json):
     """Check that a release is what it says: digests, shapes, values, physics, pixels, returns.
+
+    At a URL nothing is downloaded: manifest, index and commit records are checked, and a sample of files by digest.
 
     Exit code 0 when sound and complete, 1 when a check fails, 2 on bad usage, 3 when what is here is sound but is not
     the whole release (a rollout that is not finished, or a part that was fetched).
@@ -25,9 +34,15 @@ def verify(context, path, backgrounds, as_json):
     dmcvb-gen verify releases/demo
     """
     from dmcvb_gen.release.verify import verify as run
+    from dmcvb_gen.release.verify_url import verify_url
+    from dmcvb_gen.store.remote import is_url
 
-    with tqdm(unit=" subsets", disable=as_json or None) as bar:
-        result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()))
+    if is_url(path):
+        with tqdm(unit=" files", disable=as_json or None) as bar:
+            result = verify_url(path, options, everything, lambda name: bar.update())
+    else:
+        with tqdm(unit=" subsets", disable=as_json or None) as bar:
+            result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()))
     if as_json:
         findings = [dataclasses.asdict(finding) for finding in result.findings]
         facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
@@ -78,7 +93,7 @@ def frames_bar(as_json):
 @only_option
 @episodes_option
 @click.option("--check", is_flag=True, help="Only compare digests; change nothing.")
-@click.option("--out", type=click.Path(), help="Make the shards beside, in this folder.")
+@click.option("--out", metavar="FOLDER", callback=parse_folder, help="Make the shards beside, in this folder.")
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
 @click.option("--device", help="Paint on cpu or cuda instead of where the manifest says.")
 @workers_option
@@ -135,7 +150,7 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
 @click.option("--label", "labels", multiple=True, type=click.Choice(["depth", "segmentation"]), help="Store these too.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
 @click.option("--name", help="Name of the new release.  [default: NAME-repainted]")
-@click.option("--out", type=click.Path(), required=True, help="Folder of the new release.")
+@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the new release.")
 @workers_option
 @json_option
 def repaint(path, out, as_json, backgrounds, workers, **options):
@@ -158,30 +173,6 @@ def repaint(path, out, as_json, backgrounds, workers, **options):
     click.echo(f"{out}: repainted; look at it: dmcvb-gen preview {out}")
 
 
-SECRETS = ("key", "secret", "token", "password", "credential")
-
-
-def parse_options(context, parameter, pairs):
-    """("endpoint_url=http://...",) -> {"endpoint_url": "http://..."}; a click callback that takes no secrets."""
-    options = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not equals or not name:
-            raise click.UsageError(f"--option {name!r} is not NAME=VALUE, e.g. endpoint_url=http://localhost:9000")
-        if any(word in name.lower() for word in SECRETS):
-            raise click.UsageError(f"Give {name} in the environment: others can read the command line.")
-        options[name] = {"true": True, "false": False}.get(value.lower(), value)
-    return options
-
-
-option_option = click.option(
-    "--option",
-    "options",
-    multiple=True,
-    metavar="NAME=VALUE",
-    callback=parse_options,
-    help="Of the file system (fsspec), e.g. endpoint_url=http://localhost:9000. Repeatable.",
-)
 transfers_option = click.option(
     "--workers", type=click.IntRange(1), default=8, show_default=True, help="Files at once."
 )
@@ -190,7 +181,7 @@ transfers_option = click.option(
 @click.command()
 @click.argument("path", metavar="RELEASE")
 @click.argument("url")
-@option_option
+@remote_option
 @click.option("--take-over", is_flag=True, help="Go on although another publisher's claim is there.")
 @transfers_option
 @json_option
@@ -216,8 +207,8 @@ def publish(path, url, options, take_over, workers, as_json):
 @click.argument("url")
 @only_option
 @episodes_option
-@click.option("--out", type=click.Path(), required=True, help="Folder of the release here.")
-@option_option
+@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the release here.")
+@remote_option
 @transfers_option
 @json_option
 def fetch(url, only, episodes, out, options, workers, as_json):
@@ -238,7 +229,7 @@ def fetch(url, only, episodes, out, options, workers, as_json):
 @click.command()
 @click.argument("path", metavar="RELEASE")
 @click.option("--check", is_flag=True, help="Only compare the card with the release; write nothing.")
-@click.option("--out", type=click.Path(), help="Folder of the card.  [default: the release]")
+@click.option("--out", metavar="FOLDER", callback=parse_folder, help="Folder of the card.  [default: the release]")
 @json_option
 @click.pass_context
 def card(context, path, check, out, as_json):
@@ -274,8 +265,10 @@ def card(context, path, check, out, as_json):
 @click.option("--merge", is_flag=True, help="lerobot: all subsets as the tasks of one data set.")
 @click.option("--video", is_flag=True, help="lerobot: pictures as mp4, smaller and with losses, not as PNG.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes, a subset each.")
-@click.option("--out", type=click.Path(), required=True, help="Folder of the exports, a folder a subset.")
-@option_option
+@click.option(
+    "--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the exports, a folder a subset."
+)
+@remote_option
 @json_option
 def export(path, to, only, episodes, merge, video, workers, out, options, as_json):
     """Write subsets in another format: a folder a subset, nothing is written over.
@@ -301,7 +294,7 @@ def export(path, to, only, episodes, merge, video, workers, out, options, as_jso
 @click.option("--level", help="Likewise.")
 @click.option("--setting", help="Likewise: none, static_medium, dynamic_medium, ...")
 @click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
-@click.option("--out", type=click.Path(), required=True, help="Folder of the new release.")
+@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the new release.")
 @json_option
 def import_command(folder, task, level, setting, name, out, as_json):
     """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.
@@ -317,3 +310,27 @@ def import_command(folder, task, level, setting, name, out, as_json):
         return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
     for subset in manifest.subsets:
         click.echo(f"{subset.name}: {subset.episodes} episodes")
+
+
+@click.command("diff")
+@click.argument("one", metavar="RELEASE|URL")
+@click.argument("other", metavar="RELEASE|URL")
+@remote_option
+@json_option
+@click.pass_context
+def diff_command(context, one, other, options, as_json):
+    """Say which subsets, episodes and digests differ between two releases, by their manifests and commit records.
+
+    Exit code 0 when nothing differs, 1 when something does.
+
+    \b
+    dmcvb-gen diff releases/mini s3://bucket/dmcvb-mini
+    """
+    from dmcvb_gen.release.diff import diff
+
+    found = diff(one, other, options)
+    if as_json:
+        print_json([dataclasses.asdict(difference) for difference in found])
+    else:
+        click.echo("\n".join(str(difference) for difference in found) or "no difference")
+    context.exit(1 if found else 0)

@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json
+from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json, remote_option
 from dmcvb_gen.names import ANT_MAZE, DIFFICULTIES, FIXED, SPLITS, DistractorSetting, family_of, task_folder
+from dmcvb_gen.store.remote import public
 
 
 def _out_default(name: str) -> str:
@@ -310,9 +311,10 @@ def _duration(seconds: float) -> str:
 
 
 @click.command()
-@click.argument("path")
+@click.argument("path", metavar="RELEASE|URL")
+@remote_option
 @json_option
-def info(path, as_json):
+def info(path, options, as_json):
     """Show what a release holds: subsets, episodes, bytes, returns beside the paper's.
 
     \b
@@ -320,7 +322,7 @@ def info(path, as_json):
     """
     from dmcvb_gen.rollout.info import describe_release
 
-    facts = describe_release(path)
+    facts = describe_release(path, options)
     if as_json:
         return print_json(facts)
     table = Table(title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"))
@@ -373,11 +375,15 @@ def preview(path, only, out, episodes, scale, gif, as_json):
 
 
 @click.command("list")
+@click.option("--remote", metavar="URL", help="List the releases at a URL instead.")
+@remote_option
 @json_option
-def list_command(as_json):
+def list_command(remote, options, as_json):
     """List tasks, levels, distractors, bundled behaviours, recipes and the renderers usable here."""
     from dmcvb_gen.rollout.info import describe_package
 
+    if remote:
+        return _list_remote(remote, options, as_json)
     facts = describe_package()
     if as_json:
         return print_json(facts)
@@ -402,3 +408,20 @@ def list_command(as_json):
     console.print(f"recipes: {', '.join(facts['recipes'])}")
     for name, reason in facts["renderers"].items():
         console.print(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
+
+
+def _list_remote(url, options, as_json) -> None:
+    from dmcvb_gen.store.catalog import releases_at
+
+    found = releases_at(url, options)
+    if as_json:
+        return print_json(found)
+    table = Table(title=public(url))
+    for column in ("release", "name", "version", "subsets", "episodes", "complete", "digest"):
+        table.add_column(column)
+    for facts in found:
+        shown = ("url", "name", "version", "subsets", "episodes", "complete")
+        table.add_row(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12])
+    console = Console()
+    console.width = max(console.width, 120)
+    console.print(table)

@@ -51,7 +51,7 @@ from dmcvb_gen.store.manifest import (
     shard_count,
     subset_path,
 )
-from dmcvb_gen.store.remote import file_system, public, reason, storage_errors
+from dmcvb_gen.store.remote import file_system, local_path, public, reason, storage_errors
 from dmcvb_gen.store.writer import LOCK, mark_created, only_writer, read_commits
 
 CLAIM = "publishing.json"
@@ -277,7 +277,7 @@ def fetch(
       StoreError: no release is there; a file has other bytes than its digest says; `out` holds something else;
         there is no room; access is refused.
     """
-    out, source = Path(out), _Source.find(url, options)
+    out, source = local_path(out), Source.find(url, options)
     shards = chosen_shards(source.manifest, only, episodes)
     wanted = source.metadata(shards.values())
     commit_files = [source.listed(commit_path(*key)) for key in shards]
@@ -302,7 +302,7 @@ def fetch(
 
 
 @dataclass(frozen=True)
-class _Source:
+class Source:
     """A published release: where it lies, and what it says of itself."""
 
     filesystem: Any
@@ -314,7 +314,7 @@ class _Source:
     index: Index
 
     @classmethod
-    def find(cls, url: str, options: dict[str, Any] | None) -> _Source:
+    def find(cls, url: str, options: dict[str, Any] | None) -> Source:
         """Read manifest and index at a URL.
 
         Raises:
@@ -363,7 +363,7 @@ class _Source:
 
 
 def _fetch_commits(
-    source: _Source, listed: list[FileRecord], shards: dict[ShardKey, SubsetRecord], workers: int
+    source: Source, listed: list[FileRecord], shards: dict[ShardKey, SubsetRecord], workers: int
 ) -> dict[ShardKey, tuple[bytes, CommitRecord]]:
     """The commit records of shards, as bytes and checked: digests, and that their files lie in the subset's folder."""
 
@@ -425,7 +425,7 @@ def _check_room(out: Path, files: list[FileRecord]) -> None:
         )
 
 
-def _write_part(out: Path, source: _Source, only, episodes) -> None:
+def _write_part(out: Path, source: Source, only, episodes) -> None:
     """A manifest that says that this is a part, and which: what is here while files come, and until all are."""
     parts = []
     if (out / MANIFEST).is_file():
@@ -448,7 +448,7 @@ def _write_part(out: Path, source: _Source, only, episodes) -> None:
             mark_created(out, record)
 
 
-def _finish(out: Path, source: _Source) -> None:
+def _finish(out: Path, source: Source) -> None:
     """The release's own manifest and index where everything is here; else digests of the part."""
     commits = {record.name: read_commits(out, record) for record in source.manifest.subsets}
     if all(len(commits[record.name]) == shard_count(record) for record in source.manifest.subsets):

@@ -103,10 +103,11 @@ def has_bytes(filesystem: fsspec.AbstractFileSystem, remote: str, local: Path, r
         return True
     if "md5Hash" in facts:
         return base64.b64decode(facts["md5Hash"]).hex() in _etags(local)
-    return _remote_sha256(filesystem, remote, record.bytes) == record.sha256
+    return remote_sha256(filesystem, remote, record.bytes) == record.sha256
 
 
-def _remote_sha256(filesystem, remote, size) -> str:
+def remote_sha256(filesystem: fsspec.AbstractFileSystem, remote: str, size: int) -> str:
+    """SHA-256 of a remote file, read piece by piece."""
     digest = hashlib.sha256()
     for start in range(0, size, PIECE):
         digest.update(filesystem.cat_file(remote, start=start, end=min(start + PIECE, size)))

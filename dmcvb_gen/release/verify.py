@@ -124,14 +124,14 @@ def check_files(root: Path) -> Iterator[Finding]:
 def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]) -> Iterator[Finding]:
     for file in index.files:
         if file.path not in checked:
-            yield from _check_file(root, file, _subset_of(manifest, file.path))
+            yield from _check_file(root, file, subset_of(manifest, file.path))
     if sha256_file(root / MANIFEST) != index.manifest_sha256:
         yield Finding("files", MANIFEST, f"does not have the digest that {INDEX} says")
     elif manifest.digest is not None and root_digest(index.files, manifest) != manifest.digest:
         yield Finding("files", MANIFEST, f"its root digest is not that of the files in {INDEX}")
 
 
-def _subset_of(manifest: Manifest, path: str) -> str:
+def subset_of(manifest: Manifest, path: str) -> str:
     """The subset that a file belongs to; the file itself where it belongs to none."""
     for record in manifest.subsets:
         if path.startswith((f"{subset_path(record.name)}/", f"commits/{record.name}/")):

@@ -25,13 +25,13 @@ def return_statistics(returns: np.ndarray) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def describe_release(path: str | Path) -> dict[str, Any]:
+def describe_release(path: str | Path, storage_options: dict | None = None) -> dict[str, Any]:
     """Subsets of a release with episodes, steps, bytes and returns, the paper's row beside each.
 
     Raises:
       StoreError: there is no release at `path`.
     """
-    release = open_release(path)
+    release = open_release(path, storage_options)
     subsets = []
     for name, subset in release.subsets.items():
         subsets.append(

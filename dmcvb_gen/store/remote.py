@@ -39,6 +39,17 @@ def is_url(path: str) -> bool:
     return "://" in path or path.startswith("file:")
 
 
+def local_path(path: str | Path) -> Path:
+    """A folder here.
+
+    Raises:
+      StoreError: it is a URL; a `Path` would silently make a folder of that name.
+    """
+    if is_url(str(path)):
+        raise StoreError(f"{public(str(path))} is a URL; give a local folder, and `dmcvb-gen publish` it from there")
+    return Path(path)
+
+
 def public(url: str) -> str:
     """A URL without user, password, query and fragment, fit for logs and manifests."""
     bare = re.sub(r"[?#].*$", "", url)

@@ -1,0 +1,72 @@
+"""Is a published release what it says? A URL in, findings out; nothing is kept here.
+
+Manifest, index and commit records are read and held against one another; files are read and compared with their
+digests, a sample of them or all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.publish import Source
+from dmcvb_gen.release.transfer import in_parallel, remote_sha256, retry
+from dmcvb_gen.release.verify import Finding, Verification, subset_of
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.index import INDEX, root_digest
+from dmcvb_gen.store.manifest import FileRecord
+
+SAMPLE_FILES = 40
+"""Files that are read where not all are asked for; spread evenly over the release."""
+WORKERS = 8
+
+
+def verify_url(
+    url: str,
+    options: dict[str, Any] | None = None,
+    everything: bool = False,
+    tick: Callable[[str], None] = lambda path: None,
+) -> Verification:
+    """Check a published release where it is.
+
+    Args:
+      options: of fsspec.
+      everything: read all files, not a sample.
+      tick: told each file that was read.
+
+    Raises:
+      StoreError: no release is there, or it cannot be read.
+    """
+    source = Source.find(url, options)
+    findings = []
+    if source.manifest.digest not in (None, root_digest(source.index.files, source.manifest)):
+        findings.append(Finding("files", INDEX, "its files do not give the root digest of the manifest"))
+    chosen = source.index.files
+    if not everything:
+        places = np.unique(np.linspace(0, len(chosen) - 1, min(SAMPLE_FILES, len(chosen))).round().astype(int))
+        chosen = [chosen[place] for place in places]
+
+    def look(file: FileRecord) -> Finding | None:
+        path = f"{source.base}/{file.path}"
+        try:
+            digest = retry(source.place, file.path, lambda: remote_sha256(source.filesystem, path, file.bytes))
+        except StoreError as error:
+            return Finding("files", subset_of(source.manifest, file.path), str(error))
+        if digest == file.sha256:
+            return None
+        return Finding("files", subset_of(source.manifest, file.path), f"{file.path} does not have its digest")
+
+    findings += [found for found in in_parallel(look, chosen, WORKERS, lambda _: tick("")) if found]
+    counts = {"subsets": 0, "episodes": 0, "steps": 0, "files": len(chosen)}
+    try:
+        release = open_release(url, options)
+    except StoreError as error:
+        return Verification(counts, (*findings, Finding("files", "commits", str(error))))
+    for subset in release.subsets.values():
+        counts["subsets"] += 1
+        counts["episodes"] += len(subset.episodes)
+        counts["steps"] += subset.steps
+    return Verification(counts, tuple(findings), release.shortfalls, release.manifest.digest)

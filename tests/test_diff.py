@@ -1,0 +1,70 @@
+"""`diff` names what is different in two releases, folders or URLs, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.release.diff import diff
+from dmcvb_gen.release.publish import publish
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.writer import commit_path
+from tests.conftest import maze_recipe, roll_out
+
+NAME, MAZE = "walker-walk/random/none", "ant-maze-tiny/random/visible"
+
+
+def test_equal_releases_have_no_difference(small_release, maze_release):
+    for folder in (small_release, maze_release):
+        result = CliRunner().invoke(main, ["diff", str(folder), f"file://{folder}"])
+        assert result.exit_code == 0 and "no difference" in result.output
+
+
+def test_another_seed_changes_arrays_and_missing_episodes_are_counted(maze_release, small_release, tmp_path):
+    roll_out(maze_recipe(episodes=1).model_copy(update={"seed": 5}), tmp_path / "other")
+    found = {str(difference) for difference in diff(maze_release, tmp_path / "other")}
+    assert f"{MAZE}: episodes: 2 and 1" in found and f"{MAZE}: episodes that are there: 2 and 1" in found
+    assert f"{MAZE}: physics has other bytes in the episodes 0:1" in found
+    assert f"{MAZE}: pixels_top has other bytes in the episodes 0:1" in found
+    shutil.copytree(small_release, tmp_path / "copy")
+    (tmp_path / "copy" / commit_path(NAME, 1)).unlink()
+    result = CliRunner().invoke(main, ["diff", str(small_release), str(tmp_path / "copy"), "--json"])
+    assert result.exit_code == 1
+    assert json.loads(result.output) == [{"subset": NAME, "message": "episodes that are there: 3 and 2"}]
+    found = [str(difference) for difference in diff(small_release, maze_release)]
+    assert f"{NAME}: only in the first" in found and f"{MAZE}: only in the second" in found
+
+
+def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tmp_path):
+    there = tmp_path / "there"
+    publish(maze_release, f"file://{there}/mazes")
+    (there / "half").mkdir()
+    run = CliRunner().invoke
+    listed = json.loads(run(main, ["list", "--remote", f"file://{there}", "--json"]).output)
+    digest = open_release(maze_release).manifest.digest
+    [facts] = listed
+    assert (facts["name"], facts["version"], facts["episodes"], facts["digest"]) == ("mazes", "1.0.0", 2, digest)
+    url = facts["url"]
+    assert digest in run(main, ["info", url]).output
+    result = run(main, ["verify", url, "--all"])
+    assert result.exit_code == 0 and "sound" in result.output and digest in result.output, result.output
+    shard = next(
+        path for path in (there / "mazes").rglob("*") if "/pixels_top/c/" in path.as_posix() and path.is_file()
+    )
+    data = shard.read_bytes()
+    shard.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    result = run(main, ["verify", url, "--all"])
+    assert result.exit_code == 1 and f"{shard.relative_to(there / 'mazes')} does not have its digest" in result.output
+    assert run(main, ["list", "--remote", f"file://{there}/half"]).exit_code == 2
+
+
+def test_a_url_is_no_folder(tmp_path, small_release):
+    url = "s3://bucket/x"
+    for command in (["fetch", url, "--out", url], ["card", str(small_release), "--out", url]):
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 2 and "Traceback" not in result.output and "publish" in result.output
+    for command in (["export", str(small_release), "--to", "npz", "--out", url], ["import", "x", "--out", url]):
+        assert CliRunner().invoke(main, command).exit_code == 2
