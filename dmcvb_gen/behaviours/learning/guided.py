@@ -25,6 +25,7 @@ from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD
 
 GUIDE = "ant-maze-empty7x7"
 """The task whose bundled expert is the guide where --init-from names none."""
@@ -58,7 +59,7 @@ class GuidedSettings:
     layers: Count = 2
     updates_per_step: Positive = 0.25
     buffer_size: Count = 400_000
-    ahead: NonNegative = 2.0
+    ahead: NonNegative = AHEAD
     guided_share: Share = 0.2
     mean_share: Share = 0.5
     least_std: Positive = 0.1
