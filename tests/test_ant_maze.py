@@ -534,3 +534,16 @@ def test_unknown_names():
     with pytest.raises(UnknownNameError, match="geodesic"):
         get_task("ant-maze-empty7x7@geodesi")
     assert get_task("ant-maze-empty7x7@geodesic").reward == "geodesic"
+
+
+def test_ants_that_start_in_the_floor_are_flung_up():
+    """What `sink` is for: a spawn offset of dm_control's range along z, which decides the height an ant flies to."""
+    task = get_task("ant-maze-empty7x7")
+    batch = task.batch(2)
+    batch.reset([np.random.default_rng(i) for i in range(2)])
+    at = batch._qpos[:, :2].copy()
+    batch.sink(np.array([0, 1]), np.array([-0.25, 0.0]))
+    np.testing.assert_array_equal(batch._qpos[:, :2], at)
+    heights = [batch.step(np.zeros((2, 8))).state[:, task.state_slices["body_height"]][:, 0] for _ in range(10)]
+    highest = np.max(heights, axis=0)
+    assert highest[0] > 0.9 and highest[1] < 0.8

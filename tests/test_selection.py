@@ -157,8 +157,10 @@ def test_a_maze_medium_is_nearest_to_the_papers_row():
     picked = {}
     for task_id in ("ant-maze-empty7x7", "ant-maze-easy7x7b", "ant-maze-medium7x7c"):
         goal = medium_return(task_id)
-        found = pick_checkpoints(curve, -450.0, converge(STEPS, returns), measure, levels=MAZE_LEVELS, medium=goal)
+        end = converge(STEPS, returns, -450.0)
+        found = pick_checkpoints(curve, -450.0, end, measure, levels=MAZE_LEVELS, medium=goal)
         assert found.picks["medium"][0].evaluation.mean == pytest.approx(goal, abs=10)
+        assert -50 / 0.95 <= found.picks["expert"][0].evaluation.mean <= -50  # 95 % of the way would be -70
         picked[task_id] = goal
     assert picked == {"ant-maze-empty7x7": -172.2, "ant-maze-easy7x7b": -131.1, "ant-maze-medium7x7c": -176.0}
     assert medium_return("walker-walk") is None and medium_return("ant-maze-mine:***/*.*/***") is None

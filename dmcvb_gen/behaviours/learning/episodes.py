@@ -12,6 +12,7 @@ from dmcvb_gen.behaviours.learning.runs import Run
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.tasks.ant_maze.task import SPAWN_NOISE
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 
 HURRY = 0.1
@@ -75,6 +76,11 @@ class Episodes:
         standing = ids[self._rng.random(len(ids)) < getattr(run.settings, "standing_starts", 0.0)]
         if len(standing):
             self.batch.set_physics(standing_states(self._task, self._rng, len(standing)), standing)
+        sunken = ids[self._rng.random(len(ids)) < getattr(run.settings, "sunken_starts", 0.0)]
+        if len(sunken):
+            if self._task.family != ANT_MAZE:
+                raise DmcvbError(f"setting sunken_starts is for ant mazes, nothing sinks in {self._task.id}")
+            self.batch.sink(sunken, self._rng.uniform(-SPAWN_NOISE, -SPAWN_NOISE / 2, len(sunken)))
         return self.batch.behaviour_observation()
 
     def restart_ended(self, observation: np.ndarray, terminated: np.ndarray) -> np.ndarray:

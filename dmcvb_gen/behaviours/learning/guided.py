@@ -42,6 +42,7 @@ class GuidedSettings:
       ahead: how far down the way the guide is shown where to go, meters.
       mean_share: share of the simulations in which the student acts by its mean, as data are made: it learns what the
         guide would do where its own mean stands still.
+      sunken_starts: share of training episodes that start deep in the floor, see sac's.
       guided_share: share of training episodes that the guide walks itself.
       least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
@@ -62,6 +63,7 @@ class GuidedSettings:
     ahead: NonNegative = AHEAD
     guided_share: Share = 0.2
     mean_share: Share = 0.5
+    sunken_starts: Share = 0.3
     least_std: Positive = 0.1
     train_episode_steps: Natural = 300
 

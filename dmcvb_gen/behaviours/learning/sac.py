@@ -31,8 +31,6 @@ class SacSettings:
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       warmup_steps: agent steps of uniform random actions before the first update.
       actor_every: an actor update every so many critic updates.
-      actor_after: critic updates before the first of the actor: a run that starts from a policy file has critics that
-        know nothing yet, and would unlearn what the policy does.
       target_entropy_scale: the target entropy is minus this times the action size.
       sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` and the learning rate
         `sharp_learning_rate` (0: never). A policy that explores loses return to its own noise, one that learns fast
@@ -45,10 +43,10 @@ class SacSettings:
         an evaluation). DMC-VB's own reward is flat in the whole goal cell.
       standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
         instead of the task's initial states; evaluations always start as the task does.
-      mean_share: share of the simulations that act by the mean, as data are made: a policy that only ever collects with
-        noise never sees the places where its mean stands still.
-      guided_share: mazes: share of the simulations in which the policy that the run started from walks, shown the way
-        around the walls as `guided` shows it; so the critics see how a way ends before the actor finds it.
+      sunken_starts: mazes: share of training episodes that start deep in the floor, which flings an ant up; what it
+        does in the air decides whether it comes down on its feet.
+      mean_share: share of the simulations that act by the mean, as data are made: a policy that only ever collects
+        with noise never sees the places where its mean stands still.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
       critics: how many critics.
       clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
@@ -68,7 +66,6 @@ class SacSettings:
     updates_per_step: Positive = 1.0
     warmup_steps: Natural = 5000
     actor_every: Count = 2
-    actor_after: Natural = 0
     target_entropy_scale: float = 0.5
     sharpen_after: Natural = 0
     sharp_entropy_scale: float = 1.5
@@ -78,8 +75,8 @@ class SacSettings:
     shaping: NonNegative = 0.0
     progress: NonNegative = 0.0
     standing_starts: Share = 0.0
+    sunken_starts: Share = 0.0
     mean_share: Share = 0.0
-    guided_share: Share = 0.0
     train_episode_steps: Natural = 0
     buffer_size: Count = 1_000_000
     critics: Count = 2
@@ -306,7 +303,7 @@ class Sac:
         self.critic_optimizer.step()
         self._losses["critic_loss"] = loss.detach()
         self.updates += 1
-        if self.updates % settings.actor_every == 0 and self.updates > settings.actor_after:
+        if self.updates % settings.actor_every == 0:
             self.critic.requires_grad_(False)
             loss, log_prob = self._actor_loss(batch["observation"])
             self.actor_optimizer.zero_grad(set_to_none=True)

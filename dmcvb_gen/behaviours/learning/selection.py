@@ -2,9 +2,9 @@
 
 Paper, section 3.1: expert is the first checkpoint with 95 % of the return at convergence, medium the one with 50 %,
 mixed eight checkpoints evenly spaced, in training steps, from the start to medium. Mean actions are judged, as the data
-are made of them. Where returns are negative (mazes), the expert's share of the way is counted from the random policy's
-return, and medium is the checkpoint whose mean return is nearest to the paper's row of its group; the paper has no
-mixed data of mazes.
+are made of them. Returns of mazes are negative, so an expert costs at most 1 / 0.95 of what the return at convergence
+does, and medium is the checkpoint whose mean return is nearest to the paper's row of its group; the paper has no mixed
+data of mazes.
 """
 
 from __future__ import annotations
@@ -35,6 +35,11 @@ PAPER_TOLERANCE = 0.2
 """How far (as a share of it) a maze's medium may be from the paper's return."""
 CANDIDATES = 6
 """Checkpoints near a medium's return that are measured on fresh episodes."""
+BASE_EPISODES = 20
+"""Episodes of random actions in a maze, of which none finds its goal but by chance."""
+COST_SLACK = 0.3
+"""How much more (as a share) than an expert a maze's checkpoint may have cost on the way to be measured afresh: one
+stuck ant of twenty doubles what they cost."""
 CLOSE_ENOUGH = 0.2
 """Share of the tolerance within which no nearer checkpoint is looked for."""
 SMOOTHING = 5
@@ -176,7 +181,13 @@ def pick_checkpoints(
     if not curve or not way > 0:
         reason = convergence.reason or "the run has no evaluated checkpoint yet"
         return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
-    found: dict[str, tuple[Pick, ...] | str] = {"expert": _expert(curve, base + EXPERT_SHARE * way, way, check)}
+    found: dict[str, tuple[Pick, ...] | str] = {}
+    if medium is None:
+        found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check, errors=2)
+    else:
+        # Returns of mazes are costs: 95 % of the way from the random policy's would be half again as much as the end's.
+        goal = convergence.value / EXPERT_SHARE
+        found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check, errors=0)
     if not convergence.converged:
         found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
     last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
@@ -193,15 +204,17 @@ def pick_checkpoints(
     return Selection(task, base, convergence, picks, {level: why for level, why in found.items() if level not in picks})
 
 
-def _expert(curve: Sequence[Point], goal: float, way: float, check: Callable) -> tuple[Pick, ...] | str:
-    """The first checkpoint that returns `goal` or more, or why there is none."""
+def _expert(
+    curve: Sequence[Point], goal: float, slack: float, check: Callable, errors: float
+) -> tuple[Pick, ...] | str:
+    """The first checkpoint that returns `goal` or more, by so many standard errors, or why there is none."""
     # Returns of the curve's few episodes are noisy: start a little below the line, fresh episodes decide.
-    candidates = [point for point in curve if point[1] >= goal - 0.02 * way]
+    candidates = [point for point in curve if point[1] >= goal - slack]
     for step, value, path in candidates:
         evaluation = check(path)
         # Beyond sampling error: a policy that falls now and then has a wide spread and is not an expert yet.
         error = evaluation.std / np.sqrt(evaluation.episodes)
-        if evaluation.mean - 2 * error >= goal:
+        if evaluation.mean - errors * error >= goal:
             return (Pick("expert", f"return {goal:.1f}", step, value, str(path), evaluation),)
     return f"none of {len(candidates)} candidates held {goal:.1f} over fresh episodes; train longer (--resume)"
 
@@ -260,7 +273,7 @@ def select_checkpoints(
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(files[0]).task)
     mazes = task.family == ANT_MAZE
-    base = evaluate(random_policy(task), task, episodes, seed)[0].mean if mazes else 0.0
+    base = evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed)[0].mean if mazes else 0.0
     measured: dict[Path, tuple[Policy, Evaluation]] = {}
 
     def measure(path: Path) -> Evaluation:

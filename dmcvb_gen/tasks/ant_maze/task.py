@@ -136,6 +136,16 @@ class AntMazeBatch(EpisodeBatch):
         self._refresh(ids)
         return self.state()
 
+    def sink(self, ids: np.ndarray, offsets: np.ndarray) -> None:
+        """Put ants that have just started at other heights, as spawn offsets along z do.
+
+        Args:
+          offsets: (len(ids),) meters, within +-`SPAWN_NOISE`. Below about -0.15 an ant is flung up to a meter high,
+            and beside a wall it may come down on its back, where it stays.
+        """
+        self._qpos[ids, 2] = offsets
+        self._refresh(ids)
+
     def _place(self, sim: int, rng: np.random.Generator, start: tuple[int, int], goal: tuple[int, int]) -> None:
         layout, offsets, yaw = self.task.layout, rng.uniform(-1, 1, 5), rng.uniform(0, 2 * np.pi)
         self._qpos[sim] = 0  # joints too
