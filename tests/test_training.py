@@ -8,11 +8,7 @@ import torch
 from click.testing import CliRunner
 
 from dmcvb_gen.behaviours.learning import runs
-<<<<<<< HEAD
 from dmcvb_gen.behaviours.learning.defaults import default_run, parse_settings, run_config
-=======
-from dmcvb_gen.behaviours.learning.defaults import parse_settings, run_config
->>>>>>> 09e1367 (Mazes: training starts sunken in the floor, an expert costs at most 1 / 0.95 of what the end does)
 from dmcvb_gen.behaviours.learning.episodes import standing_states
 from dmcvb_gen.behaviours.learning.runs import RunConfig, check_same
 from dmcvb_gen.behaviours.learning.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
@@ -256,7 +252,6 @@ def test_the_class_and_the_config_name_the_same_run(tmp_path):
     )
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("task_id", ["walker-walk", "ant-maze-empty7x7"])
 def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp_path, monkeypatch, task_id):
     """Counted from outside: agent steps that evaluations were asked to simulate, for those that were trained."""
@@ -275,10 +270,10 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
     assert sum(asked) > 0.5 * share * 1600
     defaults = default_run("walker-walk")["evaluate_every"]
     assert share * defaults / 500 > 4  # enough episodes for a curve that medium is picked from
-=======
-def test_what_only_mazes_have(tmp_path, monkeypatch):
+
+
+def test_what_only_mazes_have(tmp_path):
     """Ants may start sunken in the floor, walkers may not; a share of the simulations acts by the mean."""
-    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
     settings = TINY | dict(mean_share=0.5, sunken_starts=1.0, shaping=1.0, train_episode_steps=6)
     asked = config(task="ant-maze-easy7x7a", steps=96, evaluate_every=96, settings=settings)
     open_run(tmp_path / "run", asked, False).train()
