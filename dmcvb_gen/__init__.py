@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.readers.register import register
 
@@ -12,16 +12,24 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 
-def open(path: str, storage_options: dict | None = None) -> ReleaseReader:
+def open(path: str, storage_options: dict | None = None, *, paint: bool = False, **painting: Any) -> ReleaseReader:
     """Open a release for reading: `dmcvb_gen.open("releases/demo")["walker-walk/expert/dynamic"]`.
 
     Args:
       path: its folder, or any fsspec URL ("s3://bucket/name"), which is read in place.
       storage_options: passed to fsspec for a URL.
+      paint: paint pictures when they are read instead of reading them; needs the simulator installed.
+      painting: how (`dmcvb_gen.readers.painted.Painting`): distractors="stored" (those of the data) or "resample"
+        (fresh ones for each `set_epoch`), size, backgrounds, cache_bytes (painted episodes kept a subset).
 
     Raises:
       StoreError: there is no release, it cannot be read, or the URL needs a package that is not installed.
+      DmcvbError: a way of painting that there is not.
     """
+    if paint or painting:
+        from dmcvb_gen.readers.painted import open_painted
+
+        return open_painted(path, storage_options, **painting)
     from dmcvb_gen.readers.release import open_for_reading
 
     return open_for_reading(path, storage_options)

@@ -21,6 +21,7 @@ COMMANDS = {
     "verify": ("release:verify", "Check that a release is what it says."),
     "validate": ("validate:validate", "Check a release, run the paper's benchmarks, report both."),
     "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
+    "paint": ("paint:paint", "Fill in the pictures of a release that travelled without."),
     "repaint": ("release:repaint", "New pixels from stored physics states: distractor, size, renderer."),
     "diff": ("release:diff_command", "Which subsets, episodes and digests differ between two releases."),
     "card": ("release:card", "Write a release's card: README.md, croissant.json, pictures."),

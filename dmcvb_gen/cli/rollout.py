@@ -48,6 +48,7 @@ def _out_default(name: str) -> str:
 @click.option("--split", type=click.Choice(SPLITS), default="train", help="Videos and styles: train or val.")
 @click.option("--behaviour", metavar="FILE|RUN", help="A policy file or training run, instead of the bundled one.")
 @click.option("--sample", is_flag=True, help="Draw actions instead of taking the policies' mean ones.")
+@click.option("--no-pixels", is_flag=True, help="Leave pictures out; `paint` fills them in where they are wanted.")
 @click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
@@ -55,7 +56,7 @@ def _out_default(name: str) -> str:
 @click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
 @json_option
 @click.pass_context
-def rollout(context, only, episode_range, out, workers, device, dry_run, as_json, **options):
+def rollout(context, only, episode_range, out, workers, device, dry_run, no_pixels, as_json, **options):
     """Roll out behaviour policies into a release of painted episodes.
 
     The same command goes on where it stopped: what is committed is kept. With --recipe, TASKs, --level, --distractor
@@ -72,7 +73,7 @@ def rollout(context, only, episode_range, out, workers, device, dry_run, as_json
 
     chosen = _recipe(context, options)
     out = local_folder(out or _out_default(chosen.name))
-    plan = make_plan(chosen, out, only, device, parse_range(episode_range))
+    plan = make_plan(chosen, out, only, device, parse_range(episode_range), not no_pixels)
     if dry_run:
         return _show_plan(plan, estimate(plan), workers, as_json)
     _run(prepare(plan, raw_bytes(plan)), workers, as_json)

@@ -126,7 +126,7 @@ def compare_shards(one: Path, other: Path, record: SubsetRecord, shard: int) -> 
             zarr.open_group(str(root / subset_path(record.name)), mode="r", use_consolidated=False)
             for root in (one, other)
         ]
-        for spec in array_specs(EpisodeShape.of(get_task(record.task)), record.size):
+        for spec in array_specs(EpisodeShape.of(get_task(record.task)), record.size, record.pixels):
             a, b = (np.asarray(find_array(group, spec.name)[0][first:last]) for group in groups)
             if np.array_equal(a, b, equal_nan=a.dtype.kind == "f"):
                 continue

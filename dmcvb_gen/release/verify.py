@@ -183,7 +183,7 @@ def check_values(subset: Subset) -> Iterator[Finding]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
     episodes = subset.episodes
-    specs = array_specs(EpisodeShape.of(task), subset.record.size, pixels=bool(subset.pixel_arrays))
+    specs = array_specs(EpisodeShape.of(task), subset.record.size, pixels=subset.record.pixels)
     for spec in imported_specs(subset.record) if is_imported(subset) else specs:
         if spec.name not in subset.arrays:
             yield Finding("shapes", subset.name, f"array {spec.name} is missing")
@@ -275,7 +275,8 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
             return
     renderer, _ = renderer_for(subset.record, source, split)
     try:
-        for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
+        painted_here = np.flatnonzero(~subset.unpainted[subset.episodes])
+        for index in painted_here[_sample(len(painted_here), SAMPLE_EPISODES)]:
             episode, length = int(subset.episodes[index]), int(subset.lengths[index])
             values = subset.episode(episode)
             steps = _sample(length + 1, SAMPLE_FRAMES)

@@ -1,8 +1,8 @@
-"""Rendering: `make_renderer("warp", task, 64)` gives a renderer; physics states and labels become pictures."""
+"""Rendering: `make_renderer("native", task, 64)` gives a renderer; physics states and labels become pictures."""
 
 from __future__ import annotations
 
-from typing import Any
+from importlib.util import find_spec
 
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.rendering.base import Renderer
@@ -48,8 +48,8 @@ def available_renderers() -> dict[str, str | None]:
     """Renderer -> None if it can start here, else why not and what to do."""
     from dmcvb_gen.rendering import opengl
 
-    facts: dict[str, Any] = {"warp": None, "opengl": opengl.unavailable()}
-    return facts
+    warp = None if find_spec("mujoco_warp") else "mujoco-warp is not installed: pip install mujoco-warp==3.17.0"
+    return {"native": None, "warp": warp, "opengl": opengl.unavailable()}
 
 
 __all__ = [

@@ -96,12 +96,13 @@ def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, f
     length = np.full(len(runs), chunk - 1)
     paint_once = list(paint(task, renderer, physics[:1, :2], labels[:1, :2], length[:1] * 0 + 1, 2))
     del paint_once  # kernels are compiled and buffers made
-    specs, layout = array_specs(EpisodeShape.of(task), record.size), picture_layout_for(record.setting)
+    specs, layout = array_specs(EpisodeShape.of(task), record.size, record.pixels), picture_layout_for(record.setting)
     with tempfile.TemporaryDirectory() as folder:
         group = zarr.create_group(folder)
         create_arrays(group, specs, len(runs), chunk, len(runs), layout)
         started = time.perf_counter()
-        for name, value in paint(task, renderer, physics[:, : len_rows(labels)], labels, length, chunk):
+        pictures = paint(task, renderer, physics[:, : len_rows(labels)], labels, length, chunk)
+        for name, value in pictures if record.pixels else ():
             find_array(group, name)[0][:] = value
         for name, value in label_arrays(labels, length, chunk):
             find_array(group, name)[0][:] = value
@@ -163,7 +164,7 @@ def raw_bytes(plan: Plan) -> float:
     total = 0.0
     for job in plan.jobs:
         for record in job.subsets:
-            specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
+            specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size, record.pixels)
             pictures = sum(spec.picture for spec in specs)
             total += len(job.episodes) * record.max_steps * pictures * record.size**2 * 3
     return float(np.ceil(total * 0.5))

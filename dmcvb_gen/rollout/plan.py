@@ -59,6 +59,7 @@ def make_plan(
     only: Sequence[str] = (),
     device: str = "cpu",
     episodes: tuple[int, int] | None = None,
+    pixels: bool = True,
 ) -> Plan:
     """Check a recipe and list its jobs.
 
@@ -66,12 +67,13 @@ def make_plan(
       out: the release's folder; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
+      pixels: paint pictures; without, `release.paint` can do it later.
 
     Raises:
       DmcvbError: anything that would fail later, found before any work.
     """
     root = Path(out)
-    manifest, inputs = describe(recipe, device)
+    manifest, inputs = describe(recipe, device, pixels)
     asked = {record.name for record in manifest.subsets}
     grown = taken_up(root, manifest)
     records = tuple(record for record in grown.subsets if record.name in asked)
@@ -92,7 +94,7 @@ def make_plan(
 # -- what the release will be ---------------------------------------------------------------------
 
 
-def describe(recipe: Recipe, device: str = "cpu") -> tuple[Manifest, dict[str, Inputs]]:
+def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[Manifest, dict[str, Inputs]]:
     """The manifest of a recipe's release, as it is before any shard, and what each subset is made from.
 
     The manifest names no place of this machine: policies and videos go by where the release keeps its copies.
@@ -110,7 +112,7 @@ def describe(recipe: Recipe, device: str = "cpu") -> tuple[Manifest, dict[str, I
         look = (record.task, distractor_of(record.task, record.setting))
         if look not in painted:
             painted[look] = painting_facts(record, recipe.backgrounds, device)
-        records[request.name] = record.model_copy(update=painted[look])
+        records[request.name] = record.model_copy(update=painted[look] | {"pixels": pixels})
         inputs[request.name] = Inputs(tuple(map(str, files)), recipe.backgrounds)
     manifest = Manifest(
         name=recipe.name,
@@ -257,7 +259,7 @@ def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord
       StoreError: the folder cannot be written.
     """
     for record in records:
-        specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
+        specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size, record.pixels)
         create_subset(root, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
 
 

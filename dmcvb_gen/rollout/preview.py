@@ -163,7 +163,7 @@ def write_preview(
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:
-        raise StoreError(f"{path} has no committed episodes with pictures yet; run the rollout first")
+        raise StoreError(f"{path} has no committed episodes with pictures; run the rollout first, or `dmcvb-gen paint`")
     folder = Path(out) if out else release.path / "preview"
     try:
         folder.mkdir(parents=True, exist_ok=True)

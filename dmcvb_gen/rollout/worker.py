@@ -97,7 +97,11 @@ def painted_arrays(
     renderer, videos = renderers.get(record, job.inputs.backgrounds, job.device)
     episodes, physics, length = simulation.episodes, simulation.physics, simulation.length
     exogenous = exogenous_of(record, job.seed, job.names, episodes, physics, length, videos)
-    yield from paint(task, renderer, physics[:, : len_rows(exogenous)], exogenous, length, rows, tick)
+    if record.pixels:
+        physics = physics[:, : len_rows(exogenous)]
+        yield from paint(task, renderer, physics, exogenous, length, rows, tick)
+    else:
+        tick(int((length + 1).sum()))
     yield from label_arrays(exogenous, length, rows)
     yield from simulation.arrays().items()
 

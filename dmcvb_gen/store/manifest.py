@@ -56,6 +56,9 @@ class CommitRecord(_Model):
 
     Attributes:
       environment: what made it, see `environment`; empty in releases of version 1.
+      painted: whether its pictures are among the files.
+      pictures: files that its pictures had where they were painted, for whoever paints them again; empty where they
+        are stored, or never were painted.
     """
 
     subset: RelativePath
@@ -64,6 +67,8 @@ class CommitRecord(_Model):
     steps: int = pydantic.Field(ge=0)
     files: tuple[FileRecord, ...]
     environment: dict[str, str] = {}
+    painted: bool = True
+    pictures: tuple[FileRecord, ...] = ()
 
     def same_data(self, other: CommitRecord) -> bool:
         """Whether both stand for the same bytes, wherever they were made."""
@@ -243,7 +248,7 @@ def checked_commit(text: str | bytes, where: str, subset: SubsetRecord, shard: i
             "makes it again)"
         )
     folder = f"{subset_path(subset.name)}/"
-    if any(not file.path.startswith(folder) for file in commit.files):
+    if any(not file.path.startswith(folder) for file in (*commit.files, *commit.pictures)):
         raise StoreError(f"{where} names files outside of {folder}; do not trust this release")
     return commit
 

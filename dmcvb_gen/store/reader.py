@@ -22,6 +22,7 @@ from dmcvb_gen.store.manifest import (
     shard_count,
     subset_path,
 )
+from dmcvb_gen.store.pictures import picture_of
 from dmcvb_gen.store.remote import file_system, is_url, public, storage_errors
 from dmcvb_gen.store.writer import read_commits
 
@@ -35,8 +36,9 @@ class StoredArray:
       dimensions: names of the axes.
     """
 
-    def __init__(self, array: zarr.Array, name: str, place: str):
+    def __init__(self, array: zarr.Array, name: str, place: str, unpainted: np.ndarray | None = None, cure: str = ""):
         self._array, self._place, self.name = array, place, name
+        self._unpainted, self._cure = unpainted, cure
         self.shape, self.dtype, self.ndim = array.shape, array.dtype, array.ndim
         self.dimensions = tuple(map(str, array.metadata.dimension_names or ()))
 
@@ -44,13 +46,23 @@ class StoredArray:
         return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
 
     def __getitem__(self, selection) -> np.ndarray:
+        self._check_painted(selection[0] if isinstance(selection, tuple) else selection)
         with storage_errors(self._place, decoding=True):
             return self._array[selection]
 
     def rows(self, episodes: np.ndarray) -> np.ndarray:
         """(episode, ...) values of episodes in any order."""
+        self._check_painted(episodes)
         with storage_errors(self._place, decoding=True):
             return self._array.oindex[episodes]
+
+    def _check_painted(self, selection) -> None:
+        """Raises StoreError for an episode without pictures, which would read as black."""
+        if self._unpainted is None or not self._unpainted.any():
+            return
+        missing = np.flatnonzero(np.atleast_1d(self._unpainted[selection]))
+        if len(missing):
+            raise StoreError(self._cure)
 
 
 class Subset:
@@ -112,10 +124,30 @@ class Subset:
         Raises:
           UnknownNameError: the subset has no such array.
         """
+        picture = picture_of(name) is not None
         if name not in self.paths:
+            if picture and not self.record.pixels:
+                raise StoreError(self._without_pictures)
             raise UnknownNameError(f"array of {self.name}", name, self.arrays)
+        unpainted = self.unpainted if picture else None
         with storage_errors(self.path, decoding=True):
-            return StoredArray(self.group[self.paths[name]], name, f"{self.path}/{self.paths[name]}")
+            array = self.group[self.paths[name]]
+            return StoredArray(array, name, f"{self.path}/{self.paths[name]}", unpainted, self._without_pictures)
+
+    @property
+    def unpainted(self) -> np.ndarray:
+        """(episode of the whole subset,) bool: committed, but without pictures."""
+        without = np.zeros(self.record.episodes, bool)
+        for commit in self.commits.values():
+            without[slice(*commit.episodes)] = not commit.painted
+        return without
+
+    @property
+    def _without_pictures(self) -> str:
+        return (
+            f"{self.name} has no pictures for (all of) its episodes; paint them: `dmcvb-gen paint "
+            f"{public(self.root)}`, or open the release with paint=True"
+        )
 
     @property
     def pixel_arrays(self) -> tuple[str, ...]:

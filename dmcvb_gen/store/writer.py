@@ -119,14 +119,7 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
     try:
         if any((root / "commits" / subset.name).glob("*.json")):
-            with tempfile.TemporaryDirectory() as folder:
-                group = zarr.create_group(folder, attributes=attributes, overwrite=True)
-                create_arrays(group, specs, *shape, schema_version=version)
-                zarr.consolidate_metadata(folder)
-                for source in sorted(Path(folder).rglob("zarr.json")):
-                    target = path / source.relative_to(folder)
-                    if not target.exists():
-                        copy_file(source, target)
+            _write_metadata(path, specs, attributes, shape, keep=True)
             mark_created(root, subset)
             return
         group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
@@ -150,6 +143,35 @@ def _grow(path: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> No
     zarr.consolidate_metadata(str(path))
 
 
+def add_arrays(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
+    """Give a subset that has shards already more arrays (metadata alone); its data stay as they are.
+
+    Args:
+      specs: of all arrays that the subset then has.
+      attributes: of the group, see `create_subset`.
+
+    Raises:
+      StoreError: the folder cannot be written.
+    """
+    path = root / subset_path(subset.name)
+    shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
+    with storage_errors(path, "write to"):
+        _write_metadata(path, specs, attributes, shape, keep=False)
+        mark_created(root, subset)
+
+
+def _write_metadata(path: Path, specs: tuple[ArraySpec, ...], attributes: dict, shape: tuple, keep: bool) -> None:
+    """Put a group's metadata in place file by file, beside chunks that may be there; `keep` what is there."""
+    with tempfile.TemporaryDirectory() as folder:
+        group = zarr.create_group(folder, attributes=attributes, overwrite=True)
+        create_arrays(group, specs, *shape, schema_version=attributes.get("schema_version", SCHEMA_VERSION))
+        zarr.consolidate_metadata(folder)
+        for source in sorted(Path(folder).rglob("zarr.json"), key=lambda file: -len(file.parts)):
+            target = path / source.relative_to(folder)
+            if not (keep and target.exists()):
+                copy_file(source, target)
+
+
 def write_shard(
     root: Path,
     subset: SubsetRecord,
@@ -170,32 +192,13 @@ def write_shard(
       StoreError: the disk is full or cannot be written; what was committed stays.
     """
     first, last = shard_episodes(subset, shard)
-    group_path = root / subset_path(subset.name)
     record = root / commit_path(subset.name, shard)
     try:
         there = _read_commit(root, subset, shard)
         if there:  # another process has made it since this one planned to
             return there
         record.unlink(missing_ok=True)
-        group = zarr.open_group(str(group_path), mode="r+", use_consolidated=False)
-        files = []
-        for name, values in arrays:
-            array, name = find_array(group, name)
-            file = group_path / name / array.metadata.encode_chunk_key((shard,) + (0,) * (array.ndim - 1))
-            for stale in file.parent.glob(f"{file.name}.*.partial"):
-                stale.unlink(missing_ok=True)  # left by a killed writer
-            file.unlink(missing_ok=True)
-            array[first:last] = values
-            if file.exists():  # an array of nothing but fill values has no file
-                with file.open("rb") as handle:
-                    os.fsync(handle.fileno())
-                relative = file.relative_to(root).as_posix()
-                files.append(FileRecord(path=relative, bytes=file.stat().st_size, sha256=sha256_file(file)))
-            elif np.any(values):
-                raise StoreError(
-                    f"{file} vanished while it was written: another process writes the same release; let one of the "
-                    "two go on, and run the same command again"
-                )
+        files = _write_arrays(root, subset, shard, arrays)
         commit = CommitRecord(
             subset=subset.name,
             shard=shard,
@@ -203,14 +206,83 @@ def write_shard(
             steps=int(np.sum(lengths)),
             files=tuple(sorted(files, key=lambda file: file.path)),
             environment=dict(environment if environment is not None else this_environment()),
+            painted=subset.pixels,
         )
         write_json_atomically(record, commit)
     except OSError as error:
-        raise StoreError(
-            f"cannot write shard {shard} of {subset.name} to {root}: {error.strerror or error}; what was committed "
-            "is safe, make room and run the same command again"
-        ) from None
+        raise _cannot_write(root, subset, shard, error) from None
     return commit
+
+
+def write_pictures(
+    root: Path,
+    subset: SubsetRecord,
+    commit: CommitRecord,
+    arrays: Iterable[tuple[str, np.ndarray]],
+    environment: Mapping[str, str] | None = None,
+) -> CommitRecord:
+    """Add its pictures to a shard that was committed without; what is there stays as it is.
+
+    Args:
+      commit: the shard's record.
+      arrays: picture arrays, see `write_shard`.
+      environment: what painted them; kept where it is what made the rest.
+
+    Returns:
+      The new record.
+
+    Raises:
+      StoreError: the disk is full or cannot be written; what was committed stays.
+    """
+    try:
+        files = _write_arrays(root, subset, commit.shard, arrays)
+        painted = commit.model_copy(
+            update={
+                "files": tuple(sorted((*commit.files, *files), key=lambda file: file.path)),
+                "environment": dict(environment if environment is not None else this_environment()),
+                "painted": True,
+                "pictures": (),
+            }
+        )
+        write_json_atomically(root / commit_path(subset.name, commit.shard), painted)
+    except OSError as error:
+        raise _cannot_write(root, subset, commit.shard, error) from None
+    return painted
+
+
+def _cannot_write(root: Path, subset: SubsetRecord, shard: int, error: OSError) -> StoreError:
+    return StoreError(
+        f"cannot write shard {shard} of {subset.name} to {root}: {error.strerror or error}; what was committed "
+        "is safe, make room and run the same command again"
+    )
+
+
+def _write_arrays(
+    root: Path, subset: SubsetRecord, shard: int, arrays: Iterable[tuple[str, np.ndarray]]
+) -> list[FileRecord]:
+    """Write a shard's part of arrays, each flushed to the disk."""
+    first, last = shard_episodes(subset, shard)
+    group_path = root / subset_path(subset.name)
+    group = zarr.open_group(str(group_path), mode="r+", use_consolidated=False)
+    files = []
+    for name, values in arrays:
+        array, name = find_array(group, name)
+        file = group_path / name / array.metadata.encode_chunk_key((shard,) + (0,) * (array.ndim - 1))
+        for stale in file.parent.glob(f"{file.name}.*.partial"):
+            stale.unlink(missing_ok=True)  # left by a killed writer
+        file.unlink(missing_ok=True)
+        array[first:last] = values
+        if file.exists():  # an array of nothing but fill values has no file
+            with file.open("rb") as handle:
+                os.fsync(handle.fileno())
+            relative = file.relative_to(root).as_posix()
+            files.append(FileRecord(path=relative, bytes=file.stat().st_size, sha256=sha256_file(file)))
+        elif np.any(values):
+            raise StoreError(
+                f"{file} vanished while it was written: another process writes the same release; let one of the "
+                "two go on, and run the same command again"
+            )
+    return files
 
 
 def find_array(group: zarr.Group, name: str) -> tuple[zarr.Array, str]:
