@@ -20,6 +20,7 @@ from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader, weigh
 from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.release.card import trained
 from dmcvb_gen.tasks import get_task
 
 
@@ -190,6 +191,10 @@ def test_headers_of_earlier_versions_are_read():
 def test_a_header_says_how_its_policy_came_to_be():
     assert "DAgger" in header_of(algorithm="guided").origin and "SAC" in header_of().origin
     assert header_of(algorithm="my-own").origin == "by my-own"
+    walker, maze = (read_header(bundled_policies(t, "expert")[0]) for t in ("walker-walk", "ant-maze-medium7x7a"))
+    said = trained({walker.algorithm, maze.algorithm})
+    assert "(SAC)" in said and ("DAgger" in said) == (maze.algorithm == "guided")
+    assert "SAC" not in trained({"guided"})
 
 
 def test_policies_act_without_torch():

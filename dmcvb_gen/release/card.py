@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from dmcvb_gen.behaviours.policies.header import origin_of
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
@@ -275,6 +276,11 @@ def _making(manifest: Manifest) -> list[str]:
     return [*lines, "", *_table(("task", "level", "behaviour policies"), rows)]
 
 
+def trained(algorithms: Iterable[str]) -> str:
+    """A sentence, without its full stop, of how behaviour policies came to be."""
+    return f"Behaviour policies were trained {' and '.join(origin_of(name) for name in sorted(algorithms))}"
+
+
 def _limits(release: Release) -> list[str]:
     manifest, limits = release.manifest, []
     if not manifest.complete:
@@ -286,8 +292,12 @@ def _limits(release: Release) -> list[str]:
         )
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
-    if any(record.policies for record in manifest.subsets):
-        limits.append("Behaviour policies were trained with SAC; the paper's with MPO. Compare the returns above.")
+    if algorithms := {
+        str(policy.header.get("algorithm", "unknown means"))
+        for record in manifest.subsets
+        for policy in record.policies
+    }:
+        limits.append(f"{trained(algorithms)}; the paper's by MPO. Compare the returns above.")
     steps = {name: subset.steps for name, subset in release.subsets.items()}
     small = [name for name, count in steps.items() if count < 1_000_000]
     if small:

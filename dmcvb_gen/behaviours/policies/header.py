@@ -89,7 +89,12 @@ class PolicyHeader(_Model):
     @property
     def origin(self) -> str:
         """How the policy came to be, in a few words for people."""
-        return ORIGINS.get(self.algorithm, f"by {self.algorithm}")
+        return origin_of(self.algorithm)
+
+
+def origin_of(algorithm: str) -> str:
+    """How policies of an algorithm come to be, in a few words for people, after "trained ..."."""
+    return ORIGINS.get(algorithm, f"by {algorithm}")
 
 
 def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:

@@ -127,17 +127,15 @@ def simulate(
     """
     episodes = np.asarray(episodes, int)
     size, limit = len(episodes), max_steps or task.max_steps
-    streams = {
-        name: [episode_stream(seed, names, int(i), name) for i in episodes] for name in ("initial_state", "policy")
-    }
+    starts, noise = (
+        [episode_stream(seed, names, int(i), name) for i in episodes] for name in ("initial_state", "policy")
+    )
     behaviour = (episodes % len(policies)).astype(np.int16)
     pair = np.full(size, -1, np.int16) if goal_pairs is None else (episodes // episodes_per_goal).astype(np.int16)
     started = time.perf_counter()
     batch = task.batch(size, threads)
-    if goal_pairs is None:
-        state = batch.reset(streams["initial_state"])
-    else:
-        state = batch.reset_fixed(streams["initial_state"], [goal_pairs[k] for k in pair])
+    fixed = None if goal_pairs is None else [goal_pairs[k] for k in pair]
+    state = batch.reset(starts) if fixed is None else batch.reset_fixed(starts, fixed)
     begun = time.perf_counter() - started
 
     out = _empty(task, episodes, limit)
@@ -153,7 +151,7 @@ def simulate(
             break
         started = time.perf_counter()
         seen = batch.behaviour_observation()
-        actions = _actions(policies, behaviour, streams["policy"], seen, active, task.action_size, deterministic)
+        actions = _actions(policies, behaviour, noise, seen, active, task.action_size, deterministic)
         acted = time.perf_counter()
         result = batch.step(actions, active)
         out.seconds["policy"] += acted - started
