@@ -23,7 +23,7 @@ from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.labels import Exogenous
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
@@ -127,8 +127,7 @@ class OpenglRenderer(Renderer):
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
-        shape = (len(physics), len(indices), self.size, self.size)
-        depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
+        depth, segmentation = empty_labels(len(physics), len(indices), self.size)
         self._gl.make_current()
         rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
         near = self._model.vis.map.znear * self._model.stat.extent
@@ -160,9 +159,7 @@ class OpenglRenderer(Renderer):
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
         model.mat_rgba[:, :3] = exogenous.material_rgb[frame]
-        style = int(exogenous.style[frame])
-        materials = self.task.style_geom_matid(style) if style >= 0 else None
-        model.geom_matid[:] = self.task.model.geom_matid if materials is None else materials
+        model.geom_matid[:] = geom_materials(self.task, int(exogenous.style[frame]))
         model.geom_rgba[:] = self.task.model.geom_rgba
         if hide_goal:
             model.geom_rgba[list(self.task.goal_geoms)] = 0
@@ -177,11 +174,8 @@ class OpenglRenderer(Renderer):
             self._model.tex_height[self._sky] = height
             self._model.tex_data[self._sky_range] = pixels
         else:
-            if self._backgrounds is None:
-                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
             width = int(self._model.tex_width[self._sky])
-            picture = Image.fromarray(self._backgrounds.frames(video)[frame])
-            picture = np.asarray(picture.resize((width, width), Image.Resampling.BILINEAR))
+            picture = self.background(video, frame, width, Image.Resampling.BILINEAR)
             self._model.tex_height[self._sky] = width
             start = self._sky_range.start
             self._model.tex_data[start : start + picture.size] = picture.ravel()

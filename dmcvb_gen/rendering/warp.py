@@ -21,7 +21,7 @@ from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.labels import Exogenous
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
 
@@ -219,8 +219,7 @@ class WarpRenderer(Renderer):
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
-        shape = (len(physics), len(indices), self.size, self.size)
-        depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
+        depth, segmentation = empty_labels(len(physics), len(indices), self.size)
         for part, worlds in self._parts(len(physics)):
             for column, view in enumerate(indices):
                 _, depth[part, column], segmentation[part, column] = self._launch(
@@ -323,11 +322,9 @@ class WarpRenderer(Renderer):
         return rgba[None]
 
     def _geom_matid(self, style: np.ndarray) -> np.ndarray:
-        own = np.array(self.task.model.geom_matid)
-        if (style < 0).all():
-            return own[None].astype(np.int32)
-        known = {int(s): self.task.style_geom_matid(int(s)) for s in np.unique(style)}
-        return np.stack([own if known[int(s)] is None else known[int(s)] for s in style]).astype(np.int32)
+        looks, place = np.unique(style, return_inverse=True)
+        found = np.stack([geom_materials(self.task, int(look)) for look in looks])
+        return found if len(looks) == 1 else found[place]
 
     def _set_sky(self, context, exogenous: Exogenous, worlds: int) -> None:
         """Each world's sky: the model's own, or a video frame on every face."""
@@ -351,15 +348,10 @@ class WarpRenderer(Renderer):
 
     def _sky(self, video: int, frame: int):
         if (video, frame) not in self._skies:
-            if self._backgrounds is None:
-                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
             if len(self._skies) > 256:
                 self._skies.clear()
-            width = self._sky_width()
-            picture = Image.fromarray(self._backgrounds.frames(video)[frame]).resize(
-                (width, width), Image.Resampling.BOX
-            )
-            self._skies[video, frame] = self._upload(np.tile(np.asarray(picture), (6, 1, 1)))
+            picture = self.background(video, frame, self._sky_width(), Image.Resampling.BOX)
+            self._skies[video, frame] = self._upload(np.tile(picture, (6, 1, 1)))
         return self._skies[video, frame]
 
     def close(self) -> None:

@@ -12,6 +12,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.names import ANT_MAZE, select
 from dmcvb_gen.store import Subset, open_release
 from dmcvb_gen.store.pictures import shown
+from dmcvb_gen.store.remote import storage_errors
 
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
@@ -165,7 +166,7 @@ def write_preview(
     if not subsets:
         raise StoreError(f"{path} has no committed episodes with pictures; run the rollout first, or `dmcvb-gen paint`")
     folder = Path(out) if out else release.path / "preview"
-    try:
+    with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         sheet = folder / "contact_sheet.png"
         Image.fromarray(contact_sheet(subsets, episodes, scale=scale)).save(sheet)
@@ -176,6 +177,4 @@ def write_preview(
         else:
             frames = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)))
             iio.imwrite(video, frames, plugin="FFMPEG", fps=20, macro_block_size=2, quality=8)
-    except OSError as error:
-        raise StoreError(f"cannot write to {folder}: {error.strerror or error}; give another --out") from None
     return [sheet, video]

@@ -14,7 +14,7 @@ from dmcvb_gen.names import select
 from dmcvb_gen.pool import ignore, open_pool
 from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
 from dmcvb_gen.release.export.episodes import Source
-from dmcvb_gen.store.remote import is_url, public, reason
+from dmcvb_gen.store.remote import is_url, public, storage_errors
 
 
 @dataclass(frozen=True)
@@ -203,15 +203,11 @@ def _write(work: _Work, tick: Callable[[int], None] = ignore) -> None:
     partial = work.folder.with_name(f".{work.folder.name}.partial")
     write = _writer(work.to)
     try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        write(sources if "merge" in FORMATS[work.to].options else sources[0], partial, **work.options)
-        partial.rename(work.folder)
-    except (OSError, ValueError, RuntimeError) as error:
-        if isinstance(error, DmcvbError):
-            raise
-        names = ", ".join(source.subset.name for source in sources)
-        raise StoreError(f"cannot export {names} to {work.folder}: {reason(error)}") from None
+        with storage_errors(work.folder, "write to"):
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            write(sources if "merge" in FORMATS[work.to].options else sources[0], partial, **work.options)
+            partial.rename(work.folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

@@ -1,0 +1,53 @@
+"""Makes small releases of a walker and a maze, exports them, and keeps the stored values beside: for the heavy tests.
+
+python scripts/make_integration_exports.py FOLDER lerobot tfds zarr2
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from dmcvb_gen.release.export import export  # noqa: E402
+from dmcvb_gen.store import open_release  # noqa: E402
+from dmcvb_gen.store.pictures import shown  # noqa: E402
+from tests.conftest import TINY_MAZE, roll_out, small_recipe  # noqa: E402
+
+FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer",)}
+
+
+def main() -> None:
+    work, chosen = Path(sys.argv[1]), sys.argv[2:]
+    walker = {"tasks": "walker-walk", "levels": "random", "settings": ["static"], "episodes": 2}
+    maze = {"tasks": TINY_MAZE, "levels": "random", "settings": ["visible", "hidden"], "episodes": 2}
+    wanted = []
+    for name, pattern in (("walker", walker), ("maze", maze)):
+        folder = work / name
+        roll_out(small_recipe(name=name, size=64, subsets=[pattern]), folder)
+        for subset in open_release(folder).subsets.values():
+            pictures = shown(subset)
+            flat = subset.name.replace("/", "_")
+            arrays = {"views": np.array(pictures.views)}
+            for index in range(2):
+                values = subset.episode(index, ["state", "action", "reward", "terminated", *pictures.arrays])
+                frames = np.stack([values.pop(name) for name in pictures.arrays], axis=1)
+                arrays |= {f"pixels_{index}": frames} | {f"{n}_{index}": v for n, v in values.items()}
+            np.savez(work / f"{flat}.npz", **arrays)
+            folders = {}
+            for what in chosen:
+                for to in FORMATS[what]:
+                    [folders[to]] = map(str, export(str(folder), to, work / to, [subset.name]))
+                if what == "lerobot":
+                    [folders["video"]] = map(str, export(str(folder), to, work / "video", [subset.name], video=True))
+            wanted.append({"subset": subset.name, "values": f"{flat}.npz", "hidden": pictures.hide_goal, **folders})
+    (work / "wanted.json").write_text(json.dumps(wanted, indent=1))
+
+
+if __name__ == "__main__":
+    main()
