@@ -1,0 +1,86 @@
+"""README and docs: every block of code runs, in the order of its page, and the site builds without a warning."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+RUN = {"bash", "python"}
+SHOWN = {"text", "yaml", "console", ""}
+"""What is not run: layouts and formulas, and set-up that needs another machine (console)."""
+SET_UP = ("pip install ", "bash scripts/", ". .venv/", "uvx ", "sbatch ", "ray ", "python -m venv ", "apt-get install ")
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    code: str
+    line: int
+
+
+def blocks(page: Path) -> list[Block]:
+    text = page.read_text()
+    return [Block(found[1], found[2], text[: found.start()].count("\n") + 1) for found in BLOCK.finditer(text)]
+
+
+@pytest.fixture
+def bucket(monkeypatch):
+    """An S3 server with a bucket named "bucket", as the pages' commands expect one."""
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer(port=0, verbose=False)
+    server.start()
+    address = "http://{}:{}".format(*server.get_host_and_port())
+    for name, value in {
+        "AWS_ENDPOINT_URL": address,
+        "AWS_ACCESS_KEY_ID": "docs",
+        "AWS_SECRET_ACCESS_KEY": "docs",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    import boto3
+
+    boto3.client("s3").create_bucket(Bucket="bucket")
+    yield address
+    server.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_of_a_page_runs(page, tmp_path, bucket):
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    for block in blocks(page):
+        if block.language not in RUN:
+            continue
+        start = ["bash", "-euo", "pipefail", "-c"] if block.language == "bash" else [sys.executable, "-c"]
+        done = subprocess.run([*start, block.code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        told = f"{page.name}:{block.line}\n{block.code}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+        assert done.returncode == 0, told
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_does_not_run_is_set_up_or_layout(page):
+    for block in blocks(page):
+        assert block.language in RUN | SHOWN, f"{page.name}:{block.line}: {block.language}"
+        if block.language == "console":
+            commands = [line for line in block.code.splitlines() if line.strip() and not line.startswith("#")]
+            assert all(line.startswith(SET_UP) for line in commands), f"{page.name}:{block.line}"
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
