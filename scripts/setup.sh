@@ -1,17 +1,20 @@
-# Sourced by the other scripts: a virtual environment with the package installed, made once.
+# Sourced by the other scripts: a virtual environment with the package and the extras that they name, made once.
+#   extras=train . scripts/setup.sh
 # Torch comes first and pinned: a plain install would bring gigabytes of CUDA packages.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 venv="${DMCVB_VENV:-.venv}"
-if [ ! -e "$venv/.ready" ] || [ pyproject.toml -nt "$venv/.ready" ] || [ scripts/constraints.txt -nt "$venv/.ready" ]; then
+extras="${extras:-train}"
+ready="$venv/.ready-$extras"
+if [ ! -e "$ready" ] || [ pyproject.toml -nt "$ready" ] || [ scripts/constraints.txt -nt "$ready" ]; then
   "${PYTHON:-python3}" -m venv "$venv"
   "$venv/bin/python" -m pip install --quiet --upgrade "pip>=24"
   if ! "$venv/bin/python" -c "import torch" 2>/dev/null; then
     echo "installing torch ..."
     "$venv/bin/python" -m pip install --quiet --constraint scripts/constraints.txt torch
   fi
-  echo "installing dmcvb-gen ..."
-  "$venv/bin/python" -m pip install --quiet --constraint scripts/constraints.txt --editable ".[test]"
-  touch "$venv/.ready"
+  echo "installing dmcvb-gen[$extras] ..."
+  "$venv/bin/python" -m pip install --quiet --constraint scripts/constraints.txt --editable ".[$extras]"
+  touch "$ready"
 fi
 . "$venv/bin/activate"
