@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.guided import Imitation, deepened, divergence
+from dmcvb_gen.behaviours.learning.guided import GuidedRun, Imitation, deepened, divergence
 from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.training import open_run
@@ -47,9 +47,19 @@ def test_a_deeper_student_begins_as_its_guide(tmp_path):
     assert run.header.hidden == (256, 256, 256, 256) and run.guide.header.hidden == (256, 256)
     student.load_state_dict(deepened(weights, student.state_dict()))
     guide.load_state_dict(weights)
+    begun = {fresh: begin(tmp_path / f"fresh_{fresh}", fresh) for fresh in (False, True)}
+    for name, value in as_tensors(weights).items():
+        assert torch.equal(begun[False][name], value)
+        assert torch.equal(begun[True][name], value) == name.startswith("observation")
     observation = weights["observation_mean"] + torch.randn(64, run.header.observation_size)
     for own, other in zip(student(observation), guide(observation), strict=True):
         torch.testing.assert_close(own, other)
+
+
+def begin(folder, fresh):
+    """The weights that a student begins with."""
+    (folder / "resume").mkdir(parents=True)
+    return Imitation(GuidedRun(folder, config(settings={"fresh": fresh}))).student.state_dict()
 
 
 def test_a_student_sees_the_goal_and_its_guide_the_way():

@@ -46,6 +46,8 @@ class GuidedSettings:
       guided_share: share of training episodes that the guide walks itself.
       least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
+      fresh: begin with random weights instead of the guide's: in an open maze, where the guide's own weights are an
+        expert from the first step on, a student that learns to run passes through what medium is picked from.
       half_life: agent steps in which the learning rate halves.
       layers: hidden layers of the student; those that the guide lacks begin as identities. More fit a fixed set of
         steps better (medium7x7a, an earlier guide, after 7,500 updates: 1.9, 1.5 and 1.4 nats on unseen steps with 2,
@@ -58,6 +60,7 @@ class GuidedSettings:
     learning_rate: Positive = 1e-3
     half_life: Positive = 30_000
     layers: Count = 2
+    fresh: bool = False
     updates_per_step: Positive = 0.25
     buffer_size: Count = 400_000
     ahead: NonNegative = AHEAD
@@ -69,7 +72,7 @@ class GuidedSettings:
 
 
 class GuidedRun(Run):
-    """A run of guided imitation. The student starts from the guide's weights."""
+    """A run of guided imitation. The student starts from the guide's weights, or from none of them."""
 
     @functools.cached_property
     def guide(self) -> Policy:
@@ -150,7 +153,10 @@ class Imitation:
         task, config, settings = run.task, run.config, run.settings
         torch.manual_seed(config.seed)
         self.student = Actor(run.header)
-        self.student.load_state_dict(deepened(as_tensors(run.guide.weights), self.student.state_dict()))
+        begin = deepened(as_tensors(run.guide.weights), self.student.state_dict())
+        if settings.fresh:
+            begin = self.student.state_dict() | {name: begin[name] for name in ("observation_mean", "observation_std")}
+        self.student.load_state_dict(begin)
         self.guide = Actor(run.guide.header).requires_grad_(False)
         self.guide.load_state_dict(as_tensors(run.guide.weights))
         self.optimizer = torch.optim.Adam(self.student.parameters(), lr=settings.learning_rate, fused=True)
