@@ -8,6 +8,7 @@ import shutil
 import pytest
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.publish import fetch, publish
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.plan import make_plan
@@ -129,3 +130,11 @@ def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there
     monkeypatch.setattr(module, "_put", put)
     publish(grown, url)
     assert open_release(url).manifest.version == "1.2.0" and verify(tmp_path / "there").sound
+
+
+def test_the_card_lists_the_arrays_of_every_kind_of_subset(grown, tmp_path):
+    text = write_card(grown, tmp_path)[0].read_text()
+    arrays = text.split("## Arrays")[1].split("## Returns")[0]
+    assert "`walker-walk/random/none`, `walker-walk/random/static`:" in arrays
+    assert "| `pixels` | uint8 |" in arrays and "| `pixels_hidden_goal_top` | uint8 |" in arrays
+    assert arrays.count("| `physics` | float64 |") == 2

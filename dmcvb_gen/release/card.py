@@ -25,6 +25,7 @@ from dmcvb_gen.rollout.recipe import distractor_of, is_maze
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.store.manifest import Manifest
+from dmcvb_gen.store.schema import stored_name
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
@@ -151,7 +152,24 @@ def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
     manifest = release.manifest
     first = next(iter(release.subsets.values()))
     lines = [header(manifest, facts["steps"]), "", f"# {manifest.name} {manifest.version}", "", summary, ""]
-    lines += [f"![First episode of every subset]({SHEET})", "", "## Composition", ""]
+    lines += [f"![First episode of every subset]({SHEET})", "", "## Composition", "", *_composition(facts), ""]
+    lines += ["## Arrays", "", *_arrays(release), ""]
+    lines += ["## Returns", "", *_returns(facts), ""]
+    lines += ["## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
+    lines += ["## Known limits", "", *(f"- {limit}" for limit in _limits(release)), ""]
+    lines += ["## Load it", "", *_loading(manifest, first.name), ""]
+    lines += ["## Check it, make it again", "", "```bash", f"dmcvb-gen verify {manifest.name}"]
+    lines += [f"# digest {manifest.digest or 'not finished'}"]
+    lines += [f"dmcvb-gen regenerate {manifest.name} --check      # simulates and paints everything again"]
+    lines += ["```", "", "## License and citation", ""]
+    lines += [
+        f"Data: {manifest.license}. Authors: {', '.join(manifest.authors) or 'not named'}. "
+        "The benchmark that this data follows:"
+    ]
+    return "\n".join([*lines, "", "```bibtex", CITATION, "```", ""])
+
+
+def _composition(facts: dict[str, Any]) -> list[str]:
     rows = [
         (
             f"`{s['name']}`",
@@ -163,66 +181,60 @@ def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
         )
         for s in facts["subsets"]
     ]
-    lines += _table(("subset", "episodes", "steps", "pixels", "size", "digest"), rows)
-    lines += ["", "Names are task/level/distractor. A step is two control steps with the same action.", ""]
-    lines += ["## Arrays", ""]
-    rows = [
-        (f"`{name}`", str(first.array(name).dtype), " x ".join(map(str, first.array(name).dimensions)))
-        for name in first.arrays
-    ]
-    lines += _table(("array", "type", "dimensions"), rows)
-    lines += [
-        "",
+    table = _table(("subset", "episodes", "steps", "pixels", "size", "digest"), rows)
+    return [*table, "", "Names are task/level/distractor. A step is two control steps with the same action."]
+
+
+def _arrays(release: Release) -> list[str]:
+    """A table of arrays for each kind of subset, that is, for all subsets with the same ones."""
+    kinds: dict[tuple, list[str]] = {}
+    for name, subset in release.subsets.items():
+        arrays = [(array, subset.array(array)) for array in subset.arrays]
+        rows = tuple((stored_name(n), str(a.dtype), " x ".join(a.dimensions), _sizes(a.shape)) for n, a in arrays)
+        kinds.setdefault(rows, []).append(name)
+    lines = []
+    for rows, names in kinds.items():
+        if len(kinds) > 1:
+            lines += [f"{', '.join(f'`{name}`' for name in names)}:", ""]
+        shown = [(f"`{name}`", *facts) for name, *facts in rows]
+        lines += [*_table(("array", "type", "dimensions", "sizes past the episodes"), shown), ""]
+    lines.append(
         "Row t of an episode holds observation t, the action taken there and the reward it earned; row `length` holds "
         "the last observation alone. `exogenous/` are the distractors' labels: every picture is a function of "
-        "`physics` and these.",
-        "",
-        "## Returns",
-        "",
-        "Episode returns, with those of the DMC-VB paper's data where it has the same task and level.",
-        "",
-        f"![Returns]({PLOT})",
-        "",
-    ]
+        "`physics` and these."
+    )
+    return lines
+
+
+def _sizes(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape[1:]))
+
+
+def _returns(facts: dict[str, Any]) -> list[str]:
     rows = []
     for subset in facts["subsets"]:
         rows.append((f"`{subset['name']}`", *(f"{subset['returns'][key]:.1f}" for key in STATISTICS)))
         if subset["paper"]:
             rows.append(("DMC-VB paper", *(f"{subset['paper'][key]:.1f}" for key in STATISTICS)))
-    lines += _table(("subset", *STATISTICS), rows)
-    lines += ["", "## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
-    lines += ["## Known limits", "", *(f"- {limit}" for limit in _limits(release)), ""]
-    lines += ["## Load it", "", "```python", "import dmcvb_gen", ""]
-    lines += [
-        f'subset = dmcvb_gen.open("{manifest.name}")["{first.name}"]  # a folder or URL',
+    text = "Episode returns, with those of the DMC-VB paper's data where it has the same task and level."
+    return [text, "", f"![Returns]({PLOT})", "", *_table(("subset", *STATISTICS), rows)]
+
+
+def _loading(manifest: Manifest, name: str) -> list[str]:
+    return [
+        "```python",
+        "import dmcvb_gen",
+        "",
+        f'subset = dmcvb_gen.open("{manifest.name}")["{name}"]  # a folder or URL',
         "episode = subset.episode(0)                    # numpy arrays by name",
         "data = subset.xarray()                         # lazy xarray.Dataset",
         'stacks = subset.torch("steps", stack=3)        # torch Dataset of 3-frame stacks',
         "for batch in subset.batches(256): ...          # shuffled numpy batches",
         "```",
         "",
-        "or with plain zarr or xarray: "
-        f'`xarray.open_zarr("{manifest.name}/{first.name}.zarr")` (Zarr format 3, consolidated metadata).',
-        "",
-        "## Check it, make it again",
-        "",
-        "```bash",
-        f"dmcvb-gen verify {manifest.name}",
-        f"# digest {manifest.digest or 'not finished'}",
-        f"dmcvb-gen regenerate {manifest.name} --check      # simulates and paints everything again, compares digests",
-        "```",
-        "",
-        "## License and citation",
-        "",
-        f"Data: {manifest.license}. Authors: {', '.join(manifest.authors) or 'not named'}. "
-        "The benchmark that this data follows:",
-        "",
-        "```bibtex",
-        CITATION,
-        "```",
-        "",
+        f'or with plain zarr or xarray: `xarray.open_zarr("{manifest.name}/{name}.zarr")` (Zarr format 3, '
+        "consolidated metadata).",
     ]
-    return "\n".join(lines)
 
 
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
