@@ -26,6 +26,7 @@ from dmcvb_gen.rendering.native.records import (
     OPACITY,
     OWN_OPACITY,
     PLACE,
+    QUAD,
     RGB,
     SIZE,
     SKY,
@@ -34,7 +35,7 @@ from dmcvb_gen.rendering.native.records import (
     VIEW,
     WINDOW,
 )
-from dmcvb_gen.rendering.native.sampling import part
+from dmcvb_gen.rendering.native.sampling import leaf, part
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
 from dmcvb_gen.rendering.native.shading import shade_body, shade_plane, shade_sky
 from dmcvb_gen.rendering.native.visibility import (
@@ -88,6 +89,8 @@ class Work(NamedTuple):
     rec: np.ndarray  # (geom, records.WIDTH)
     k: np.ndarray  # (records.LENGTH,)
     vertices: np.ndarray  # (vertex, vertex, 3) the lamp's color on the lit plane
+    heaven: np.ndarray  # (pixels^2, 3) the sky's color where `known`
+    known: np.ndarray  # (pixels^2,) bool
 
 
 def make_work(geoms: int, pixels: int, lines: np.ndarray, width: int) -> Work:
@@ -101,13 +104,15 @@ def make_work(geoms: int, pixels: int, lines: np.ndarray, width: int) -> Work:
         rec=np.zeros((geoms, width)),
         k=np.zeros(LENGTH),
         vertices=np.zeros((max(int(lines[0]), 1), max(int(lines[1]), 1), 3)),
+        heaven=np.zeros((pixels * pixels, 3)),
+        known=np.zeros(pixels * pixels, np.bool_),
     )
 
 
 # -- poses -----------------------------------------------------------------------------------------
 
 
-@part
+@leaf
 def turned(axes, f, row, x, y, z):
     """Component `row` of a world direction in the camera's frame."""
     return axes[f, 0, row] * x + axes[f, 1, row] * y + axes[f, 2, row] * z
@@ -143,9 +148,10 @@ def pose_camera(k, eye, axes, lamp, sky, f):
         k[LAMP + 3 + row] = turned(axes, f, row, lamp[f, 3], lamp[f, 4], lamp[f, 5])
     k[EYE], k[EYE + 1], k[EYE + 2] = 0.0, 0.0, -1.0
     k[SKY] = sky[f]
+    k[QUAD] = -1.0
 
 
-@part
+@leaf
 def mirrored(x, y, z, nx, ny, nz, away):
     """A point mirrored in the plane with unit normal n, `away` from the origin; a direction with `away` 0."""
     twice = 2.0 * (x * nx + y * ny + z * nz - away)
@@ -251,7 +257,7 @@ def draw_behind(inverse, behind, behind_number, xs, ys, offsets, k, rec, hide_go
 
 
 @part
-def shade_surface(k, rec, texels, table, grid, vertices, geom, behind, veiled, pixels, row, column):
+def shade_surface(k, rec, texels, table, grid, vertices, heaven, known, geom, behind, veiled, pixels, row, column):
     """(red, green, blue) in [0, 1] of what samples of a pixel show.
 
     Args:
@@ -262,7 +268,11 @@ def shade_surface(k, rec, texels, table, grid, vertices, geom, behind, veiled, p
         a, b, c, d, e, f = shade_body(k, rec, texels, table, behind, pixels, row, column, True)
         red, green, blue = min(a + d, 1.0), min(b + e, 1.0), min(c + f, 1.0)
     if geom == NOTHING:
-        red, green, blue = shade_sky(k, texels, table, pixels, row, column)
+        at = row * pixels + column
+        if not known[at]:
+            known[at] = True
+            heaven[at, 0], heaven[at, 1], heaven[at, 2] = shade_sky(k, texels, table, pixels, row, column)
+        red, green, blue = heaven[at, 0], heaven[at, 1], heaven[at, 2]
     else:
         if rec[geom, KIND] == PLANE:
             a, b, c, d, e, f = shade_plane(k, rec, texels, table, grid, vertices, geom, pixels, row, column)
@@ -280,37 +290,65 @@ def shade_surface(k, rec, texels, table, grid, vertices, geom, behind, veiled, p
     return red, green, blue
 
 
+@leaf
+def drop_hidden_images(number, inverse, behind, behind_number, first, mirror):
+    """Keep a pixel's mirror images where the mirror is in front, and the image beyond it."""
+    for s in range(first, first + 4):
+        if behind_number[s] != NOTHING and (number[s] != mirror or behind[s] >= inverse[s]):
+            behind_number[s] = NOTHING
+
+
+@leaf
+def share_of(number, behind_number, first, s):
+    """How many of a pixel's samples show what sample s does; 0 if one before it does."""
+    count = 1
+    for t in range(first, first + 4):
+        if t != s and number[t] == number[s] and behind_number[t] == behind_number[s]:
+            if t < s:
+                return 0
+            count += 1
+    return count
+
+
 @part
 def shade_picture(
-    k, rec, texels, table, grid, vertices, inverse, number, behind, behind_number, veiled, pixels, out, f
-):
+    k, rec, texels, table, grid, vertices, heaven, known,
+    inverse, number, behind, behind_number, veiled, pixels, out, f,
+):  # fmt: skip
     """Write frame f of `out`: each surface in a pixel is shaded once and weighted by its samples."""
-    mirror = int(k[MIRROR])
-    for row in range(pixels):
-        for column in range(pixels):
-            first = 4 * (row * pixels + column)
-            if not veiled:  # an image shows where the mirror is in front, and the image beyond it
-                for s in range(first, first + 4):
-                    if behind_number[s] != NOTHING and (number[s] != mirror or behind[s] >= inverse[s]):
-                        behind_number[s] = NOTHING
-            red, green, blue = 0.0, 0.0, 0.0
-            for s in range(first, first + 4):
-                geom, other = number[s], behind_number[s]
-                count, seen = 1, False
-                for t in range(first, s):
-                    seen = seen or (number[t] == geom and behind_number[t] == other)
-                if seen:
-                    continue
-                for t in range(s + 1, first + 4):
-                    if number[t] == geom and behind_number[t] == other:
-                        count += 1
+    mirror, layered = int(k[MIRROR]), veiled or k[MIRROR] >= 0.0
+    half = (pixels + 1) // 2
+    for place in range(4 * half * half):  # two by two, as texture footprints are shared
+        quad, corner = place >> 2, place & 3
+        row, column = 2 * (quad // half) + (corner >> 1) - (pixels & 1), 2 * (quad % half) + (corner & 1)
+        if row < 0 or row >= pixels or column >= pixels:
+            continue
+        first = 4 * (row * pixels + column)
+        if layered and not veiled:
+            drop_hidden_images(number, inverse, behind, behind_number, first, mirror)
+        red, green, blue, left, s = 0.0, 0.0, 0.0, 4, first
+        while left > 0:
+            count = share_of(number, behind_number, first, s)
+            if count > 0:
                 a, b, c = shade_surface(
-                    k, rec, texels, table, grid, vertices, int(geom), int(other), veiled, pixels, row, column
-                )
-                red, green, blue = red + count * a, green + count * b, blue + count * c
-            out[f, row, column, 0] = np.uint8(red * 63.75 + 0.5)
-            out[f, row, column, 1] = np.uint8(green * 63.75 + 0.5)
-            out[f, row, column, 2] = np.uint8(blue * 63.75 + 0.5)
+                    k, rec, texels, table, grid, vertices, heaven, known,
+                    int(number[s]), int(behind_number[s]), veiled, pixels, row, column,
+                )  # fmt: skip
+                red, green, blue, left = red + count * a, green + count * b, blue + count * c, left - count
+            s += 1
+        out[f, row, column, 0] = np.uint8(red * 63.75 + 0.5)
+        out[f, row, column, 1] = np.uint8(green * 63.75 + 0.5)
+        out[f, row, column, 2] = np.uint8(blue * 63.75 + 0.5)
+
+
+@leaf
+def same_sky(axes, sky, f):
+    """Whether frame f shows the sky as the frame before it did."""
+    same = f > 0 and sky[f] == sky[f - 1]
+    for row in range(3):
+        for column in range(3):
+            same = same and axes[f, row, column] == axes[f - 1, row, column]
+    return same
 
 
 @part
@@ -330,7 +368,7 @@ def light_frame(k, rec, grid, vertices):
 def paint_frames(
     looks, constants, boxes, grid, texels, table, xs, ys, offsets,
     center, turn, eye, axes, lamp, rgb, look, sky,
-    inverse, number, behind, behind_number, rec, k, vertices,
+    inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
     hide_goal, out,
 ):  # fmt: skip
     """Paint frames into `out` (frame, pixels, pixels, 3) uint8; arguments as `Still`, `Frames` and `Work` name them."""
@@ -341,16 +379,19 @@ def paint_frames(
         veiled = draw_front(inverse, number, xs, ys, offsets, k, rec, hide_goal, in_a_box(boxes, eye, f))
         draw_behind(inverse, behind, behind_number, xs, ys, offsets, k, rec, hide_goal, veiled)
         light_frame(k, rec, grid, vertices)
+        if not same_sky(axes, sky, f):
+            known[:] = False
         shade_picture(
-            k, rec, texels, table, grid, vertices, inverse, number, behind, behind_number, veiled, ys.size, out, f
-        )
+            k, rec, texels, table, grid, vertices, heaven, known,
+            inverse, number, behind, behind_number, veiled, ys.size, out, f,
+        )  # fmt: skip
 
 
 @part
 def label_frames(
     looks, constants, boxes, grid, texels, table, xs, ys, offsets,
     center, turn, eye, axes, lamp, rgb, look, sky,
-    inverse, number, behind, behind_number, rec, k, vertices,
+    inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
     depth, geom,
 ):  # fmt: skip
     """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them."""
@@ -375,14 +416,14 @@ def painter(version: int):
     def paint(
         looks, constants, boxes, grid, texels, table, xs, ys, offsets,
         center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, vertices,
+        inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
         hide_goal, out,
     ):  # fmt: skip
         if version != 0:
             paint_frames(
                 looks, constants, boxes, grid, texels, table, xs, ys, offsets,
                 center, turn, eye, axes, lamp, rgb, look, sky,
-                inverse, number, behind, behind_number, rec, k, vertices,
+                inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
                 hide_goal, out,
             )  # fmt: skip
 
@@ -396,14 +437,14 @@ def labeler(version: int):
     def label(
         looks, constants, boxes, grid, texels, table, xs, ys, offsets,
         center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, vertices,
+        inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
         depth, geom,
     ):  # fmt: skip
         if version != 0:
             label_frames(
                 looks, constants, boxes, grid, texels, table, xs, ys, offsets,
                 center, turn, eye, axes, lamp, rgb, look, sky,
-                inverse, number, behind, behind_number, rec, k, vertices,
+                inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
                 depth, geom,
             )  # fmt: skip
 

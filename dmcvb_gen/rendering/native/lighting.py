@@ -29,12 +29,12 @@ from dmcvb_gen.rendering.native.records import (
     TURN,
     WINDOW,
 )
-from dmcvb_gen.rendering.native.sampling import part
+from dmcvb_gen.rendering.native.sampling import leaf, part
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
 from dmcvb_gen.rendering.native.visibility import slopes_of_ball
 
 
-@part
+@leaf
 def power(base, exponent):
     """`base` to a whole power by multiplication, so that its bits are the same everywhere."""
     result = 1.0
@@ -46,7 +46,7 @@ def power(base, exponent):
     return result
 
 
-@part
+@leaf
 def highlight(nx, ny, nz, lx, ly, lz, vx, vy, vz, exponent):
     """(N.H)^exponent; n and l are of unit length, v points to the eye."""
     length = math.sqrt(vx * vx + vy * vy + vz * vz)
@@ -60,7 +60,7 @@ def highlight(nx, ny, nz, lx, ly, lz, vx, vy, vz, exponent):
     return power(math.sqrt(square), exponent)
 
 
-@part
+@leaf
 def headlight_terms(k, eye, px, py, pz, nx, ny, nz, exponent):
     """(N.L, specular) of the headlight at a point p; `eye` is where its direction is in k."""
     diffuse = -(nx * k[eye] + ny * k[eye + 1] + nz * k[eye + 2])
@@ -87,7 +87,7 @@ def lamp_terms(k, lamp, px, py, pz, nx, ny, nz, exponent):
     return factor, diffuse, highlight(nx, ny, nz, lx, ly, lz, -px, -py, -pz, exponent)
 
 
-@part
+@leaf
 def lit(k, light, c, own, factor, diffuse, specular):
     """Channel c of a light's color; `light` is where it is in k, `own` the material's color there."""
     return factor * (own * (k[light + c] + k[light + 3 + c] * diffuse) + k[light + 6 + c] * specular)
@@ -129,7 +129,7 @@ def aim_shadows(k, rec):
         rec[g, BOUNDS + 2], rec[g, BOUNDS + 3] = least_y, most_y
 
 
-@part
+@leaf
 def in_map(k, px, py, pz):
     """A point as (right, up, depth) of the shadow map."""
     dx, dy, dz = px - k[LAMP], py - k[LAMP + 1], pz - k[LAMP + 2]
@@ -140,7 +140,7 @@ def in_map(k, px, py, pz):
     )
 
 
-@part
+@leaf
 def ball_blocks(dx, dy, dz, ox, oy, oz, radius):
     """Whether the way from the origin to d meets a ball around o before its end."""
     square = dx * dx + dy * dy + dz * dz
@@ -224,7 +224,7 @@ def cone_slope(cosine, down):
 
 @part
 def light_vertices(k, rec, grid, vertices, g):
-    """Fill WINDOW, and `vertices` (vertex, vertex, 3) in it, with the lamp's color on plane g.
+    """Fill WINDOW (first and past the last along two axes), and `vertices` in it, with the lamp's color on plane g.
 
     An opaque plane is lit in two passes; on one that is seen through both lights are added before they are cut at 1.
     """
@@ -241,7 +241,8 @@ def light_vertices(k, rec, grid, vertices, g):
         past = first
         while past < lines and grid[axis, past] <= middle + reach and height > 0.0:
             past += 1
-        k[WINDOW + 2 * axis], k[WINDOW + 2 * axis + 1] = first, past
+        # With the dark vertices around it, so that every cell that has any light has all its corners.
+        k[WINDOW + 2 * axis], k[WINDOW + 2 * axis + 1] = max(first - 1, 0), min(past + 1, lines)
     share, exponent = rec[g, SHARE], int(rec[g, EXPONENT])
     for i in range(int(k[WINDOW]), int(k[WINDOW + 1])):
         for j in range(int(k[WINDOW + 2]), int(k[WINDOW + 3])):
@@ -259,15 +260,7 @@ def light_vertices(k, rec, grid, vertices, g):
                 vertices[i, j, c] = color
 
 
-@part
-def vertex_light(k, vertices, i, j, c):
-    """The lamp's color c at a vertex of the lit plane."""
-    if i < k[WINDOW] or i >= k[WINDOW + 1] or j < k[WINDOW + 2] or j >= k[WINDOW + 3]:
-        return 0.0
-    return vertices[i, j, c]
-
-
-@part
+@leaf
 def cell_of(grid, axis, lines, x):
     """The cell of a plane's grid that holds x."""
     if x < grid[axis, 1]:
@@ -281,24 +274,24 @@ def cell_of(grid, axis, lines, x):
 def lamp_on_plane(k, grid, vertices, x, y):
     """The lamp's color at (x, y) of the lit plane; OpenGL draws each cell as two triangles."""
     i, j = cell_of(grid, 0, int(k[LINES]), x), cell_of(grid, 1, int(k[LINES + 1]), y)
-    if i + 1 < k[WINDOW] or i >= k[WINDOW + 1] or j + 1 < k[WINDOW + 2] or j >= k[WINDOW + 3]:
+    if i < k[WINDOW] or i + 1 >= k[WINDOW + 1] or j < k[WINDOW + 2] or j + 1 >= k[WINDOW + 3]:
         return 0.0, 0.0, 0.0
     wide, high = grid[0, i + 1] - grid[0, i], grid[1, j + 1] - grid[1, j]
     a = (x - grid[0, i]) / wide if wide > 0.0 else 0.0
     b = (y - grid[1, j]) / high if high > 0.0 else 0.0
     return (
-        blended(k, vertices, i, j, a, b, 0),
-        blended(k, vertices, i, j, a, b, 1),
-        blended(k, vertices, i, j, a, b, 2),
+        blended(vertices, i, j, a, b, 0),
+        blended(vertices, i, j, a, b, 1),
+        blended(vertices, i, j, a, b, 2),
     )
 
 
-@part
-def blended(k, vertices, i, j, a, b, c):
+@leaf
+def blended(vertices, i, j, a, b, c):
     """Blend of color c of a cell's corners, (a, b) being the place in it."""
-    right, up = vertex_light(k, vertices, i + 1, j, c), vertex_light(k, vertices, i, j + 1, c)
+    right, up = vertices[i + 1, j, c], vertices[i, j + 1, c]
     if a + b <= 1.0:
-        corner = vertex_light(k, vertices, i, j, c)
+        corner = vertices[i, j, c]
         return corner + a * (right - corner) + b * (up - corner)
-    corner = vertex_light(k, vertices, i + 1, j + 1, c)
+    corner = vertices[i + 1, j + 1, c]
     return corner + (1.0 - a) * (up - corner) + (1.0 - b) * (right - corner)

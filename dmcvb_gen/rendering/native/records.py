@@ -49,7 +49,8 @@ SHADOW = 47  # 9: right, up and forward directions of the shadow map
 WINDOW = 56  # 4: the vertices (first, past the last; two axes) that the lamp's cone reaches
 VIEW = 60  # 9: the camera's axes in the world, columns right, up, back
 SKY = 69  # texture of the sky, -1: none
-LENGTH = 70
+QUAD = 70  # 3: number, geom and squared footprint of the two by two pixels shaded last
+LENGTH = 73
 
 # -- columns of the table of textures (texture, ...), int64
 LEVELS = 0

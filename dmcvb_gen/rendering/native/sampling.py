@@ -15,9 +15,11 @@ from dmcvb_gen.rendering.native.records import FACES, FIRST, LEVELS
 
 part = njit(nogil=True, error_model="numpy")
 """For the parts of the entry points in `frame`, which alone are kept on disk."""
+leaf = njit(nogil=True, error_model="numpy", forceinline=True)
+"""For small parts: numba hands an array over as seven numbers or more, so a call can cost more than its work."""
 
 
-@part
+@leaf
 def level_of_detail(rho_squared):
     """(finer level, share of the next one in 1/256) of a footprint of `rho` texels a pixel.
 
@@ -33,7 +35,7 @@ def level_of_detail(rho_squared):
     return level, int(256.0 * share) if share > 0.0 else 0
 
 
-@part
+@leaf
 def repeated(coordinate, size):
     """The two texels around a repeating coordinate, and the second one's weight in 1/256."""
     place = (coordinate - math.floor(coordinate)) * size + 0.5
@@ -47,7 +49,7 @@ def repeated(coordinate, size):
     return first, second, weight
 
 
-@part
+@leaf
 def clamped(coordinate, size):
     """As `repeated`, for a coordinate in [0, 1] that ends at the texture's edge."""
     place = coordinate * size + 0.5
@@ -56,7 +58,7 @@ def clamped(coordinate, size):
     return max(second - 1, 0), min(second, size - 1), weight
 
 
-@part
+@leaf
 def blend_of_four(texels, top, bottom, left, right, across, down):
     """Red and blue (in the halves of one integer), and green, of four texels, times 65536."""
     a, b, all_ = np.uint64(across), np.uint64(down), np.uint64(256)
@@ -81,7 +83,7 @@ def blend_of_four(texels, top, bottom, left, right, across, down):
     return red_blue, green
 
 
-@part
+@leaf
 def unpacked(red_blue, green, nearer, farther, share):
     """Two levels' `blend_of_four` mixed, as colors in [0, 1]."""
     unit = 1.0 / (255.0 * 65536.0)
@@ -96,7 +98,7 @@ def unpacked(red_blue, green, nearer, farther, share):
     return red * unit, green_ * unit, blue * unit
 
 
-@part
+@leaf
 def repeating_level(texels, table, texture, level, s, t):
     """`blend_of_four` at (s, t) of a level of a repeating texture."""
     entry = FIRST + 3 * level
@@ -121,7 +123,7 @@ def sample_repeating(texels, table, texture, s, t, rho_squared):
     return unpacked(red_blue, green, more, more_green, share)
 
 
-@part
+@leaf
 def cube_face(x, y, z):
     """Face of a cube map, its two coordinates' numerators and the length that divides them (OpenGL's table)."""
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -132,7 +134,7 @@ def cube_face(x, y, z):
     return (2, x, z, ay) if y >= 0.0 else (3, x, -z, ay)
 
 
-@part
+@leaf
 def face_change(face, dx, dy, dz):
     """How the numerators and the length of a face change with the direction."""
     if face == 0:
@@ -148,7 +150,7 @@ def face_change(face, dx, dy, dz):
     return -dx, -dy, -dz
 
 
-@part
+@leaf
 def cube_level(texels, table, texture, level, face, s, t):
     """`blend_of_four` at (s, t) in [0, 1] of a face of a level of a cube map."""
     entry = FIRST + 3 * level

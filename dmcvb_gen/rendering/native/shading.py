@@ -26,6 +26,7 @@ from dmcvb_gen.rendering.native.records import (
     MIRRORED_PLACE,
     OPACITY,
     PLACE,
+    QUAD,
     REFLECTANCE,
     REPEAT,
     RGB,
@@ -38,25 +39,25 @@ from dmcvb_gen.rendering.native.records import (
     TURN,
     VIEW,
 )
-from dmcvb_gen.rendering.native.sampling import part, sample_cube, sample_repeating
+from dmcvb_gen.rendering.native.sampling import leaf, part, sample_cube, sample_repeating
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE
 
 
-@part
+@leaf
 def ray_of(step, pixels, row, column):
     """x and y of the ray through a pixel's center."""
     half = 0.5 * pixels
     return (column + 0.5 - half) * step, (half - row - 0.5) * step
 
 
-@part
+@leaf
 def quad_ray(step, pixels, row, column):
     """The ray of the first pixel of the two by two in which OpenGL takes differences (to the right, and up)."""
     last = pixels - 1
     return ray_of(step, pixels, last - ((last - row) & ~1), column & ~1)
 
 
-@part
+@leaf
 def place_on_plane(rec, g, x, y):
     """A plane's coordinates, over its half lengths, where the ray (x, y) meets it."""
     at = FUNCTIONS
@@ -67,23 +68,26 @@ def place_on_plane(rec, g, x, y):
     )
 
 
-@part
+@leaf
 def texel_on_plane(k, rec, texels, table, g, pixels, row, column, a, b):
     """Color of a plane's texture at a pixel, (a, b) being the place on it over its half lengths."""
     texture = int(rec[g, TEXTURE])
     if texture < 0:
         return 1.0, 1.0, 1.0
-    step = k[STEP]
-    x, y = quad_ray(step, pixels, row, column)
     scale_a, scale_b = rec[g, REPEAT] * rec[g, SIZE], rec[g, REPEAT + 1] * rec[g, SIZE + 1]
-    a0, b0 = place_on_plane(rec, g, x, y)
-    a1, b1 = place_on_plane(rec, g, x + step, y)
-    a2, b2 = place_on_plane(rec, g, x, y + step)
-    rho = max(
-        max(abs(a1 - a0), abs(a2 - a0)) * scale_a * table[texture, FIRST + 1],
-        max(abs(b1 - b0), abs(b2 - b0)) * scale_b * table[texture, FIRST + 2],
-    )
-    return sample_repeating(texels, table, texture, scale_a * (1.0 + a), scale_b * (1.0 - b), rho * rho)
+    quad = ((row + (pixels & 1)) >> 1) * pixels + (column >> 1)
+    if k[QUAD] != quad or k[QUAD + 1] != g:  # else as for the pixel before
+        step = k[STEP]
+        x, y = quad_ray(step, pixels, row, column)
+        a0, b0 = place_on_plane(rec, g, x, y)
+        a1, b1 = place_on_plane(rec, g, x + step, y)
+        a2, b2 = place_on_plane(rec, g, x, y + step)
+        rho = max(
+            max(abs(a1 - a0), abs(a2 - a0)) * scale_a * table[texture, FIRST + 1],
+            max(abs(b1 - b0), abs(b2 - b0)) * scale_b * table[texture, FIRST + 2],
+        )
+        k[QUAD], k[QUAD + 1], k[QUAD + 2] = quad, g, rho * rho
+    return sample_repeating(texels, table, texture, scale_a * (1.0 + a), scale_b * (1.0 - b), k[QUAD + 2])
 
 
 @part
@@ -146,7 +150,7 @@ def meet_body(rec, g, place, axis, x, y):
     return unit_normal(depth, x, y, ox, oy, oz)
 
 
-@part
+@leaf
 def unit_normal(depth, x, y, ox, oy, oz):
     """The depth, and the direction from o to the point at that depth of the ray (x, y)."""
     nx, ny, nz = depth * x - ox, depth * y - oy, -depth - oz
@@ -154,7 +158,7 @@ def unit_normal(depth, x, y, ox, oy, oz):
     return depth, nx * over, ny * over, nz * over
 
 
-@part
+@leaf
 def own_direction(rec, g, nx, ny, nz):
     """A direction in geom g's own frame."""
     return (
