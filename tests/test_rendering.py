@@ -1,4 +1,4 @@
-"""Both renderers through one suite, and each against what it should look like."""
+"""All renderers through one suite, and each against what it should look like."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 
 needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
-RENDERERS = ["warp", pytest.param("opengl", marks=needs_opengl)]
+RENDERERS = ["native", "warp", pytest.param("opengl", marks=needs_opengl)]
 FRAMES = 12
 LARGEST_DIFFERENCE = {"none": 8.0, "static": 8.0, "dynamic": 8.0}
 """Mean absolute difference of the renderers in grey levels of 255: no mirror image on the floor in warp."""
@@ -126,19 +126,20 @@ def test_the_background_shows_through_humanoids_floor(name):
 
 
 @needs_opengl
+@pytest.mark.parametrize("other", ["warp", "native"])
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
-def test_depth_and_segmentation_of_the_renderers_agree(task_id):
+def test_depth_and_segmentation_of_the_renderers_agree(task_id, other):
     task, setting, physics, labels = frames_of(task_id, "none", 4)
     found = {}
-    for name in ("warp", "opengl"):
+    for name in (other, "opengl"):
         renderer = renderer_of(name, task, setting)
         found[name] = renderer.render_labels(physics, labels)
         renderer.close()
-    same = found["warp"]["segmentation"] == found["opengl"]["segmentation"]
+    same = found[other]["segmentation"] == found["opengl"]["segmentation"]
     assert same.mean() > 0.93
     # Warp's labels are of a pixel's first sample, so the floor seen at a low angle is at another distance.
-    both = same & (found["warp"]["segmentation"] > 0)  # 0 is the floor
-    ratio = found["warp"]["depth"][both] / found["opengl"]["depth"][both]
+    both = same & (found[other]["segmentation"] > 0)  # 0 is the floor
+    ratio = found[other]["depth"][both] / found["opengl"]["depth"][both]
     assert len(ratio) > 20 and np.median(np.abs(ratio - 1)) < 0.02
 
 
@@ -190,8 +191,9 @@ def test_sizes_out_of_range_are_refused(name, size):
 def test_unknown_renderers_and_devices_name_the_cure():
     with pytest.raises(UnknownNameError, match="warp"):
         make_renderer("vulkan", get_task("walker-walk"), 64)
-    with pytest.raises(RenderingError, match="--device cpu"):
-        make_renderer("warp", get_task("walker-walk"), 64, device="cuda:7")
+    for name in ("warp", "native"):
+        with pytest.raises(RenderingError, match="--device cpu"):
+            make_renderer(name, get_task("walker-walk"), 64, device="cuda:7")
 
 
 def test_available_renderers_say_why_not():

@@ -1,0 +1,147 @@
+"""The painter of our own against OpenGL, and against its own golden pictures.
+
+Golden pictures fail where a change of ours or of a dependency changes pixels. Look at the new ones before they
+replace the old: `python -m tests.test_native` writes them all anew.
+"""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds
+from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from tests.test_rendering import frames_of, needs_opengl, renderer_of
+
+MAZE = "ant-maze-medium7x7a"
+GOLDEN = Path(__file__).parent / "golden"
+CASES = [(task, setting) for task in LOCOMOTION_TASKS for setting in ("none", "dynamic")] + [(MAZE, "none")]
+LARGEST_DIFFERENCE = {"walker-walk": 1.5, "cheetah-run": 1.5, "humanoid-walk": 1.5, MAZE: 2.5}
+"""Mean absolute difference to OpenGL, grey levels of 255 (OpenGL's own picture of 512 pixels, averaged, is 2.1 off)."""
+
+
+@functools.cache
+def pair(task_id: str, setting_name: str):
+    """Frames of a task with OpenGL's and native's pictures of them."""
+    task, setting, physics, labels = frames_of(task_id, setting_name)
+    pictures = []
+    for name in ("opengl", "native"):
+        renderer = renderer_of(name, task, setting)
+        pictures.append(renderer.render(physics, labels).astype(int))
+        renderer.close()
+    return task, *pictures
+
+
+@needs_opengl
+@pytest.mark.parametrize(("task_id", "setting_name"), [*CASES, *((task, "static") for task in LOCOMOTION_TASKS)])
+def test_every_view_is_as_close_to_opengl_as_eyes_see(task_id, setting_name):
+    task, reference, ours = pair(task_id, setting_name)
+    for view, name in enumerate(task.views):
+        difference = ours[:, view] - reference[:, view]
+        assert np.abs(difference).mean() < LARGEST_DIFFERENCE[task_id], name
+        assert 10 * np.log10(255**2 / np.mean(difference**2.0)) > 35, name
+        worst = np.abs(difference).mean(axis=(1, 2, 3)).max()
+        assert worst < 2 * LARGEST_DIFFERENCE[task_id], name  # no frame lacks a shadow or a mirror image
+
+
+@needs_opengl
+def test_larger_pictures_are_as_close():
+    task, setting, physics, labels = frames_of("walker-walk", "dynamic", 2)
+    pictures = []
+    for name in ("opengl", "native"):
+        renderer = renderer_of(name, task, setting, 200)
+        pictures.append(renderer.render(physics, labels).astype(int))
+        renderer.close()
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1.5
+
+
+@pytest.mark.parametrize("size", [8, 9, 65, 1024])
+@pytest.mark.parametrize("task_id", ["walker-walk", MAZE])
+def test_sizes(task_id, size):
+    task, setting, physics, labels = frames_of(task_id, "none", 2)
+    renderer = renderer_of("native", task, setting, size)
+    picture = renderer.render(physics[:1], labels[:1], views=task.views[:1])
+    assert picture.shape == (1, 1, size, size, 3) and 20 < picture.mean() < 235
+    labels_of = renderer.render_labels(physics[:1], labels[:1], views=task.views[:1])
+    assert labels_of["depth"].shape == labels_of["segmentation"].shape == (1, 1, size, size)
+    small = renderer_of("native", task, setting, 64).render(physics[:1], labels[:1], views=task.views[:1])
+    assert abs(float(picture.mean()) - float(small.mean())) < (12 if size < 10 else 3)
+
+
+def test_a_hidden_goal_changes_only_its_own_pixels():
+    task, setting, physics, labels = frames_of(MAZE, "none")
+    renderer = renderer_of("native", task, setting)
+    shown, hidden = renderer.render(physics, labels), renderer.render(physics, labels, hide_goal=True)
+    goal = np.isin(renderer.render_labels(physics, labels)["segmentation"], task.goal_geoms)
+    changed = (shown != hidden).any(axis=-1)
+    assert goal[:, 0].any() and changed[goal].mean() > 0.95
+    grown = goal.copy()
+    for axis in (-1, -2):
+        grown |= np.roll(grown, 1, axis) | np.roll(grown, -1, axis)
+    assert not changed[~grown].any()
+
+
+def test_a_style_changes_a_maze():
+    task, setting, physics, labels = frames_of(MAZE, "none", 2)
+    renderer = renderer_of("native", task, setting)
+    before = renderer.render(physics[:1], labels[:1])
+    other = next(look for look in task.looks(3) if look != labels.style[0])
+    labels.style[:] = other
+    assert (before != renderer.render(physics[:1], labels[:1])).any(axis=-1).mean() > 0.5
+
+
+def test_what_it_does_not_paint_is_refused():
+    with pytest.raises(RenderingError, match="4 samples"):
+        make_renderer("native", get_task("walker-walk"), 64, samples=2)
+
+
+def test_another_process_reads_what_this_one_compiled():
+    task, setting, physics, labels = frames_of("walker-walk", "none", 2)
+    renderer_of("native", task, setting).render(physics, labels)
+    code = (
+        "import logging; logging.basicConfig(level=logging.INFO)\n"
+        "from tests.test_rendering import frames_of, renderer_of\n"
+        "task, setting, physics, labels = frames_of('walker-walk', 'none', 2)\n"
+        "renderer_of('native', task, setting).render(physics, labels)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=GOLDEN.parents[1])
+    assert run.returncode == 0 and "compiled the painter" not in run.stderr
+
+
+# -- golden pictures -------------------------------------------------------------------------------
+
+
+def golden(task_id: str, setting_name: str) -> dict[str, np.ndarray]:
+    """File name -> picture: four moments of each view, side by side."""
+    task, setting, physics, labels = frames_of(task_id, setting_name)
+    renderer = make_renderer(
+        "native", task, 64, backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting)
+    )
+    pictures = renderer.render(physics[::3], labels[::3])
+    return {
+        f"{task_id}_{setting_name}_{view}.png": np.concatenate(list(pictures[:, index]), axis=1)
+        for index, view in enumerate(task.views)
+    }
+
+
+@pytest.mark.parametrize(("task_id", "setting_name"), CASES)
+def test_pictures_are_the_golden_ones(task_id, setting_name):
+    for name, picture in golden(task_id, setting_name).items():
+        expected = np.asarray(Image.open(GOLDEN / name))
+        different = (picture != expected).any(axis=-1).mean()
+        assert different == 0, f"{name}: {different:.2%} of the pixels changed; see the top of {Path(__file__).name}"
+
+
+if __name__ == "__main__":
+    GOLDEN.mkdir(exist_ok=True)
+    for case in CASES:
+        for name, picture in golden(*case).items():
+            Image.fromarray(picture).save(GOLDEN / name, optimize=True)
