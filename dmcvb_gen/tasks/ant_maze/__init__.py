@@ -10,7 +10,7 @@ import re
 
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.tasks.ant_maze.distance import REWARDS
-from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, PAPER_NAMES, fixed_pairs, get_layout, load_layout, make_layout
+from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, load_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import AntMaze
 
 PREFIX = "ant-maze-"
@@ -47,7 +47,6 @@ def layout_task_id(path) -> str:
 __all__ = [
     "ANT_MAZE_TASKS",
     "LAYOUTS",
-    "PAPER_NAMES",
     "AntMaze",
     "ant_maze_task",
     "fixed_pairs",

@@ -32,16 +32,6 @@ LAYOUTS = {
 }
 """DMC-VB's seven layouts, rows joined by "/" (the authors' benchmark code)."""
 
-PAPER_NAMES = {
-    "empty7x7": "ant-maze/empty",
-    "easy7x7a": "ant-maze/single-obstacle",
-    "easy7x7b": "ant-maze/single-obstacle",
-    "easy7x7c": "ant-maze/single-obstacle",
-    "medium7x7a": "ant-maze/multi-obstacle",
-    "medium7x7b": "ant-maze/multi-obstacle",
-    "medium7x7c": "ant-maze/multi-obstacle",
-}
-"""Layout -> the row of the paper's tables that it belongs to."""
 
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_]*$")
 
