@@ -112,7 +112,7 @@ def test_a_published_release_grows_by_its_new_shards_alone(grown, tmp_path):
 def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there(grown, tmp_path, monkeypatch):
     from dmcvb_gen.release import publish as module
 
-    url, put = f"file://{tmp_path}/there", module._put
+    url, put = f"file://{tmp_path}/there", module.put_object
     publish(grown.parent / "before", url)
 
     def stop(filesystem, path, data):
@@ -120,14 +120,14 @@ def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there
             raise StoreError("cut off")
         put(filesystem, path, data)
 
-    monkeypatch.setattr(module, "_put", stop)
+    monkeypatch.setattr(module, "put_object", stop)
     with pytest.raises(StoreError, match="cut off"):
         publish(grown, url)
     old = open_release(url)
     assert old.manifest.version == "1.0.0" and list(old.subsets) == ["walker-walk/random/none"]
     assert json.dumps(old["walker-walk/random/none"].episode(0)["reward"].tolist())
     assert list(old["walker-walk/random/none"].episodes) == [0]
-    monkeypatch.setattr(module, "_put", put)
+    monkeypatch.setattr(module, "put_object", put)
     publish(grown, url)
     assert open_release(url).manifest.version == "1.2.0" and verify(tmp_path / "there").sound
 

@@ -22,11 +22,10 @@ from click.testing import CliRunner
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.release import transfer
 from dmcvb_gen.release.publish import CLAIM, fetch, publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.store import open_release
+from dmcvb_gen.store import open_release, transfer
 from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.remote import public, reason
 from dmcvb_gen.store.writer import finish_release

@@ -14,6 +14,7 @@ from dmcvb_gen.errors import DmcvbError
 
 COMMANDS = {
     "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of painted episodes."),
+    "status": ("cluster:status", "Show how far a release is that is being made, here or on many machines."),
     "info": ("rollout:info", "Show what a release holds, returns beside the paper's."),
     "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
     "show-maze": ("maze:show_maze", "Picture a maze, its distances to a goal and the path there."),

@@ -7,6 +7,7 @@ import dataclasses
 import click
 from tqdm import tqdm
 
+from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json, remote_option
 
 
@@ -97,9 +98,11 @@ def frames_bar(as_json):
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
 @click.option("--device", help="Paint on cpu or cuda instead of where the manifest says.")
 @workers_option
+@executor_option
+@ray_option
 @json_option
 @click.pass_context
-def regenerate(context, path, only, episodes, check, out, backgrounds, device, workers, as_json):
+def regenerate(context, path, only, episodes, check, out, backgrounds, device, workers, executor, ray_address, as_json):
     """Make a release's shards again from its manifest alone, bit for bit.
 
     Repairs damaged and missing shards in place, unless --check or --out is given. Exit code 1 when a shard comes
@@ -113,7 +116,7 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
 
     if check and out:
         raise click.UsageError("Give --check or --out, not both.")
-    work = Regeneration(path, only, episodes, backgrounds, device, workers)
+    work = Regeneration(path, only, episodes, backgrounds, device, crew(workers, executor, ray_address))
     with frames_bar(as_json) as bar:
         outcome = work.remake(out, bar.update) if out else (work.check if check else work.repair)(bar.update)
     if as_json:
@@ -152,8 +155,10 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
 @click.option("--name", help="Name of the new release.  [default: NAME-repainted]")
 @click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the new release.")
 @workers_option
+@executor_option
+@ray_option
 @json_option
-def repaint(path, out, as_json, backgrounds, workers, **options):
+def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **options):
     """Give episodes new pixels, from their stored physics states: nothing is simulated.
 
     \b
@@ -165,7 +170,7 @@ def repaint(path, out, as_json, backgrounds, workers, **options):
 
     request = Repainting(path, local_folder(out), backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
-        manifest = run(request, workers, bar.update)
+        manifest = run(request, crew(workers, executor, ray_address), bar.update)
     if as_json:
         return print_json({"out": out, "complete": manifest.complete, "subsets": [s.name for s in manifest.subsets]})
     for subset in manifest.subsets:

@@ -12,7 +12,15 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json, remote_option
+from dmcvb_gen.cli.cluster import crew, executor_option, parse_bytes, parse_part, ray_option, slurm_script
+from dmcvb_gen.cli.common import (
+    background_source,
+    format_bytes,
+    format_duration,
+    json_option,
+    print_json,
+    remote_option,
+)
 from dmcvb_gen.names import ANT_MAZE, DIFFICULTIES, FIXED, SPLITS, DistractorSetting, family_of, task_folder
 from dmcvb_gen.store.remote import public
 
@@ -51,16 +59,31 @@ def _out_default(name: str) -> str:
 @click.option("--no-pixels", is_flag=True, help="Leave pictures out; `paint` fills them in where they are wanted.")
 @click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@executor_option
+@ray_option
 @click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
-@click.option("--out", help="The release's folder.  [default: releases/NAME]")
+@click.option("--out", help="The release's folder, or a URL: s3://bucket/name, gs://, ...  [default: releases/NAME]")
+@remote_option
+@click.option("--scratch", type=click.Path(), help="With a URL: where shards are made.  [default: the system's]")
+@click.option("--scratch-size", metavar="BYTES", callback=parse_bytes, help="Bound of it, e.g. 20GB.  [default: half]")
+@click.option("--init", is_flag=True, help="Only begin the release; make nothing.")
+@click.option("--part", metavar="K/N", callback=parse_part, help="Make only every N-th job, from the K-th on.")
+@click.option("--finish", "finishing", is_flag=True, help="Only finish the release: write its digests.")
+@click.option("--other-versions", is_flag=True, help="Go on although packages differ from where it was begun.")
+@click.option("--slurm-script", type=click.IntRange(1), metavar="N", help="Print a script for an array of N tasks.")
 @click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
 @json_option
 @click.pass_context
-def rollout(context, only, episode_range, out, workers, device, dry_run, no_pixels, as_json, **options):
+def rollout(
+    context, only, episode_range, out, workers, device, init, part, finishing, dry_run, no_pixels, as_json, **options
+):
     """Roll out behaviour policies into a release of painted episodes.
 
     The same command goes on where it stopped: what is committed is kept. With --recipe, TASKs, --level, --distractor
-    and --goal keep a part of the recipe, and other options take the place of its values.
+    and --goal keep a part of the recipe, and other options take the place of its values. Without both, the release at
+    --out goes on from its own manifest.
+
+    On many machines: once --init, then --part 1/N to --part N/N anywhere, then --finish; see docs/scale.md.
 
     \b
     dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8
@@ -69,17 +92,44 @@ def rollout(context, only, episode_range, out, workers, device, dry_run, no_pixe
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
     from dmcvb_gen.rollout.estimate import estimate, raw_bytes
-    from dmcvb_gen.rollout.plan import make_plan, prepare
+    from dmcvb_gen.rollout.plan import finish_site, make_plan, prepare
+    from dmcvb_gen.rollout.site import site_of
 
-    chosen = _recipe(context, options)
-    out = local_folder(out or _out_default(chosen.name))
-    plan = make_plan(chosen, out, only, device, parse_range(episode_range), not no_pixels)
+    if sum((init, bool(part), finishing)) > 1:
+        raise click.UsageError("Give one of --init, --part and --finish.")
+    chosen = _recipe(context, options, going_on=bool(out))
+    if options["slurm_script"]:
+        return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
+    scratch = (options["scratch"], options["scratch_size"])
+    site = site_of(out or _out_default(chosen.name), options["options"], *scratch, workers)
+    if finishing:
+        return _finish(site, finish_site, as_json)
+    plan = make_plan(chosen, site, only, device, parse_range(episode_range), part or (1, 1), not no_pixels)
     if dry_run:
         return _show_plan(plan, estimate(plan), workers, as_json)
-    _run(prepare(plan, raw_bytes(plan)), workers, as_json)
+    shared = init or bool(part)
+    plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
+    if init:
+        return click.echo(f"{site.place}: begun, {len(plan.jobs)} jobs to do; make them with --part 1/N to N/N")
+    _run(plan, crew(workers, options["executor"], options["ray_address"]), as_json, whole=not part)
 
 
-def _run(plan, workers, as_json):
+def _finish(site, finish_site, as_json):
+    manifest = site.manifest()
+    if manifest is None:
+        raise click.UsageError(f"{site.place} holds no release; begin it with --init.")
+    manifest = finish_site(site, manifest)
+    missing = [subset.name for subset in manifest.subsets if subset.digest is None]
+    if as_json:
+        print_json({"out": site.place, "complete": manifest.complete, "incomplete": missing})
+    elif missing:
+        click.echo(f"{site.place}: not complete; shards are missing in {len(missing)} subsets, e.g. {missing[0]}")
+    else:
+        click.echo(f"{site.place}: complete")
+    click.get_current_context().exit(0 if manifest.complete else 1)
+
+
+def _run(plan, workers, as_json, whole=True):
     from dmcvb_gen.rollout.executors import run_jobs
     from dmcvb_gen.rollout.plan import finish
 
@@ -92,12 +142,12 @@ def _run(plan, workers, as_json):
             for part, value in result.seconds.items():
                 seconds[part] = seconds.get(part, 0.0) + value
             bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
-    manifest = finish(plan)
-    elapsed = time.time() - started
+    manifest = finish(plan) if whole else plan.manifest
+    elapsed, place = time.time() - started, plan.site.place
     if as_json:
         print_json(
             dict(
-                out=str(plan.root),
+                out=place,
                 complete=manifest.complete,
                 steps=steps,
                 seconds=round(elapsed, 2),
@@ -108,10 +158,12 @@ def _run(plan, workers, as_json):
         )
         return
     state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
+    if not whole:
+        state = "finished with --finish when all parts are there"
     kept = f", {plan.done} shards were there already" if plan.done else ""
     rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
-    click.echo(f"{plan.root}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
-    click.echo(f"Look at it: dmcvb-gen info {plan.root}; dmcvb-gen preview {plan.root}")
+    click.echo(f"{place}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
+    click.echo(f"Look at it: dmcvb-gen info {place}; dmcvb-gen preview {place}")
 
 
 def parse_range(text: str | None) -> tuple[int, int] | None:
@@ -128,19 +180,25 @@ def parse_range(text: str | None) -> tuple[int, int] | None:
     return int(first), int(last)
 
 
-def _recipe(context, options):
-    """The recipe that a command line asks for."""
+def _recipe(context, options, going_on):
+    """The recipe that a command line asks for; None where a release is to go on from its manifest."""
     from dmcvb_gen.rollout.recipe import load_recipe
 
     tasks = (*options["tasks"], *(_layout_task(layout) for layout in options["layouts"]))
     if not options["recipe"] and not tasks:
+        if going_on and not {n for n in RECIPE_OPTIONS if _is_given(context, n)}:
+            return None
         raise click.UsageError("Give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes.")
     if options["steps"] and options["episodes"]:
         raise click.UsageError("Give --episodes or --steps, not both.")
-    given = {name for name in options if context.get_parameter_source(name) == ParameterSource.COMMANDLINE}
+    given = {name for name in options if _is_given(context, name)}
     if options["recipe"]:
         return _changed_recipe(load_recipe(options["recipe"]), tasks, options, given)
     return _recipe_from_options(tasks, options)
+
+
+def _is_given(context, name):
+    return context.get_parameter_source(name) == ParameterSource.COMMANDLINE
 
 
 NOT_WITH_RECIPE = {
@@ -176,6 +234,12 @@ def _changed_recipe(recipe, tasks, options, given):
 
 _OVERRIDES = {"episodes", "steps", "max_steps", "episodes_per_shard"}
 _OVERRIDES |= {"fixed_goals", "episodes_per_goal", "seed", "size", "split"}
+
+
+RECIPE_OPTIONS = _OVERRIDES | set(NOT_WITH_RECIPE)
+RECIPE_OPTIONS |= {"levels", "settings", "goals", "sample", "renderer", "samples", "backgrounds", "behaviour"}
+RECIPE_OPTIONS |= {"independent"}
+"""Options that say what to make, not where or how."""
 
 
 def _translated(options):
@@ -280,7 +344,7 @@ def _show_plan(plan, cost, workers, as_json):
             )
         )
         return
-    table = Table(title=f"{plan.manifest.name} {plan.manifest.version} -> {plan.root}")
+    table = Table(title=f"{plan.manifest.name} {plan.manifest.version} -> {plan.site.place}")
     for column in ("subset", "episodes", "steps", "bytes", "core-hours"):
         table.add_column(column, justify="left" if column == "subset" else "right")
     rows: dict[str, list[float]] = {}
@@ -297,18 +361,12 @@ def _show_plan(plan, cost, workers, as_json):
         table.add_row(name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
     console = Console()
     console.print(table)
+    spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
     console.print(
         f"{cost.jobs} jobs to do, {cost.done} shards done; {cost.steps:,} steps, {format_bytes(cost.bytes)}, "
-        f"{cost.core_seconds / 3600:.2f} core-hours: {_duration(cost.seconds(workers))} with --workers {workers}, "
-        f"{_duration(cost.seconds(cores))} with the {cores} cores here, {_duration(cost.seconds(64))} with 64."
+        f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
+        f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64."
     )
-
-
-def _duration(seconds: float) -> str:
-    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172800, "h", 3600)):
-        if seconds < limit:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 86400:.1f} days"
 
 
 @click.command()

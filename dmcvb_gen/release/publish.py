@@ -17,14 +17,6 @@ from typing import Any
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.regenerate import load_manifest
-from dmcvb_gen.release.transfer import (
-    OBJECT_STORES,
-    download,
-    in_parallel,
-    protocol,
-    retry,
-    upload,
-)
 from dmcvb_gen.rollout.jobs import ShardKey, chosen_shards
 from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import (
@@ -52,6 +44,15 @@ from dmcvb_gen.store.manifest import (
     subset_path,
 )
 from dmcvb_gen.store.remote import file_system, local_path, public, reason, storage_errors
+from dmcvb_gen.store.transfer import (
+    create_object,
+    download,
+    in_parallel,
+    put_object,
+    read_object,
+    retry,
+    upload,
+)
 from dmcvb_gen.store.writer import LOCK, mark_created, only_writer, read_commits
 
 CLAIM = "publishing.json"
@@ -125,7 +126,7 @@ def publish(
     if before == ():
         return Moved(len(index.files), total, 0)
     fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
-    fresh = fresh and before is None and _read(filesystem, place, f"{base}/{INDEX}") is None
+    fresh = fresh and before is None and read_object(filesystem, place, f"{base}/{INDEX}") is None
     kept = set(before or ())
     results = []
     for part in _in_order([file for file in index.files if file not in kept]):
@@ -135,13 +136,13 @@ def publish(
             workers,
             lambda result: tick(1),
         )
-    retry(place, INDEX, lambda: _put(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
+    retry(place, INDEX, lambda: put_object(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
     text = (root / MANIFEST).read_bytes()
     if before is not None:
-        retry(place, MANIFEST, lambda: _put(filesystem, f"{base}/{MANIFEST}", text))
+        retry(place, MANIFEST, lambda: put_object(filesystem, f"{base}/{MANIFEST}", text))
     else:
         try:
-            _create(filesystem, f"{base}/{MANIFEST}", text)
+            create_object(filesystem, f"{base}/{MANIFEST}", text)
         except FileExistsError:
             _published(filesystem, place, base, index.manifest_sha256, manifest)  # another one's raises
     retry(place, CLAIM, lambda: filesystem.rm_file(f"{base}/{CLAIM}"))
@@ -154,24 +155,13 @@ def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     return [part for part in ([file for file in todo if file not in set(late)], late) if part]
 
 
-def _read(filesystem, place, path) -> bytes | None:
-    def attempt():
-        try:
-            filesystem.invalidate_cache()
-            return filesystem.cat_file(path)
-        except FileNotFoundError:
-            return None
-
-    return retry(place, path.rsplit("/", 1)[-1], attempt)
-
-
 def _published(filesystem, place, base, digest: str, manifest: Manifest) -> tuple[FileRecord, ...] | None:
     """The files of an older version that this one has grown from; () for this very one, None where none is.
 
     Raises:
       StoreError: another release is there.
     """
-    found = _read(filesystem, place, f"{base}/{MANIFEST}")
+    found = read_object(filesystem, place, f"{base}/{MANIFEST}")
     if found is None:
         return None
     if files.sha256_bytes(found) == digest:
@@ -181,40 +171,13 @@ def _published(filesystem, place, base, digest: str, manifest: Manifest) -> tupl
         other = parse_manifest(found, f"{place}/{MANIFEST}")
         what = f"{other.name} {other.version}"
         if is_grown_from(manifest, other):
-            return parse_index(_read(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
+            return parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
     except StoreError:
         pass
     raise StoreError(
         f"{place} already holds {what}, and a published version never changes; publish {manifest.name} "
         f"{manifest.version} to another URL (a changed byte is a new version)"
     )
-
-
-def _put(filesystem, path: str, data: bytes) -> None:
-    if protocol(filesystem) not in OBJECT_STORES:
-        filesystem.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
-    filesystem.pipe_file(path, data)
-
-
-def _create(filesystem, path: str, data: bytes) -> None:
-    """Write a file that must not be there yet; atomic on local disks and S3, as good as can be elsewhere.
-
-    Raises:
-      FileExistsError: it is there.
-    """
-    if protocol(filesystem) not in OBJECT_STORES:
-        filesystem.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
-    if protocol(filesystem) in ("file", "local"):
-        with open(path, "xb") as file:
-            file.write(data)
-        return
-    try:
-        filesystem.pipe_file(path, data, mode="create")
-    except Exception as error:
-        filesystem.invalidate_cache()
-        if "PreconditionFailed" in f"{type(error).__name__} {error}" or "condition" in str(error):
-            raise FileExistsError(path) from None
-        raise
 
 
 def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
@@ -228,7 +191,7 @@ def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
 
     def attempt():
         try:
-            _create(filesystem, path, data)
+            create_object(filesystem, path, data)
             return None
         except FileExistsError:
             return filesystem.cat_file(path)
@@ -239,7 +202,7 @@ def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
     if found is None or found == data:
         return found is None  # else ours, from an interrupted try: the files that are there already are kept
     if take_over:
-        retry(place, CLAIM, lambda: _put(filesystem, path, data))
+        retry(place, CLAIM, lambda: put_object(filesystem, path, data))
         return False
     try:
         other = json.loads(found)
@@ -322,11 +285,11 @@ class Source:
         """
         place = public(url)
         filesystem, base = file_system(url, options)
-        text = _read(filesystem, place, f"{base}/{MANIFEST}")
+        text = read_object(filesystem, place, f"{base}/{MANIFEST}")
         if text is None:
             raise StoreError(f"{place} holds no release (no {MANIFEST}); check the URL, or it is still being published")
         manifest = parse_manifest(text, f"{place}/{MANIFEST}")
-        listing = _read(filesystem, place, f"{base}/{INDEX}")
+        listing = read_object(filesystem, place, f"{base}/{INDEX}")
         if listing is None:
             raise StoreError(
                 f"{place} has no {INDEX}; it was not put there by `dmcvb-gen publish`, copy the folder whole"

@@ -19,11 +19,12 @@ import zarr
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import copy_file, folder_in_the_making, remove_partial, write_json
-from dmcvb_gen.pool import Tick, ignore
+from dmcvb_gen.pool import Tick, Workers, ignore
 from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import copy_inputs, create_groups
+from dmcvb_gen.rollout.site import FolderSite
 from dmcvb_gen.store.index import restore_index, restored_commit
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment, parse_manifest
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
@@ -158,7 +159,7 @@ class Regeneration:
       only, episodes: subset patterns and (first, last + 1): the shards that hold any of them; all by default.
       backgrounds: where the videos are now, if they moved.
       device: paint there instead of where the manifest says.
-      workers: processes.
+      workers: processes, or a Ray cluster that sees the same folders.
     """
 
     root: str | Path
@@ -166,7 +167,7 @@ class Regeneration:
     episodes: tuple[int, int] | None = None
     backgrounds: str | None = None
     device: str | None = None
-    workers: int = 1
+    workers: Workers = 1
 
     def check(self, tick: Tick = ignore) -> Outcome:
         """Make shards again and compare their digests with the release; the release is not changed.
@@ -282,7 +283,9 @@ class Regeneration:
         inputs = release_inputs(Path(self.root), records, self.backgrounds)
         if copy:
             copy_inputs(folder, records, inputs)
-        for result in run_jobs(make_jobs(manifest, shards, folder, inputs, self.device), self.workers, tick):
+        for result in run_jobs(
+            make_jobs(manifest, shards, FolderSite(folder), inputs, self.device), self.workers, tick
+        ):
             yield from result.commits
 
 

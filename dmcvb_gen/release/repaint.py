@@ -7,7 +7,7 @@ the very bytes that rolling it out would have given.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,19 @@ from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.names import ANT_MAZE, DistractorSetting, family_of, select
-from dmcvb_gen.pool import Tick, ignore, run_all
+from dmcvb_gen.pool import Tick, Workers, ignore, run_all
 from dmcvb_gen.release.shards import damage
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
 from dmcvb_gen.rollout.painting import check_renderer, exogenous_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.rollout.plan import copy_inputs, painting_facts, subset_attributes
 from dmcvb_gen.rollout.recipe import check_size, make_recipe
+from dmcvb_gen.rollout.site import FolderSite, leave
+from dmcvb_gen.rollout.worker import make_shard
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import Subset
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
-from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release, write_shard
+from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -103,11 +105,11 @@ def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec
     return tuple(ArraySpec(name, LABELS[label], (size, size), ("height", "width")) for label, name in names)
 
 
-def repaint(request: Repainting, workers: int = 1, tick: Tick = ignore) -> Manifest:
+def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> Manifest:
     """Write a release with new pictures of the episodes of another; run again, it goes on where it stopped.
 
     Args:
-      workers: processes.
+      workers: processes, or a Ray cluster that sees the same folders.
       tick: told how many frames were painted since the last call.
 
     Returns:
@@ -116,7 +118,7 @@ def repaint(request: Repainting, workers: int = 1, tick: Tick = ignore) -> Manif
     Raises:
       DmcvbError: nothing fits, two subsets would become one, a source shard is damaged, or `out` cannot be used.
     """
-    release, out = _source(request), Path(request.out)
+    release, out, site = _source(request), Path(request.out), FolderSite(Path(request.out))
     pairs: dict[str, Pair] = {}
     for name in select(list(release.subsets), list(request.only)):
         pair = _pair(release, release[name], request)
@@ -138,10 +140,13 @@ def repaint(request: Repainting, workers: int = 1, tick: Tick = ignore) -> Manif
     copy_inputs(out, [pair.record for pair in pairs.values()], inputs)
     jobs = [
         PaintJob(job, tuple(pairs[record.name] for record in job.subsets), tuple(request.labels))
-        for job in make_jobs(manifest, todo, out, inputs, request.device)
+        for job in make_jobs(manifest, todo, site, inputs, request.device)
     ]
-    for _ in run_all(paint_shards, jobs, workers, tick=tick):
-        pass
+    try:
+        for _ in run_all(paint_shards, jobs, workers, tick=tick):
+            pass
+    finally:
+        leave(site)
     return finish_release(out, manifest)
 
 
@@ -267,10 +272,13 @@ def paint_shards(work: PaintJob, tick: Tick = ignore) -> tuple[CommitRecord, ...
     Raises:
       StoreError: a source shard is damaged, or the target cannot be written.
     """
-    return tuple(_paint_shard(work.job, pair, work.labels, tick) for pair in work.pairs)
+    made = [_paint_shard(work.job, pair, work.labels, tick) for pair in work.pairs]
+    for _, wait in made:
+        wait()
+    return tuple(commit for commit, _ in made)
 
 
-def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> CommitRecord:
+def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tuple[CommitRecord, Callable[[], None]]:
     source, record, task = pair.source, pair.record, get_task(pair.record.task)
     broken = damage(Path(source.root), source.record, job.shard)
     if broken:
@@ -294,7 +302,7 @@ def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> Com
         for label in labels:
             yield from _label_pictures(task, renderer, physics, exogenous, length, rows, label)
 
-    return write_shard(Path(job.root), record, job.shard, arrays(), length, environment(job.device))
+    return make_shard(job.site, record, job.shard, arrays(), length, job.device)
 
 
 def _label_pictures(task, renderer, physics, exogenous, length, rows, label) -> Iterator[tuple[str, np.ndarray]]:

@@ -13,11 +13,11 @@ import numpy as np
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.publish import Source
-from dmcvb_gen.release.transfer import in_parallel, remote_sha256, retry
 from dmcvb_gen.release.verify import Finding, Verification, subset_of
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import INDEX, root_digest
 from dmcvb_gen.store.manifest import FileRecord
+from dmcvb_gen.store.transfer import in_parallel, remote_sha256, retry
 
 SAMPLE_FILES = 40
 """Files that are read where not all are asked for; spread evenly over the release."""

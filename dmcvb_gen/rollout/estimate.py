@@ -20,7 +20,7 @@ from dmcvb_gen.names import ANT_MAZE, distractor_of
 from dmcvb_gen.rollout.jobs import Job
 from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.rollout.plan import Plan
-from dmcvb_gen.rollout.worker import simulate_job
+from dmcvb_gen.rollout.worker import inputs_of, simulate_job
 from dmcvb_gen.store.manifest import SubsetRecord
 from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, array_specs, create_arrays, picture_layout_for
 from dmcvb_gen.store.writer import find_array
@@ -85,7 +85,7 @@ def _simulate(job: Job) -> _Sample:
 def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, float]:
     """Seconds and bytes a step of painting and storing one setting."""
     task, chunk = get_task(record.task), min(PIXEL_CHUNK_STEPS, record.max_steps + 1)
-    renderer, videos = renderers.get(record, job.inputs.backgrounds, job.device)
+    renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
     exogenous = exogenous_of(
         record, job.seed, job.names, sample.episodes, sample.physics, sample.length, videos
     )  # of whole episodes: a walk's camera is elsewhere at their end

@@ -7,9 +7,10 @@ another machine make the same bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
@@ -20,6 +21,9 @@ from dmcvb_gen.rollout.recipe import Recipe, make_recipe
 from dmcvb_gen.store.manifest import Manifest, SubsetRecord
 from dmcvb_gen.store.writer import shard_count, shard_episodes
 from dmcvb_gen.tasks import get_task
+
+if TYPE_CHECKING:
+    from dmcvb_gen.rollout.site import Site
 
 ShardKey = tuple[str, int]
 """(subset, shard)."""
@@ -45,18 +49,18 @@ class Job:
     """One shard of subsets that share a trajectory, to be simulated once and painted for each of them.
 
     Attributes:
-      root: where the release is, a folder or a URL.
+      site: where the release is made.
       subsets: the records of the subsets to write, one or more settings of a task and level.
       shard: index of the shard.
-      inputs: policies and videos.
+      inputs: policies and videos; None: the release's own copies.
       seed, names: the streams of the simulation.
       device: where pictures are painted.
     """
 
-    root: str
+    site: Site
     subsets: tuple[SubsetRecord, ...]
     shard: int
-    inputs: Inputs
+    inputs: Inputs | None
     seed: int
     names: tuple[str, ...]
     device: str = "cpu"
@@ -100,15 +104,15 @@ def chosen_shards(
 def make_jobs(
     manifest: Manifest,
     shards: Mapping[ShardKey, SubsetRecord],
-    target: str | Path,
-    inputs: Mapping[str, Inputs],
+    site: Site,
+    inputs: Mapping[str, Inputs] | None = None,
     device: str | None = None,
 ) -> tuple[Job, ...]:
     """The jobs that make shards; subsets that share trajectories are simulated once.
 
     Args:
-      target: the folder or URL that the jobs write to.
-      inputs: of each subset, by name.
+      site: where the jobs write to.
+      inputs: of each subset, by name; the release's own copies by default.
       device: paint there instead of where the manifest says.
 
     Raises:
@@ -120,11 +124,41 @@ def make_jobs(
             raise RecipeError(f"the manifest does not say the goals of {name}; make it from its recipe again")
         where = device or record.renderer.get("device") or "cpu"
         seed = manifest.recipe_of(name).get("seed", 0)
-        groups.setdefault((*_trajectory(manifest, record), seed, shard, inputs[name], where), []).append(record)
+        key = (*_trajectory(manifest, record), seed, shard, inputs and inputs[name], where)
+        groups.setdefault(key, []).append(record)
     return tuple(
-        Job(str(target), tuple(records), shard, given, seed, names, where)
+        Job(site, tuple(records), shard, given, seed, names, where)
         for (names, *_, seed, shard, given, where), records in groups.items()
     )
+
+
+def part_of(jobs: Sequence[Job], part: tuple[int, int]) -> tuple[Job, ...]:
+    """Every N-th job.
+
+    Args:
+      part: (K, N): the K-th of N parts, counted from 1; together, the parts are all jobs.
+
+    Raises:
+      StoreError: there is no such part.
+    """
+    number, count = part
+    if not 1 <= number <= count:
+        raise StoreError(f"part {number}/{count} is out of range; give K/N with K from 1 to N")
+    return tuple(jobs[number - 1 :: count])
+
+
+def left_to_do(jobs: Iterable[Job], done: Mapping[str, Collection[int]]) -> tuple[Job, ...]:
+    """Jobs without the subsets whose shard is committed already; none where that is all of them.
+
+    Args:
+      done: subset -> shards.
+    """
+    left = []
+    for job in jobs:
+        records = tuple(record for record in job.subsets if job.shard not in done.get(record.name, ()))
+        if records:
+            left.append(replace(job, subsets=records))
+    return tuple(left)
 
 
 def _trajectory(manifest: Manifest, record: SubsetRecord) -> tuple:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,15 +13,19 @@ from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
-from dmcvb_gen.files import copy_file, sha256_file
+from dmcvb_gen.files import copy_file, json_bytes, sha256_file, write_bytes
 from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
-from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, chosen_shards, make_jobs
+from dmcvb_gen.pool import ignore
+from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, chosen_shards, left_to_do, make_jobs, part_of
 from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
-from dmcvb_gen.store.growth import taken_up
+from dmcvb_gen.rollout.site import CONNECTIONS, FolderSite, Site
+from dmcvb_gen.store.growth import merged
+from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
-from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
+from dmcvb_gen.store.transfer import in_parallel
+from dmcvb_gen.store.writer import create_subset, finish_release, start_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from dmcvb_gen.tasks.base import Task
@@ -31,16 +36,16 @@ class Plan:
     """Everything a rollout will do.
 
     Attributes:
-      root: the release's folder.
+      site: where the release is made.
       manifest: of the release as it will be.
-      inputs: of each subset, by name.
+      inputs: of each subset, by name; None where the release's own copies serve.
       jobs: what is still to do, settings that share trajectories together.
       done: committed shards that are there already.
     """
 
-    root: Path
+    site: Site
     manifest: Manifest
-    inputs: Mapping[str, Inputs]
+    inputs: Mapping[str, Inputs] | None
     jobs: tuple[Job, ...]
     done: int
 
@@ -54,41 +59,48 @@ class Plan:
 
 
 def make_plan(
-    recipe: Recipe,
-    out: str | Path,
+    recipe: Recipe | None,
+    out: str | Path | Site,
     only: Sequence[str] = (),
     device: str = "cpu",
     episodes: tuple[int, int] | None = None,
+    part: tuple[int, int] = (1, 1),
     pixels: bool = True,
 ) -> Plan:
     """Check a recipe and list its jobs.
 
     Args:
-      out: the release's folder; what is committed there already is left out of the jobs.
+      recipe: None goes on with the release that is there, from its manifest alone.
+      out: the release's folder or site; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
+      part: (K, N): of all jobs, done or not, every N-th from the K-th on.
       pixels: paint pictures; without, `release.paint` can do it later.
 
     Raises:
       DmcvbError: anything that would fail later, found before any work.
     """
-    root = Path(out)
-    manifest, inputs = describe(recipe, device, pixels)
+    site = out if isinstance(out, Site) else FolderSite(Path(out))
+    there = site.manifest()
+    if recipe is not None:
+        manifest, inputs = describe(recipe, device, pixels)
+    elif there is not None:
+        manifest, inputs = there, None
+    else:
+        raise StoreError(f"{site.place} holds no release to go on with; give TASKs or --recipe")
     asked = {record.name for record in manifest.subsets}
-    grown = taken_up(root, manifest)
-    records = tuple(record for record in grown.subsets if record.name in asked)
-    grown = grown.model_copy(update={"subsets": records})
-    names = {record.name for record in chosen_shards(grown, only).values()}
-    done: dict[str, set[int]] = {}
-    if (root / MANIFEST).exists():
-        done = {r.name: set(read_commits(root, r)) for r in records if r.name in names}
-    shards = {
-        (name, shard): record
-        for (name, shard), record in chosen_shards(grown, only, episodes).items()
-        if shard not in done.get(name, ())
-    }
-    jobs = make_jobs(grown, shards, root, inputs, device)
-    return Plan(root, manifest, inputs, jobs, sum(map(len, done.values())))
+    grown = manifest if there is None else merged(there, manifest, site.place)
+    grown = grown.model_copy(update={"subsets": tuple(record for record in grown.subsets if record.name in asked)})
+    shards = chosen_shards(grown, only, episodes)
+    records = list({record.name: record for record in shards.values()}.values())
+    done = site.commits(records) if there is not None else {}
+    jobs = part_of(make_jobs(grown, shards, site, None if site.slow else inputs, device), part)
+    left = left_to_do(jobs, done)
+    return Plan(site, manifest, inputs, left, _count(jobs) - _count(left))
+
+
+def _count(jobs: Sequence[Job]) -> int:
+    return sum(len(job.subsets) for job in jobs)
 
 
 # -- what the release will be ---------------------------------------------------------------------
@@ -196,17 +208,63 @@ def _placeless(recipe: Recipe, requests: Sequence[SubsetRequest], records: Mappi
     return data
 
 
-# -- the release's folder -------------------------------------------------------------------------
+# -- the release's folder or bucket ---------------------------------------------------------------
 
 
-def prepare(plan: Plan, expected_bytes: float = 0) -> Plan:
-    """Create the release's folder, manifest, policies and empty arrays; a plan whose manifest is the folder's.
+def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False, shared: bool = False) -> Plan:
+    """Create the release: its manifest, policies, videos and empty arrays; a plan whose manifest is the one there.
+
+    Args:
+      expected_bytes: room that will be needed in the folder.
+      other_versions: go on although packages have other versions here than where the release was begun.
+      shared: other machines write to the folder too, so the manifest is written by the first of all alone.
 
     Raises:
-      StoreError: the folder holds what contradicts this recipe, cannot be written, or the disk lacks the room.
+      StoreError: what is there contradicts this recipe or was begun with other versions; it cannot be written, or the
+        disk lacks the room.
     """
-    root = plan.root
-    manifest = start_release(root, plan.manifest)
+    there = plan.site.manifest()
+    if there is not None:
+        if not other_versions:
+            check_versions(there)
+    if isinstance(plan.site, FolderSite):
+        manifest = _prepare_folder(plan, there, expected_bytes, shared)
+    elif there is None:
+        manifest = _prepare_bucket(plan)
+    else:
+        manifest = _unchanged(plan.site, there, plan.manifest)
+    return replace(plan, manifest=manifest)
+
+
+def _unchanged(site: Site, there: Manifest, asked: Manifest) -> Manifest:
+    """The manifest of a bucket, if it holds all that is asked for.
+
+    Raises:
+      StoreError: it would have to grow.
+    """
+    if merged(there, asked, site.place) is not there:
+        raise StoreError(
+            f"{site.place} would have to grow, which releases do in folders alone; fetch it, roll out what is new into "
+            "that folder, and publish it as the next version"
+        )
+    return there
+
+
+def check_versions(manifest: Manifest) -> None:
+    """Raises StoreError where a package has another version here than where a release was begun."""
+    begun, here = manifest.environments[0] if manifest.environments else {}, environment()
+    for name, version in here.items():
+        if name not in ("system", "cpu", "device") and begun.get(name, version) != version:
+            raise StoreError(
+                f"the release was begun with {name} {begun[name]} and this is {name} {version}, which may change bits; "
+                f"install {name} {begun[name]}, or give --other-versions"
+            )
+
+
+def _prepare_folder(plan: Plan, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
+    root = plan.site.root
+    same = there is not None and merged(there, plan.manifest, str(root)) is there
+    manifest = there if same and shared else start_release(root, plan.manifest)
     free = os.statvfs(root)
     if expected_bytes > free.f_bavail * free.f_frsize:
         raise StoreError(
@@ -214,10 +272,32 @@ def prepare(plan: Plan, expected_bytes: float = 0) -> Plan:
             f"at {root}; make room, choose another --out or fewer --episodes"
         )
     wanted = {record.name for job in plan.jobs for record in job.subsets}
-    records = [record for record in manifest.subsets if record.name in wanted]
-    copy_inputs(root, records, plan.inputs)
+    records = [record for record in manifest.subsets if shared or record.name in wanted]
+    if plan.inputs is not None:
+        copy_inputs(root, records, plan.inputs)
     create_groups(root, manifest, records)
-    return replace(plan, manifest=manifest)
+    return manifest
+
+
+def _prepare_bucket(plan: Plan) -> Manifest:
+    """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
+    site = plan.site
+    with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
+        root = Path(folder)
+        copy_inputs(root, plan.manifest.subsets, plan.inputs)
+        create_groups(root, plan.manifest, plan.manifest.subsets)
+        begun = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+        begun = {name: path for name, path in begun.items() if not Path(name).name.startswith(".")}
+        strange = set(site.listing()) - set(begun) - {MANIFEST}
+        if strange and site.manifest() is None:
+            raise StoreError(
+                f"{site.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
+            )
+        pieces = [(name, path.read_bytes()) for name, path in begun.items()]
+        in_parallel(lambda piece: site.write(*piece), pieces, CONNECTIONS, ignore)
+    if site.create(MANIFEST, json_bytes(plan.manifest)):
+        return plan.manifest
+    return _unchanged(site, site.manifest(), plan.manifest)
 
 
 def copy_inputs(root: Path, records: Iterable[SubsetRecord], inputs: Mapping[str, Inputs]) -> None:
@@ -282,5 +362,31 @@ def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any
 
 
 def finish(plan: Plan) -> Manifest:
-    """Write the digests of what is whole into the manifest."""
-    return finish_release(plan.root, plan.manifest)
+    """Write the digests of what is whole into the manifest, when all workers are through."""
+    return finish_site(plan.site, plan.manifest)
+
+
+def finish_site(site: Site, manifest: Manifest) -> Manifest:
+    """Write a release's digests: of every file, of the subsets that are whole, and of all.
+
+    Raises:
+      StoreError: a file is missing, or the place cannot be written.
+    """
+    if isinstance(site, FolderSite):
+        return finish_release(site.root, manifest)
+    commits = site.commits(manifest.subsets)
+    with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
+        mirror = Path(folder)
+        shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
+        small = [path for path in site.listing() if path not in shards | {MANIFEST, INDEX}]
+
+        def bring(path: str) -> None:
+            data = site.read(path)
+            if data is not None:
+                write_bytes(mirror / path, data)
+
+        in_parallel(bring, small, CONNECTIONS, ignore)
+        manifest = finish_release(mirror, manifest, commits)
+        for name in (INDEX, MANIFEST):
+            site.write(name, (mirror / name).read_bytes())
+    return manifest

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.behaviours.policies.simulate import Simulation, simulate
-from dmcvb_gen.pool import Tick, ignore
-from dmcvb_gen.rollout.jobs import Job
+from dmcvb_gen.pool import Later, Tick, ignore
+from dmcvb_gen.rollout.jobs import Inputs, Job
 from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
-from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, environment
+from dmcvb_gen.rollout.site import Site, stage_of
+from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, commit_path, environment
 from dmcvb_gen.store.writer import write_shard
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
@@ -38,8 +38,14 @@ class JobResult:
 
 def load_policies(job: Job) -> list[Policy]:
     """The behaviour policies of a job (uniform random actions where there is no file)."""
-    task = get_task(job.subsets[0].task)
-    return [load_policy(path, task) for path in job.inputs.policies] or [random_policy(task)]
+    record = job.subsets[0]
+    task = get_task(record.task)
+    return [load_policy(path, task) for path in inputs_of(job, record).policies] or [random_policy(task)]
+
+
+def inputs_of(job: Job, record: SubsetRecord) -> Inputs:
+    """What a subset of a job is made from, on this machine."""
+    return job.inputs or stage_of(job.site).inputs(record)
 
 
 def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_steps: int | None = None) -> Simulation:
@@ -66,27 +72,62 @@ def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_
     )
 
 
-def run_job(job: Job, threads: int = 1, tick: Tick = ignore) -> JobResult:
+def run_job(job: Job, threads: int = 1, tick: Tick = ignore) -> JobResult | Later:
     """Simulate, paint and commit a job.
 
     Args:
       threads: of the physics.
       tick: told how many frames were painted since the last call.
 
+    Returns:
+      What it gave; later, where shards are still on their way to a bucket.
+
     Raises:
       StoreError: the disk is full or cannot be written.
     """
     simulation = simulate_job(job, threads)
     seconds = dict(simulation.seconds) | {"rendering": 0.0, "storage": 0.0}
-    commits = []
+    sent = []
     for record in job.subsets:
         started, painting = time.perf_counter(), Stopwatch()
         arrays = painting.time(painted_arrays(job, record, simulation, tick))
-        made_in = environment(job.device)
-        commits.append(write_shard(Path(job.root), record, job.shard, arrays, simulation.length, made_in))
+        sent.append(make_shard(job.site, record, job.shard, arrays, simulation.length, job.device))
         seconds["rendering"] += painting.seconds
         seconds["storage"] += time.perf_counter() - started - painting.seconds
-    return JobResult(tuple(commits), sum(commit.steps for commit in commits), seconds)
+
+    def arrived() -> JobResult:
+        for _, wait in sent:
+            wait()
+        commits = tuple(commit for commit, _ in sent)
+        return JobResult(commits, sum(commit.steps for commit in commits), seconds)
+
+    return Later(arrived) if job.site.slow else arrived()
+
+
+def make_shard(
+    site: Site,
+    record: SubsetRecord,
+    shard: int,
+    arrays: Iterator[tuple[str, np.ndarray]],
+    lengths: np.ndarray,
+    device: str,
+) -> tuple[CommitRecord, Callable[[], None]]:
+    """Write a shard on this process's stage and deliver it.
+
+    Args:
+      arrays, lengths: as for `write_shard`.
+      device: that painted.
+
+    Returns:
+      Its commit record, and a call that waits until it is delivered.
+
+    Raises:
+      StoreError: it cannot be written or delivered.
+    """
+    folder = stage_of(site).prepare(record)
+    commit = write_shard(folder, record, shard, arrays, lengths, environment(device))
+    (folder / commit_path(record.name, shard)).unlink()  # it belongs to the delivery
+    return commit, site.deliver(folder, commit)
 
 
 def painted_arrays(
@@ -94,7 +135,7 @@ def painted_arrays(
 ) -> Iterator[tuple[str, np.ndarray]]:
     """The arrays of a shard, one at a time: pictures, labels, and what was simulated."""
     task, rows = get_task(record.task), simulation.state.shape[1]
-    renderer, videos = renderers.get(record, job.inputs.backgrounds, job.device)
+    renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
     episodes, physics, length = simulation.episodes, simulation.physics, simulation.length
     exogenous = exogenous_of(record, job.seed, job.names, episodes, physics, length, videos)
     if record.pixels:

@@ -329,11 +329,18 @@ def subset_digest(commits: Mapping[int, CommitRecord]) -> str:
     return digest.hexdigest()
 
 
-def finish_release(root: Path, manifest: Manifest) -> Manifest:
-    """Write the digests: of every file, of the subsets that are whole; the manifest is complete when all are."""
+def finish_release(
+    root: Path, manifest: Manifest, known: Mapping[str, Mapping[int, CommitRecord]] | None = None
+) -> Manifest:
+    """Write the digests: of every file, of the subsets that are whole; the manifest is complete when all are.
+
+    Args:
+      known: subset -> shard -> record of the shards that are committed, where the shards are not in the folder.
+    """
     subsets, complete, made, found = [], True, [], {}
     for subset in manifest.subsets:
-        commits = found[subset.name] = read_commits(root, subset)
+        commits = read_commits(root, subset) if known is None else dict(known.get(subset.name, {}))
+        found[subset.name] = commits
         whole = len(commits) == shard_count(subset)
         complete &= whole
         made += [commits[shard].environment for shard in sorted(commits)]

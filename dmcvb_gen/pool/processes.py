@@ -1,115 +1,23 @@
-"""Work done side by side: functions and arguments in, results as they come; in this process or in fresh ones.
-
-::
-
-    with open_pool(workers=4, tick=bar.update) as pool:
-        for job in jobs:
-            pool.submit(job, run_job, job)      # run_job(job, tick=...) in a worker
-        for job, result in pool.results():
-            ...                                 # may submit more
-
-Functions and arguments travel by pickle between processes of one program and user; nothing is unpickled from a file.
-"""
+"""Work done in fresh processes of this machine: functions and arguments in, results as they come."""
 
 from __future__ import annotations
 
-import abc
 import atexit
 import itertools
 import multiprocessing
 import os
 import queue
 import signal
-import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
-from typing import Any, TypeVar
+from typing import Any
 
 from dmcvb_gen.errors import StoreError
-
-Item = TypeVar("Item")
-Tick = Callable[..., None]
-"""Told by the functions at work how far they are; called in the process that asked for the work."""
-
-IN_FLIGHT = 2
-"""Pieces of work handed out for each worker: one at work, one that waits for it."""
-POLL_SECONDS = 0.2
-"""How often progress is passed on while no result comes."""
-KEPT = "what was committed is safe: run the same command again"
-
-
-def ignore(*_) -> None:
-    """A tick for callers that show no progress."""
-
-
-class Later:
-    """A result that is on its way while its worker goes on with something else.
-
-    Args:
-      wait: gives the result once it is there, or raises what went wrong.
-    """
-
-    def __init__(self, wait: Callable[[], Any]):
-        self.wait = wait
-
-
-class Pool(abc.ABC):
-    """Where functions are run; a context manager that ends its workers when it is left, at once on an error.
-
-    `submit(key, function, *arguments)` has `function(*arguments, tick=...)` run; `results()` gives (key, result) as
-    they come, until nothing is left of what was submitted, then or meanwhile. The first exception of a function is
-    raised by `results()`. A function may give a `Later`: its worker takes the next piece of work, and the result comes
-    when it is there.
-    """
-
-    @abc.abstractmethod
-    def submit(self, key: Any, function: Callable, *arguments: Any) -> None:
-        """Have `function(*arguments, tick=...)` run; `key` comes back with its result."""
-
-    @abc.abstractmethod
-    def results(self) -> Iterator[tuple[Any, Any]]:
-        """(key, result) of all that was submitted, as they come.
-
-        Raises:
-          StoreError: a worker was killed.
-        """
-
-    def close(self, at_once: bool = False) -> None:  # noqa: B027 (nothing to end by default)
-        """End the workers; with `at_once`, also what they are doing."""
-
-    def __enter__(self) -> Pool:
-        return self
-
-    def __exit__(self, kind, *_) -> None:
-        self.close(at_once=kind is not None)
-
-
-class SerialPool(Pool):
-    """One after the other, in this process, when the result is asked for."""
-
-    def __init__(self, tick: Tick = ignore):
-        self._tick, self._waiting = tick, deque()
-
-    def submit(self, key, function, *arguments):
-        self._waiting.append((key, function, arguments))
-
-    def results(self):
-        late: deque[tuple[Any, Later]] = deque()
-        while self._waiting or late:
-            if self._waiting:
-                key, function, arguments = self._waiting.popleft()
-                result = function(*arguments, tick=self._tick)
-                if not isinstance(result, Later):
-                    yield key, result
-                    continue
-                late.append((key, result))
-            while late and (len(late) > 1 or not self._waiting):
-                key, later = late.popleft()
-                yield key, later.wait()
+from dmcvb_gen.pool.base import IN_FLIGHT, KEPT, POLL_SECONDS, Later, Pool, Tick, ignore, limit_threads
 
 
 class ProcessPool(Pool):
@@ -200,26 +108,6 @@ class ProcessPool(Pool):
         self._late.close()
 
 
-def open_pool(workers: int = 1, *, threads: int = 1, tick: Tick = ignore, kept: str = KEPT) -> Pool:
-    """A pool of `workers` processes; with one worker, the work is done in this process (on its own threads)."""
-    return SerialPool(tick) if workers <= 1 else ProcessPool(workers, threads, tick, kept)
-
-
-def run_all(
-    function: Callable, items: Iterable[Item], workers: int = 1, *, threads: int = 1, tick: Tick = ignore
-) -> Iterator[tuple[Item, Any]]:
-    """(item, `function(item, tick=...)`) of all items, as they come.
-
-    Raises:
-      StoreError: a worker was killed.
-    """
-    items = list(items)
-    with open_pool(min(workers, max(len(items), 1)), threads=threads, tick=tick) as pool:
-        for item in items:
-            pool.submit(item, function, item)
-        yield from pool.results()
-
-
 # -- in a worker ----------------------------------------------------------------------------------
 
 
@@ -239,14 +127,6 @@ def _start(ticks, late, threads: int) -> None:
     limit_threads(threads)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     atexit.register(os._exit, 0)  # taking the interpreter apart lasts seconds and saves nothing
-
-
-def limit_threads(threads: int) -> None:
-    """Have the libraries that this process imports (or has imported, as far as they listen) use `threads` threads."""
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = str(threads)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(threads)
 
 
 def _end_with_parent() -> None:

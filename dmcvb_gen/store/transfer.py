@@ -146,6 +146,47 @@ def upload(
     return retry(place, record.path, attempt)
 
 
+def read_object(filesystem: fsspec.AbstractFileSystem, place: str, path: str) -> bytes | None:
+    """A small file's bytes, None where it is not there."""
+
+    def attempt():
+        try:
+            filesystem.invalidate_cache()
+            return filesystem.cat_file(path)
+        except FileNotFoundError:
+            return None
+
+    return retry(place, path.rsplit("/", 1)[-1], attempt)
+
+
+def put_object(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) -> None:
+    """Write a small file, in place of what is there."""
+    if protocol(filesystem) not in OBJECT_STORES:
+        filesystem.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
+    filesystem.pipe_file(path, data)
+
+
+def create_object(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) -> None:
+    """Write a file that must not be there yet; atomic on local disks and S3, as good as can be elsewhere.
+
+    Raises:
+      FileExistsError: it is there.
+    """
+    if protocol(filesystem) not in OBJECT_STORES:
+        filesystem.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
+    if protocol(filesystem) in ("file", "local"):
+        with open(path, "xb") as file:
+            file.write(data)
+        return
+    try:
+        filesystem.pipe_file(path, data, mode="create")
+    except Exception as error:
+        filesystem.invalidate_cache()
+        if "PreconditionFailed" in f"{type(error).__name__} {error}" or "condition" in str(error):
+            raise FileExistsError(path) from None
+        raise
+
+
 def download(filesystem: fsspec.AbstractFileSystem, place: str, remote: str, local: Path, record: FileRecord) -> int:
     """Bring one file here and check it; gives the bytes that were moved (0 if it was here already).
 

@@ -1,0 +1,142 @@
+"""What `rollout` needs on many machines: parts, bounds of scratch room, a batch script; and the command `status`."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import click
+from click.core import ParameterSource
+from rich.console import Console
+from rich.table import Table
+
+from dmcvb_gen.cli.common import format_duration, json_option, print_json, remote_option
+from dmcvb_gen.pool import Ray, Workers
+
+executor_option = click.option(
+    "--executor", type=click.Choice(["processes", "ray"]), default="processes", show_default=True, help="Who works."
+)
+ray_option = click.option(
+    "--ray-address", metavar="ADDRESS", help="With ray: the cluster.  [default: RAY_ADDRESS, here]"
+)
+
+
+def crew(workers: int, executor: str, address: str | None) -> Workers:
+    """Who works, as the options say."""
+    if executor == "ray":
+        return Ray(address)
+    if address:
+        raise click.UsageError("--ray-address is for --executor ray.")
+    return workers
+
+
+UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+
+
+def parse_part(context, parameter, text):
+    """ "2/8" -> (2, 8); a click callback."""
+    if text is None:
+        return None
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
+        raise click.UsageError(f"--part {text!r} is not K/N with K from 1 to N, e.g. 2/8.")
+    return int(number), int(count)
+
+
+def parse_bytes(context, parameter, text):
+    """ "20GB" -> 20000000000; a click callback."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)B?", text.strip().upper())
+    if not found or float(found[1]) <= 0:
+        raise click.UsageError(f"--scratch-size {text!r} is no size; give bytes, or e.g. 500MB or 20GB.")
+    return int(float(found[1]) * UNITS[found[2]])
+
+
+SLURM = """#!/bin/bash
+# An array of {count} tasks: sbatch this file. A task that is taken away is put back into the queue and goes on.
+#SBATCH --job-name={name}
+#SBATCH --array=1-{count}
+#SBATCH --cpus-per-task={workers}
+#SBATCH --mem-per-cpu=4G
+#SBATCH --requeue
+#SBATCH --open-mode=append
+set -euo pipefail
+
+if [ "${{SLURM_ARRAY_TASK_ID:?submit this with sbatch}}" = 1 ] && [ "${{SLURM_RESTART_COUNT:-0}}" = 0 ]; then
+  {init}
+  sbatch --dependency="afterok:$SLURM_ARRAY_JOB_ID" --job-name={name}-finish --requeue --wrap={finish}
+fi
+exec {work} --part "$SLURM_ARRAY_TASK_ID/{count}"
+"""
+
+
+def slurm_script(context, count: int, workers: int) -> str:
+    """A script for sbatch that makes a release in `count` tasks; each task does its part of the jobs."""
+    base = ["dmcvb-gen", "rollout", *_given(context, without=("slurm_script", "as_json", "dry_run"))]
+    name = "dmcvb-gen"
+    return SLURM.format(
+        count=count,
+        workers=workers,
+        name=name,
+        init=shlex.join([*base, "--init"]),
+        work=shlex.join(base),
+        finish=shlex.quote(shlex.join([*base, "--finish"])),
+    )
+
+
+def _given(context, without) -> list[str]:
+    """The words of a command line, as they were given, but for some options."""
+    words = []
+    for parameter in context.command.params:
+        if parameter.name in without or context.get_parameter_source(parameter.name) != ParameterSource.COMMANDLINE:
+            continue
+        value = context.params[parameter.name]
+        if isinstance(parameter, click.Argument):
+            words += value
+        elif parameter.is_flag:
+            words.append(parameter.opts[-1])
+        elif isinstance(value, dict):
+            for key, entry in value.items():
+                words += [parameter.opts[-1], f"{key}={entry}"]
+        else:
+            for entry in value if parameter.multiple else (value,):
+                words += [parameter.opts[-1], str(entry)]
+    return words
+
+
+@click.command()
+@click.argument("place", metavar="RELEASE|URL")
+@remote_option
+@json_option
+def status(place, options, as_json):
+    """Show how far a release is that is being made: shards done and overtaken, steps/s, time left.
+
+    All is told from the commit records, so it works from any machine.
+
+    \b
+    dmcvb-gen status s3://bucket/mine
+    """
+    from dmcvb_gen.rollout.progress import progress_of
+    from dmcvb_gen.rollout.site import site_of
+
+    found = progress_of(site_of(place, options))
+    if as_json:
+        return print_json(found.facts())
+    table = Table(title=f"{found.name}: {found.done:,} of {found.total:,} shards")
+    for column in ("subset", "done", "late", "open"):
+        table.add_column(column, justify="left" if column == "subset" else "right")
+    for subset in found.subsets:
+        table.add_row(subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done:,}")
+    Console().print(table)
+    if found.steps_per_second:
+        last, left = format_duration(found.silence), format_duration(found.seconds_left)
+        rate = f"{found.steps_per_second:,.0f} steps/s"
+        click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")
+    if found.late:
+        click.echo(
+            f"{found.late} shards are late: later ones are done, so they are still in flight or their worker was lost; "
+            "the same command makes them"
+        )
+    if found.done == found.total:
+        click.echo("complete" if found.complete else "all shards are there; finish with --finish")

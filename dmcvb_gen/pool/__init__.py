@@ -1,0 +1,94 @@
+"""Work done side by side: functions and arguments in, results as they come; in this process or in fresh ones.
+
+::
+
+    with open_pool(workers=4, tick=bar.update) as pool:
+        for job in jobs:
+            pool.submit(job, run_job, job)      # run_job(job, tick=...) in a worker
+        for job, result in pool.results():
+            ...                                 # may submit more
+
+Functions and arguments travel by pickle between processes of one program and user; nothing is unpickled from a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
+
+from dmcvb_gen.pool.base import (
+    IN_FLIGHT,
+    KEPT,
+    Later,
+    Needs,
+    Pool,
+    Ray,
+    SerialPool,
+    Tick,
+    Workers,
+    ignore,
+    limit_threads,
+)
+from dmcvb_gen.pool.processes import ProcessPool
+
+__all__ = [
+    "IN_FLIGHT",
+    "KEPT",
+    "Later",
+    "Needs",
+    "Pool",
+    "ProcessPool",
+    "Ray",
+    "SerialPool",
+    "Tick",
+    "Workers",
+    "ignore",
+    "limit_threads",
+    "open_pool",
+    "run_all",
+]
+
+Item = TypeVar("Item")
+
+
+def open_pool(
+    workers: Workers = 1,
+    *,
+    threads: int = 1,
+    tick: Tick = ignore,
+    kept: str = KEPT,
+    needs: Needs | None = None,
+    most: int | None = None,
+) -> Pool:
+    """A pool of `workers`; with one worker, the work is done in this process (on its own threads).
+
+    Args:
+      threads: of a worker process's libraries.
+      tick, kept: see `ProcessPool`.
+      needs: of a piece of work, where it is placed on a cluster.
+      most: how many pieces of work there will be at most; no more processes are of use.
+
+    Raises:
+      DmcvbError: the cluster cannot be reached.
+    """
+    if isinstance(workers, Ray):
+        from dmcvb_gen.pool.ray_pool import RayPool
+
+        return RayPool(workers.address, needs, tick)
+    workers = workers if most is None else min(workers, most)
+    return SerialPool(tick) if workers <= 1 else ProcessPool(workers, threads, tick, kept)
+
+
+def run_all(
+    function: Callable, items: Iterable[Item], workers: Workers = 1, *, threads: int = 1, tick: Tick = ignore
+) -> Iterator[tuple[Item, Any]]:
+    """(item, `function(item, tick=...)`) of all items, as they come.
+
+    Raises:
+      StoreError: a worker was killed.
+    """
+    items = list(items)
+    with open_pool(workers, threads=threads, tick=tick, most=len(items)) as pool:
+        for item in items:
+            pool.submit(item, function, item)
+        yield from pool.results()

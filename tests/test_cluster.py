@@ -1,0 +1,313 @@
+"""Releases made on many machines: parts that share nothing but a bucket, and a Ray cluster that loses a node."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.names import ANT_MAZE
+from dmcvb_gen.pool import Ray
+from dmcvb_gen.rollout.executors import run_jobs
+from dmcvb_gen.rollout.jobs import left_to_do, part_of
+from dmcvb_gen.rollout.plan import finish, make_plan, prepare
+from dmcvb_gen.rollout.progress import progress_of
+from dmcvb_gen.rollout.recipe import make_recipe
+from dmcvb_gen.rollout.site import FolderSite, Sender, site_of, stage_of
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import parse_manifest
+from tests.conftest import roll_out
+
+WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
+MAZE = {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "hidden", "episodes": 4}
+
+
+def quick_recipe(*patterns, **changes):
+    """Five-step episodes in shards of one, small pictures."""
+    short = [pattern | {"episodes_per_shard": 1, "max_steps": 5} for pattern in patterns or (WALKER, MAZE)]
+    fields = {"name": "quick", "seed": 2, "size": 8, "renderer": {"backend": "native"}, "subsets": short}
+    return make_recipe(fields | changes)
+
+
+@pytest.fixture(scope="module")
+def recipe_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recipe") / "quick.json"  # which is YAML, too
+    path.write_text(json.dumps(quick_recipe().model_dump(mode="json", exclude_defaults=True)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The same release, made in one folder by one process."""
+    folder = tmp_path_factory.mktemp("whole") / "r"
+    roll_out(quick_recipe(), folder)
+    return folder
+
+
+def digests(manifest):
+    return {subset.name: subset.digest for subset in manifest.subsets}
+
+
+def contents(folder):
+    """Bytes of all files of a release by path, hidden ones apart."""
+    paths = {path.relative_to(folder).as_posix(): path for path in Path(folder).rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in paths.items() if not Path(name).name.startswith(".")}
+
+
+# -- parts and buckets ----------------------------------------------------------------------------
+
+
+def test_parts_are_all_jobs_whatever_is_done(tmp_path):
+    jobs = make_plan(quick_recipe(), tmp_path / "r").jobs
+    parts = [part_of(jobs, (k, 3)) for k in (1, 2, 3)]
+    assert sorted(map(str, sum(parts, ()))) == sorted(map(str, jobs)) and len(jobs) == 8
+    name = jobs[0].subsets[0].name
+    left = left_to_do(jobs, {name: {jobs[0].shard}})
+    assert len(left) == 8 and name not in {record.name for record in left[0].subsets}
+    with pytest.raises(StoreError, match="4/3"):
+        part_of(jobs, (4, 3))
+
+
+def test_a_bucket_ends_with_the_very_files_of_a_folder(whole, tmp_path):
+    site = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    plan = prepare(make_plan(quick_recipe(), site))
+    assert [job.inputs for job in plan.jobs] == [None] * 8  # workers need nothing but the bucket
+    for _ in run_jobs(plan.jobs):
+        pass
+    assert finish(plan).complete and contents(tmp_path / "bucket") == contents(whole)
+    assert not [path for path in (tmp_path / "scratch").rglob("*") if path.is_file()]
+    again = make_plan(None, site)
+    assert again.jobs == () and again.done == 12
+
+
+def test_a_shard_made_twice_ends_in_the_same_bytes_and_other_bytes_are_refused(whole, tmp_path):
+    plan = prepare(make_plan(quick_recipe(), tmp_path / "r"))
+    job = plan.jobs[0]
+    [first], [second] = run_jobs([job]), run_jobs([job])  # a retry beside a slow one
+    assert first.commits == second.commits
+    site, commit = FolderSite(tmp_path / "r"), first.commits[0]
+    other = commit.model_copy(update={"files": commit.files[:-1], "environment": {"cpu": "another one"}})
+    with pytest.raises(StoreError, match="committed meanwhile with other bytes"):
+        site.deliver(stage_of(site).folder, other)
+
+
+def test_versions_other_than_those_of_the_beginning_are_refused_unless_asked_for(tmp_path):
+    plan = prepare(make_plan(quick_recipe(), tmp_path / "r"))
+    manifest = json.loads((tmp_path / "r/manifest.json").read_text())
+    manifest["environments"][0]["mujoco"] = "1.50"
+    (tmp_path / "r/manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match="begun with mujoco 1.50 .* --other-versions"):
+        prepare(make_plan(None, tmp_path / "r"))
+    assert (
+        prepare(make_plan(None, tmp_path / "r"), other_versions=True).jobs
+        == plan.jobs[:0] + make_plan(None, tmp_path / "r").jobs
+    )
+
+
+def test_progress_is_told_from_the_commit_records_alone(tmp_path):
+    site = FolderSite(tmp_path / "r")
+    plan = prepare(make_plan(quick_recipe(), tmp_path / "r"))
+    assert progress_of(site).done == 0 and progress_of(site).steps_per_second is None
+    list(run_jobs(plan.jobs[1:3]))
+    for number, path in enumerate(sorted((tmp_path / "r/commits").rglob("*.json"))):
+        os.utime(path, (1000 + 10 * number, 1000 + 10 * number))
+    found = progress_of(site)
+    assert (found.done, found.total, found.late, found.steps) == (4, 12, 2, 20)
+    assert found.steps_per_second == pytest.approx(15 / 30) and found.seconds_left == pytest.approx(8 * 5 / 0.5)
+
+
+def test_what_waits_to_be_sent_takes_a_bounded_room():
+    sender, waiting, most = Sender(bound=25), [], [0]
+
+    def send():
+        time.sleep(0.02)
+        waiting.pop()
+
+    waits = []
+    for _ in range(8):
+        waiting.append(10)
+        most[0] = max(most[0], sum(waiting))
+        waits.append(sender.send(10, send))
+    for wait in waits:
+        wait()
+    assert most[0] <= 30 and not waiting
+
+
+def test_a_shard_that_scratch_cannot_hold_is_refused(tmp_path):
+    site = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path, scratch_bytes=1000)
+    plan = prepare(make_plan(quick_recipe(), site))
+    with pytest.raises(StoreError, match="--scratch-size"):
+        list(run_jobs(plan.jobs))
+
+
+BUCKET = ["rollout", "walker-walk", "--episodes", "2", "--max-steps", "3", "--size", "8", "--samples", "1", "--out"]
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--part", "3/2"], "K from 1 to N"),
+        (["--part", "x"], "K from 1 to N"),
+        (["--init", "--finish"], "one of"),
+        (["--finish"], "holds no release"),
+        (["--scratch-size", "much"], "--scratch-size"),
+        (["--option", "secret=x"], "in the environment"),
+    ],
+)
+def test_bad_requests_are_refused_and_leave_nothing(tmp_path, arguments, words):
+    result = CliRunner().invoke(main, [*BUCKET, f"file://{tmp_path}/bucket", "--scratch", str(tmp_path), *arguments])
+    assert result.exit_code == 2 and words in result.output + result.stderr
+    assert not contents(tmp_path)
+
+
+def test_another_release_or_other_files_in_the_bucket_are_refused(tmp_path):
+    here = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    prepare(make_plan(quick_recipe(), here))
+    with pytest.raises(StoreError, match="seed 2, asked for 4"):
+        prepare(make_plan(quick_recipe(seed=4), here))
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/thesis.tex").write_text("years of work")
+    with pytest.raises(StoreError, match="other files.*thesis.tex"):
+        prepare(make_plan(quick_recipe(), site_of(f"file://{tmp_path}/thesis", scratch=tmp_path / "scratch")))
+
+
+def test_nobody_at_the_address_is_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("s3fs")
+    monkeypatch.setattr("dmcvb_gen.store.transfer.PAUSE", 0.01)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "x")
+    options = ["--option", "endpoint_url=http://127.0.0.1:9", "--option", "max_attempts=1"]
+    result = CliRunner().invoke(main, [*BUCKET, "s3://bucket/x", "--scratch", str(tmp_path), *options[:2]])
+    assert result.exit_code == 2 and result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+
+
+# -- batch systems --------------------------------------------------------------------------------
+
+
+def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
+    arguments = ["rollout", "--recipe", str(recipe_file), "--out", "s3://bucket/x", "--workers", "4"]
+    script = CliRunner().invoke(main, [*arguments, "--slurm-script", "3"]).output
+    assert "#SBATCH --array=1-3" in script and "#SBATCH --requeue" in script and "#SBATCH --cpus-per-task=4" in script
+    (tmp_path / "job.sh").write_text(script)
+    bin_ = tmp_path / "bin"
+    bin_.mkdir()
+    for name in ("dmcvb-gen", "sbatch"):
+        (bin_ / name).write_text(f'#!/bin/bash\necho {name} "$@" >> {tmp_path}/log\n')
+        (bin_ / name).chmod(0o755)
+    for task in (1, 2, 3):
+        environment = os.environ | {"PATH": f"{bin_}:{os.environ['PATH']}", "SLURM_ARRAY_JOB_ID": "7"}
+        environment["SLURM_ARRAY_TASK_ID"] = str(task)
+        subprocess.run(["bash", str(tmp_path / "job.sh")], check=True, env=environment)
+    called = (tmp_path / "log").read_text().splitlines()
+    base = f"dmcvb-gen rollout --recipe {recipe_file} --workers 4 --out s3://bucket/x"
+    assert called[0] == f"{base} --init" and called[1].startswith("sbatch --dependency=afterok:7")
+    assert called[1].endswith(f"--wrap={base} --finish")
+    assert called[2:] == [f"{base} --part {task}/3" for task in (1, 2, 3)]
+
+
+# -- parts that are killed, through a bad network -------------------------------------------------
+
+
+SPOILED = 0.04
+"""Share of requests that are dropped, delayed, answered with an error or cut."""
+
+
+@pytest.mark.slow
+def test_parts_killed_again_and_again_end_with_the_same_files(s3_server, recipe_file, whole, tmp_path):
+    rng = random.Random(7)
+    proxy, direct, environment = s3_server
+    proxy.fault = lambda method, path: rng.choice(["drop", "500", "cut"]) if rng.random() < SPOILED else None
+    command = [sys.executable, "-m", "dmcvb_gen", "rollout", "--recipe", str(recipe_file), "--out", "s3://bucket/quick"]
+    command += ["--option", f"endpoint_url={proxy.url}", "--scratch", str(tmp_path)]
+    commits = "bucket/quick/commits"
+
+    def start(part):
+        quiet = dict(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        return subprocess.Popen([*command, "--part", f"{part}/4"], env=environment, start_new_session=True, **quiet)
+
+    def count():
+        direct.invalidate_cache()
+        return len(direct.find(commits)) if direct.exists(commits) else 0
+
+    running, kills, deadline = {part: start(part) for part in (1, 2, 3, 4)}, 0, time.time() + 600
+    while running and time.time() < deadline:
+        time.sleep(0.2)
+        for part, process in list(running.items()):
+            if process.poll() == 0:
+                del running[part]
+            elif process.poll() is not None:
+                running[part] = start(part)  # the network was too bad for it
+            elif kills < 4 and count() >= kills and rng.random() < 0.1:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+                kills, running[part] = kills + 1, start(part)
+    assert kills == 4 and not running
+    finishing = subprocess.run([*command, "--finish", "--json"], env=environment, capture_output=True, text=True)
+    proxy.fault = lambda method, path: None
+    assert json.loads(finishing.stdout)["complete"], finishing.stderr
+    direct.invalidate_cache()
+    there = {path.removeprefix("bucket/quick/"): direct.cat_file(path) for path in direct.find("bucket/quick")}
+    assert there == contents(whole)  # the same files to the last byte, and no stray one
+    assert parse_manifest(there["manifest.json"]).complete
+    assert not [path for path in tmp_path.rglob("worker-*") if path.is_file()]
+
+
+@pytest.fixture
+def s3_server(monkeypatch):
+    """(proxy, direct file system, environment of processes) of a real S3 server with an empty bucket."""
+    s3fs = pytest.importorskip("s3fs")
+    moto = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    from tests.test_publish import CREDENTIALS, Proxy
+
+    moto.start()
+    host, port = moto.get_host_and_port()
+    proxy = Proxy(host, port)
+    for name, value in CREDENTIALS.items():
+        monkeypatch.setenv(name, value)
+    direct = s3fs.S3FileSystem(endpoint_url=f"http://{host}:{port}", skip_instance_cache=True)
+    direct.mkdir("bucket")
+    yield proxy, direct, os.environ | {"OMP_NUM_THREADS": "1"}
+    proxy.server.shutdown()
+    moto.stop()
+
+
+# -- Ray ------------------------------------------------------------------------------------------
+
+
+def test_an_address_where_no_cluster_answers_is_one_line(tmp_path):
+    pytest.importorskip("ray")
+    arguments = [*BUCKET, str(tmp_path / "r"), "--executor", "ray", "--ray-address", "127.0.0.1:9"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2 and re.search("error: no Ray cluster answers at 127.0.0.1:9", result.stderr)
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_that_loses_a_node_and_gains_one_makes_the_same_release(whole, tmp_path):
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        lost = [cluster.add_node(num_cpus=1) for _ in range(2)][0]
+        plan = prepare(make_plan(quick_recipe(), tmp_path / "r"))
+        results = run_jobs(plan.jobs, Ray(cluster.address))
+        next(results)
+        cluster.remove_node(lost, allow_graceful=False)  # SIGKILL, whatever it is doing
+        cluster.add_node(num_cpus=1)
+        assert len(list(results)) == len(plan.jobs) - 1
+    finally:
+        cluster.shutdown()
+    assert digests(finish(plan)) == digests(open_release(whole).manifest)
+    assert contents(tmp_path / "r") == contents(whole)
+    assert {subset.family for subset in plan.manifest.subsets} >= {ANT_MAZE}
