@@ -16,7 +16,9 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
-from dmcvb_gen.release.verify import Finding, is_imported, verify
+from dmcvb_gen.release.contents import is_imported
+from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.tasks import get_task
 

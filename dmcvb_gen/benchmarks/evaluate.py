@@ -19,7 +19,7 @@ from dmcvb_gen.agents.data import Normalization, normalize_pixels
 from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.distractors import ExogenousWalk, load_backgrounds
 from dmcvb_gen.names import distractor_of
-from dmcvb_gen.release.verify import is_imported
+from dmcvb_gen.release.contents import is_imported
 from dmcvb_gen.rollout.jobs import video_source
 from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.rollout.recipe import RendererChoice

@@ -24,7 +24,7 @@ from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.tables import Cell, Missing
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.names import FIXED, task_folder
-from dmcvb_gen.release.verify import Finding
+from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.rollout.info import return_statistics
 from dmcvb_gen.store import Release
 from dmcvb_gen.store.manifest import environment

@@ -16,7 +16,7 @@ from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.tables import Cell, Missing, plan_benchmark
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import select
-from dmcvb_gen.release.verify import Finding
+from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.store import Release, open_release
 
 STATE_BC_SHARE = 0.9

@@ -11,6 +11,7 @@ import click
 
 from dmcvb_gen import __version__
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.extras import cure
 
 COMMANDS = {
     "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of painted episodes."),
@@ -59,6 +60,12 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except DmcvbError as error:
             click.echo(f"error: {error}", err=True)
+            ctx.exit(2)
+        except ModuleNotFoundError as error:
+            what = cure(error.name or "")
+            if what is None:
+                raise
+            click.echo(f"error: {what}", err=True)
             ctx.exit(2)
 
 

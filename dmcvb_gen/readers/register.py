@@ -32,7 +32,10 @@ def environment_ids() -> tuple[str, ...]:
 
 def register() -> None:
     """Register the environments, so that `gymnasium.make` and `make_vec` know them; done once."""
-    import gymnasium
+    try:
+        import gymnasium
+    except ImportError:
+        return  # whoever only reads needs no environments
 
     for name, (task, setting) in environments().items():
         if name not in gymnasium.registry:

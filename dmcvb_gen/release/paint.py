@@ -19,7 +19,7 @@ from dmcvb_gen.files import copy_file, write_json
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.pool import Tick, ignore, run_all
 from dmcvb_gen.release.shards import damage
-from dmcvb_gen.rollout.jobs import background_source, chosen_shards
+from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.rollout.painting import paint, renderers
 from dmcvb_gen.rollout.plan import painting_facts, subset_attributes
 from dmcvb_gen.store import open_release
@@ -36,6 +36,7 @@ from dmcvb_gen.store.pictures import picture_of
 from dmcvb_gen.store.reader import Subset
 from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import add_arrays, finish_release, only_writer, write_pictures
 from dmcvb_gen.tasks import get_task
 

@@ -16,8 +16,6 @@ from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.release.regenerate import load_manifest
-from dmcvb_gen.rollout.jobs import ShardKey, chosen_shards
 from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import (
     CARD_FILES,
@@ -43,7 +41,9 @@ from dmcvb_gen.store.manifest import (
     shard_count,
     subset_path,
 )
+from dmcvb_gen.store.reader import load_manifest
 from dmcvb_gen.store.remote import file_system, local_path, public, reason, storage_errors
+from dmcvb_gen.store.shards import ShardKey, chosen_shards
 from dmcvb_gen.store.transfer import (
     create_object,
     download,

@@ -22,12 +22,14 @@ from dmcvb_gen.files import copy_file, folder_in_the_making, remove_partial, wri
 from dmcvb_gen.pool import Tick, Workers, ignore
 from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs, release_inputs
+from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import copy_inputs, create_groups
 from dmcvb_gen.rollout.site import FolderSite
 from dmcvb_gen.store.index import restore_index, restored_commit
-from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment, parse_manifest
+from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
+from dmcvb_gen.store.reader import load_manifest
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import (
     commit_path,
     find_array,
@@ -136,18 +138,6 @@ def compare_shards(one: Path, other: Path, record: SubsetRecord, shard: int) -> 
     except Exception:  # damaged bytes make codecs raise anything; all mean that there is nothing to compare with
         return None
     return tuple(found)
-
-
-def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
-    """A local release's folder and manifest.
-
-    Raises:
-      StoreError: there is none.
-    """
-    root = Path(root)
-    if not (root / MANIFEST).is_file():
-        raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
-    return root, parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
 
 
 @dataclass(frozen=True)

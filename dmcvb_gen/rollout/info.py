@@ -8,12 +8,9 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen import __version__
-from dmcvb_gen.behaviours.policies.bundled import bundled_levels
 from dmcvb_gen.behaviours.policies.paper import paper_returns
-from dmcvb_gen.distractors.base import KINDS, SCALES
-from dmcvb_gen.rollout.recipe import LEVELS, MAZE_SETTINGS, shipped_recipes
+from dmcvb_gen.names import DIFFICULTIES, DISTRACTOR_KINDS, GOAL_MODES, LEVELS
 from dmcvb_gen.store import open_release
-from dmcvb_gen.tasks import get_task, task_ids
 
 
 def return_statistics(returns: np.ndarray) -> dict[str, float]:
@@ -64,7 +61,10 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
 
 def describe_package() -> dict[str, Any]:
     """Tasks, levels, distractors, bundled behaviours, recipes, and renderers with why they cannot start here."""
+    from dmcvb_gen.behaviours.policies.bundled import bundled_levels
     from dmcvb_gen.rendering import available_renderers
+    from dmcvb_gen.rollout.recipe import shipped_recipes
+    from dmcvb_gen.tasks import get_task, task_ids
 
     tasks = []
     for task_id in task_ids():
@@ -83,9 +83,9 @@ def describe_package() -> dict[str, Any]:
         version=__version__,
         tasks=tasks,
         levels=list(LEVELS),
-        distractors=list(KINDS),
-        difficulties=list(SCALES),
-        maze_settings=list(MAZE_SETTINGS),
+        distractors=list(DISTRACTOR_KINDS),
+        difficulties=list(DIFFICULTIES),
+        maze_settings=list(GOAL_MODES),
         recipes=list(shipped_recipes()),
         renderers=available_renderers(),
     )

@@ -16,17 +16,16 @@ from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RecipeError, StoreError
-from dmcvb_gen.names import FIXED, LOCOMOTION, family_of, select
+from dmcvb_gen.names import FIXED, LOCOMOTION, family_of
 from dmcvb_gen.rollout.recipe import Recipe, make_recipe
 from dmcvb_gen.store.manifest import Manifest, SubsetRecord
-from dmcvb_gen.store.writer import shard_count, shard_episodes
+from dmcvb_gen.store.shards import ShardKey
+from dmcvb_gen.store.writer import shard_episodes
 from dmcvb_gen.tasks import get_task
 
 if TYPE_CHECKING:
     from dmcvb_gen.rollout.site import Site
 
-ShardKey = tuple[str, int]
-"""(subset, shard)."""
 BUILTIN = "builtin"
 """The videos that the package brings."""
 
@@ -73,32 +72,6 @@ class Job:
     def frames(self) -> int:
         """Steps to make, counted once for each setting (at most: mazes may end early)."""
         return len(self.episodes) * self.subsets[0].max_steps * len(self.subsets)
-
-
-def chosen_shards(
-    manifest: Manifest, only: Sequence[str] = (), episodes: tuple[int, int] | None = None
-) -> dict[ShardKey, SubsetRecord]:
-    """The shards that hold any of the chosen episodes.
-
-    Args:
-      only: subset patterns such as "walker-walk/*/static", all subsets by default.
-      episodes: (first, last + 1), all by default.
-
-    Raises:
-      UnknownNameError: a pattern that fits nothing.
-      StoreError: no subset has such episodes.
-    """
-    names = set(select([record.name for record in manifest.subsets], list(only)))
-    chosen = {}
-    for record in manifest.subsets:
-        for shard in range(shard_count(record)) if record.name in names else ():
-            first, last = shard_episodes(record, shard)
-            if episodes is None or (first < episodes[1] and episodes[0] < last):
-                chosen[record.name, shard] = record
-    if not chosen:
-        most = max(record.episodes for record in manifest.subsets)
-        raise StoreError(f"no subset has episodes {episodes[0]}:{episodes[1]}; the longest has 0:{most}")
-    return chosen
 
 
 def make_jobs(

@@ -16,7 +16,7 @@ from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.files import copy_file, json_bytes, sha256_file, write_bytes
 from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
 from dmcvb_gen.pool import ignore
-from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, chosen_shards, left_to_do, make_jobs, part_of
+from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs, part_of
 from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.rollout.site import CONNECTIONS, FolderSite, Site
@@ -24,6 +24,7 @@ from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
 from dmcvb_gen.store.writer import create_subset, finish_release, start_release
 from dmcvb_gen.tasks import get_task

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs
+from dmcvb_gen.rollout.jobs import make_jobs
 from dmcvb_gen.rollout.site import Site
 from dmcvb_gen.store.manifest import commit_path, shard_count
+from dmcvb_gen.store.shards import chosen_shards
 
 RECENT = 3600.0
 """Seconds before the last commit whose commits tell the rate; pauses before them do not count."""

@@ -198,8 +198,9 @@ def environment(device: str = "cpu") -> dict[str, str]:
 
 @functools.cache
 def _environment(device: str) -> dict[str, str]:
-    packages = ("mujoco", "mujoco-warp", "warp-lang", "dm-control", "numpy", "torch", "zarr", "numcodecs")
-    versions = {name: metadata.version(name) for name in packages}
+    packages = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
+    packages += ("mujoco-warp", "warp-lang") if device != "cpu" else ()
+    versions = {name: version for name in packages if (version := _version(name))}
     return {
         "dmcvb-gen": __version__,
         "python": platform.python_version(),
@@ -208,6 +209,13 @@ def _environment(device: str) -> dict[str, str]:
         "device": device,
         **versions,
     }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _cpu_name() -> str:

@@ -303,6 +303,18 @@ def open_release(path: str | Path, storage_options: dict | None = None, skip: Co
     return Release(path, manifest, {name: subset for name, subset in subsets.items() if len(subset.commits)})
 
 
+def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
+    """A local release's folder and manifest.
+
+    Raises:
+      StoreError: there is none.
+    """
+    root = Path(root)
+    if not (root / MANIFEST).is_file():
+        raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
+    return root, parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
+
+
 def _remote_commits(filesystem, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:
     """The committed shards of a subset at a URL, shard -> record."""
     paths = {f"{base}/{commit_path(subset.name, shard)}": shard for shard in range(shard_count(subset))}

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import fsspec
-import tenacity
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_file
@@ -45,6 +44,8 @@ def retry(place: str, path: str, attempt):
     Raises:
       StoreError: access is refused, the disk is full, or it never succeeded.
     """
+    import tenacity  # only where something is sent or fetched
+
     attempts = tenacity.Retrying(
         stop=tenacity.stop_after_attempt(ATTEMPTS),
         wait=tenacity.wait_exponential(multiplier=PAUSE, min=0),

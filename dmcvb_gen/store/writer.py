@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 import zarr
 
@@ -56,6 +55,8 @@ def only_writer(root: Path, wait: float = 0) -> Iterator[None]:
     Raises:
       StoreError: another one is at work.
     """
+    import filelock  # readers do without
+
     try:
         with filelock.FileLock(root / LOCK, timeout=wait):
             yield

@@ -7,12 +7,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
 
 from dmcvb_gen.readers.release import ReleaseReader, SubsetReader
 from dmcvb_gen.store import Manifest
 from dmcvb_gen.store.pictures import Pictures, shown
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class Source:
 
     @property
     def steps_per_second(self) -> float:
-        return 1 / (ACTION_REPEAT * get_task(self.subset.task).control_timestep)
+        return 1 / float(self.subset.attrs["seconds_per_step"])
 
     @property
     def pictures(self) -> Pictures:
@@ -106,6 +104,8 @@ class Source:
 
 def png(frame: np.ndarray) -> bytes:
     """(height, width, 3) uint8 as a PNG file."""
+    from PIL import Image
+
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, "PNG")
     return buffer.getvalue()

@@ -1,0 +1,41 @@
+"""Packages that not everybody needs: the name of a module that is missing in, the line that installs it out."""
+
+from __future__ import annotations
+
+EXTRAS = {
+    "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
+    "gpu": ("mujoco_warp", "warp"),
+    "s3": ("s3fs",),
+    "gs": ("gcsfs",),
+    "hf": ("huggingface_hub",),
+    "hdf5": ("h5py",),
+    "minari": ("minari",),
+    "lerobot": ("pyarrow",),
+    "ray": ("ray",),
+}
+"""Extra -> the modules that it brings."""
+SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safetensors", "PIL", "imageio", "gymnasium")
+"""Modules of a whole install that one who only reads may leave out."""
+_PACKAGES = {
+    "stable_baselines3": "stable-baselines3",
+    "sb3_contrib": "sb3-contrib",
+    "mujoco_warp": "mujoco-warp",
+    "warp": "warp-lang",
+    "skfmm": "scikit-fmm",
+    "dm_control": "dm-control",
+    "PIL": "pillow",
+    "yaml": "PyYAML",
+}
+"""Module -> its package, where the names differ."""
+
+
+def cure(module: str) -> str | None:
+    """What to do where `module` (or its parent) is not installed; None for a module that is not one of ours to name."""
+    top = module.split(".")[0]
+    package = _PACKAGES.get(top, top)
+    for extra, modules in EXTRAS.items():
+        if top in modules:
+            return f"this needs {package}, which is not installed: pip install {package} (or the extra [{extra}])"
+    if top in SIMULATOR or top in _PACKAGES:
+        return f"this needs {package}, which is not installed: pip install {package} (a whole install brings it)"
+    return None

@@ -1,0 +1,174 @@
+"""Are the contents of a subset what they should be? A subset in, findings out: values, physics, pixels.
+
+Every finding names subset, episode and step. Values are checked everywhere; a sample of steps is simulated again and a
+sample of frames painted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dmcvb_gen.distractors.backgrounds import load_backgrounds
+from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
+from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.release.import_tfds import imported_specs
+from dmcvb_gen.rollout.jobs import video_source
+from dmcvb_gen.rollout.painting import renderer_for
+from dmcvb_gen.store import Subset
+from dmcvb_gen.store.pictures import picture_of
+from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.tasks import get_task
+
+SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
+"""How much of each subset is simulated and painted again."""
+REWARD_TOLERANCE, STATE_TOLERANCE = 1e-4, 1e-3
+"""Largest difference that another CPU or library version may cause in one step; on the same machine it is 0."""
+PIXEL_TOLERANCE = 2.0
+"""Mean absolute difference of a repainted frame, grey levels of 255; on the same machine it is 0."""
+
+
+def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[Finding]:
+    """All that can be checked of a subset.
+
+    Args:
+      backgrounds: where the manifest's videos are now, if they moved.
+
+    Raises:
+      StoreError: something cannot be read.
+    """
+    found = list(check_values(subset))
+    yield from found
+    if any(finding.check in ("shapes", "lengths") for finding in found) or is_imported(subset):
+        return  # no values to go by, or nothing to simulate or paint from
+    yield from check_physics(subset)
+    if subset.pixel_arrays:
+        yield from check_pixels(subset, backgrounds)
+
+
+def _sample(count: int, wanted: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
+
+
+def is_imported(subset: Subset) -> bool:
+    """Whether a subset came from DMC-VB's published data, which have no physics states and no labels."""
+    return subset.record.renderer.get("name") == "imported"
+
+
+def check_values(subset: Subset) -> Iterator[Finding]:
+    """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
+    task = get_task(subset.task)
+    episodes = subset.episodes
+    specs = array_specs(EpisodeShape.of(task), subset.record.size, pixels=subset.record.pixels)
+    for spec in imported_specs(subset.record) if is_imported(subset) else specs:
+        if spec.name not in subset.arrays:
+            yield Finding("shapes", subset.name, f"array {spec.name} is missing")
+            return
+        array = subset.array(spec.name)
+        rows = (subset.record.max_steps + 1,) if spec.steps else ()
+        wanted = (subset.record.episodes, *rows, *spec.shape)
+        if array.shape != wanted or array.dtype != np.dtype(spec.dtype):
+            yield Finding("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
+            return
+    seen: dict[bytes, int] = {}
+    for episode, length in zip(map(int, episodes), map(int, subset.lengths), strict=True):
+        if not 0 < length <= subset.record.max_steps:
+            yield Finding("lengths", subset.name, f"length {length} is not in 1..{subset.record.max_steps}", episode)
+            continue
+        names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
+        values = subset.episode(episode, [*names, "return", "terminated"])
+        for name in names:
+            bad = ~np.isfinite(values[name].reshape(len(values[name]), -1)).all(axis=1)
+            if bad.any():
+                yield Finding("finite", subset.name, f"{name} is not finite", episode, int(bad.argmax()))
+        if np.abs(values["action"]).max() > 1:
+            step = int(np.abs(values["action"]).max(axis=1).argmax())
+            yield Finding("actions", subset.name, "an action is outside [-1, 1]", episode, step)
+        total = float(values["reward"].astype(np.float64).sum())
+        if not abs(total - float(values["return"])) <= 1e-6 * max(1.0, abs(total)):
+            yield Finding(
+                "returns", subset.name, f"rewards sum to {total:.4f}, return is {values['return']:.4f}", episode
+            )
+        low, high = task.return_range
+        if not low <= total <= high:
+            yield Finding("returns", subset.name, f"return {total:.2f} is outside {low:g}..{high:g}", episode)
+        if (
+            bool(values["terminated"]) != (values["discount"][-1] == 0)
+            or (length < subset.record.max_steps) > values["terminated"]
+        ):
+            yield Finding("lengths", subset.name, "length, discount and terminated do not agree", episode)
+        key = values["action"].tobytes()
+        if key in seen:
+            yield Finding("duplicates", subset.name, f"has the actions of episode {seen[key]}", episode)
+        seen[key] = episode
+
+
+def check_physics(subset: Subset) -> Iterator[Finding]:
+    """Sampled steps simulated again: state, reward and next physics state are the stored ones."""
+    task = get_task(subset.task)
+    known = np.ones(task.state_size, bool)
+    for name in task.unstored_fields:
+        known[task.state_slices[name]] = False
+    for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
+        episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+        values = subset.episode(episode, ["state", "action", "reward", "physics"])
+        steps = _sample(length, SAMPLE_STEPS)
+        batch = task.batch(len(steps))
+        with np.errstate(invalid="ignore"):
+            state = batch.set_physics(values["physics"][steps])
+            for row, step in enumerate(steps):
+                gap = np.abs(state[row] - values["state"][step])[known].max()
+                if not gap <= STATE_TOLERANCE:
+                    yield Finding("states", subset.name, f"physics gives a state {gap:.3g} away", episode, int(step))
+            result = batch.step(values["action"][steps])
+            after = batch.set_physics(values["physics"][steps + 1])
+            for row, step in enumerate(steps):
+                gap = abs(result.reward[row] - values["reward"][step])
+                if not gap <= REWARD_TOLERANCE:
+                    yield Finding(
+                        "rewards",
+                        subset.name,
+                        f"reward is {values['reward'][step]:.5f}, the physics gives {result.reward[row]:.5f}",
+                        episode,
+                        int(step),
+                    )
+                gap = np.abs(result.state[row] - after[row])[known].max()
+                if not gap <= STATE_TOLERANCE * 10:
+                    yield Finding("physics", subset.name, f"the action leads {gap:.3g} away", episode, int(step))
+
+
+def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Finding]:
+    """Sampled frames painted again from physics and labels; frames that are black or never change."""
+    recorded = subset.record.backgrounds
+    source = video_source(subset.root, subset.record, backgrounds)
+    split = recorded["split"] if recorded else "train"
+    if recorded:
+        digest = load_backgrounds(source, split).digest
+        if digest != recorded["digest"]:
+            yield Finding(
+                "pixels", subset.name, f"backgrounds {source!r} are not those of the manifest; give --backgrounds"
+            )
+            return
+    renderer, _ = renderer_for(subset.record, source, split)
+    try:
+        painted_here = np.flatnonzero(~subset.unpainted[subset.episodes])
+        for index in painted_here[_sample(len(painted_here), SAMPLE_EPISODES)]:
+            episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+            values = subset.episode(episode)
+            steps = _sample(length + 1, SAMPLE_FRAMES)
+            labels = Exogenous(**{name: values[f"exogenous/{name}"] for name in EXOGENOUS_NAMES})
+            for name in subset.pixel_arrays:
+                stored = values[name][steps]
+                view, hidden = picture_of(name)
+                painted = renderer.render(values["physics"][steps], labels[steps], [view], hide_goal=hidden)[:, 0]
+                gaps = np.abs(painted.astype(int) - stored).reshape(len(steps), -1).mean(axis=1)
+                for step, gap in zip(steps, gaps, strict=True):
+                    if gap > PIXEL_TOLERANCE:
+                        yield Finding("pixels", subset.name, f"{name} is {gap:.1f} grey levels off", episode, int(step))
+                if stored.max() == 0:
+                    yield Finding("pixels", subset.name, f"{name} is black", episode)
+                elif (stored == stored[:1]).all() and len(steps) > 1:
+                    yield Finding("pixels", subset.name, f"{name} never changes", episode)
+    finally:
+        renderer.close()

@@ -1,0 +1,132 @@
+"""The package as strangers install it: a wheel with all its data, reading with hardly anything else, no torch to roll out."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "h5py")
+"""What one who only reads and exports to HDF5 installs (each brings what it needs)."""
+HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "mujoco_warp", "warp")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel built from the tree."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True)
+    return next(folder.glob("dmcvb_gen-*.whl"))
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    out = tmp_path_factory.mktemp("data") / "demo"
+    asked = ["walker-walk", "--level", "random", "--episodes", "2", "--max-steps", "5", "--size", "16"]
+    subprocess.run(
+        [sys.executable, "-m", "dmcvb_gen", "rollout", *asked, "--out", str(out)], check=True, cwd=out.parent
+    )
+    return out
+
+
+def test_the_wheel_carries_every_data_file(wheel):
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    data = [path for path in (ROOT / "dmcvb_gen").rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+    data = [path for path in data if not path.name.endswith((".nbi", ".nbc"))]
+    assert len(data) > 60
+    assert not [path for path in data if path.relative_to(ROOT).as_posix() not in inside]
+
+
+def closure(packages):
+    """Packages and what they need, of those installed here."""
+    from importlib import metadata
+
+    import packaging.requirements
+
+    found, todo = set(), list(packages)
+    while todo:
+        name = todo.pop().lower().replace("_", "-")
+        if name in found:
+            continue
+        found.add(name)
+        for text in metadata.requires(name) or ():
+            need = packaging.requirements.Requirement(text)
+            if need.marker is None or need.marker.evaluate({"extra": ""}):
+                todo.append(need.name)
+    return found
+
+
+def site_of(packages, wheel, folder):
+    """A folder with nothing but the wheel and links to these packages and what they need."""
+    from importlib import metadata
+
+    zipfile.ZipFile(wheel).extractall(folder)
+    library = Path(sysconfig.get_paths()["purelib"])
+    for name in closure(packages):
+        for file in metadata.distribution(name).files or ():
+            top = file.parts[0]
+            if top not in ("..", "__pycache__", "bin") and not (folder / top).exists() and (library / top).exists():
+                (folder / top).symlink_to(library / top)
+    return folder
+
+
+def run(site, *arguments):
+    """`python -m dmcvb_gen ...` with the packages of `site` alone."""
+    code = (
+        f"import sys; sys.path = [p for p in sys.path if 'site-packages' not in p]; sys.path.insert(0, {str(site)!r})"
+    )
+    code += "; sys.argv[0] = 'dmcvb-gen'; from dmcvb_gen.cli import main; main(prog_name='dmcvb-gen')"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [sys.executable, "-S", "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=site.parent)
+
+
+def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
+    site = site_of(READING, wheel, tmp_path / "site")
+    assert not (site / "mujoco").exists() and not (site / "torch").exists() and not (site / "gymnasium").exists()
+    for command in (
+        ["--help"],
+        ["info", release],
+        ["verify", release],
+        ["publish", release, f"file:{tmp_path / 'published'}"],
+        ["fetch", f"file:{tmp_path / 'published'}", "--out", tmp_path / "fetched"],
+        ["list", "--remote", f"file:{tmp_path / 'published'}"],
+        ["export", release, "--to", "hdf5", "--out", tmp_path / "h5"],
+    ):
+        done = run(site, *command)
+        assert done.returncode == 0, (command, done.stdout, done.stderr)
+    refused = run(site, "rollout", "walker-walk", "--out", tmp_path / "x")
+    assert refused.returncode == 2 and "pip install" in refused.stderr and "Traceback" not in refused.stderr
+
+
+def test_rolling_out_needs_neither_torch_nor_warp(tmp_path):
+    code = (
+        "import sys, importlib.abc\n"
+        f"heavy = {HEAVY!r}\n"
+        "class Block(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in heavy: raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Block())\n"
+        "from dmcvb_gen.cli import main\n"
+        "main(sys.argv[1:], prog_name='dmcvb-gen')\n"
+    )
+    small = ["--episodes", "1", "--max-steps", "4", "--size", "16", "--level", "expert", "--renderer", "native"]
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        asked = ["rollout", task, *small, "--out", str(tmp_path / task)]
+        done = subprocess.run([sys.executable, "-c", code, *asked], capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        done = subprocess.run(
+            [sys.executable, "-c", code, "verify", str(tmp_path / task)], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    train = subprocess.run(
+        [sys.executable, "-c", code, "train-behaviour", "walker-walk"], capture_output=True, text=True
+    )
+    assert train.returncode == 2 and "pip install torch" in train.stderr
