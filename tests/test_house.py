@@ -12,7 +12,7 @@ import dmcvb_gen
 
 ROOT = Path(dmcvb_gen.__file__).parent
 FLOORS = (
-    ("names", "seeding", "errors", "files", "pool", "labels", "arithmetic"),  # the ground
+    ("names", "seeding", "extras", "errors", "files", "pool", "labels", "arithmetic"),  # the ground
     ("tasks",),
     ("store",),
     ("rendering",),
