@@ -273,3 +273,15 @@ def test_a_folder_without_a_release_says_so(tmp_path):
 def test_a_release_is_read_through_a_url(small_release):
     release = open_release(f"file://{small_release}")
     np.testing.assert_array_equal(release[NAME].read("reward"), open_release(small_release)[NAME].read("reward"))
+
+
+def test_the_root_digest_names_the_data_and_not_the_machine(small_release):
+    from dmcvb_gen.store.index import read_index, root_digest
+
+    manifest = open_release(small_release).manifest
+    listed = read_index(small_release).files
+    elsewhere = manifest.model_copy(update={"environments": ({"cpu": "another"},)})
+    moved = [f.model_copy(update={"sha256": "0" * 64}) if f.path.startswith("commits/") else f for f in listed]
+    assert root_digest(moved, elsewhere) == manifest.digest
+    other = [f.model_copy(update={"sha256": "0" * 64}) if f.path.endswith("/zarr.json") else f for f in listed]
+    assert root_digest(other, manifest) != manifest.digest

@@ -2,11 +2,12 @@
 
 `files.json` lists every file but itself and the manifest, holds the digest of the manifest's bytes, and a digest of its
 own content. The root digest is over the lines "<sha256>  <path>" of all data files in the order of their paths, the
-manifest among them (as it is but for that digest, which it holds). The card's files speak of the root digest, so they
-are listed, but no part of it::
+manifest among them (but for that digest, which it holds). It is the same wherever the same data were made: what names
+the machine, the manifest's environments and the shards' commit records, is listed with a digest, but no part of it.
+Nor are the card's files, which speak of the root digest::
 
     files.json --digests--> shards, commit records, zarr.json, policies, card
-               --digest---> manifest.json --root digest--> all of these but the card
+               --digest---> manifest.json --root digest--> shards, zarr.json, policies, the manifest's own content
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ from dmcvb_gen.store.remote import storage_errors
 
 INDEX = "files.json"
 CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
+COMMITS = "commits/"
+"""Folder of the shards' records, which name the machine that made them."""
 VIDEOS = "backgrounds/"
 """Folder of a release's own copies of videos, one folder a digest."""
 CARD_FOLDER = "card"
@@ -101,9 +104,9 @@ def read_index(root: Path) -> Index | None:
 
 
 def root_digest(listed: Iterable[FileRecord], manifest: Manifest) -> str:
-    """The one digest of a release, see the module."""
-    bare = files.sha256_bytes(files.json_bytes(manifest.model_copy(update={"digest": None})))
-    lines = {file.path: file.sha256 for file in listed if not is_card(file.path)} | {MANIFEST: bare}
+    """The one digest of a release, see the module; the same wherever the same data were made."""
+    bare = files.sha256_bytes(files.json_bytes(manifest.model_copy(update={"digest": None, "environments": ()})))
+    lines = {f.path: f.sha256 for f in listed if not (is_card(f.path) or f.path.startswith(COMMITS))} | {MANIFEST: bare}
     digest = hashlib.sha256()
     for path in sorted(lines):
         digest.update(f"{lines[path]}  {path}\n".encode())

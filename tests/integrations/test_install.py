@@ -1,4 +1,4 @@
-"""The package as strangers install it: a wheel with all its data; reading with hardly anything, rollouts without torch."""
+"""The package as strangers install it: a wheel with all its data; reading with hardly anything; no torch to roll out."""
 
 from __future__ import annotations
 
