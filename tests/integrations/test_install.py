@@ -1,4 +1,4 @@
-"""The package as strangers install it: a wheel with all its data; reading with hardly anything; no torch to roll out."""
+"""The package as strangers install it: a wheel with all data; reading with hardly anything; rollouts without torch."""
 
 from __future__ import annotations
 
