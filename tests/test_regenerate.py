@@ -14,10 +14,11 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.jobs import chosen_shards, make_jobs, release_inputs
+from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
+from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
 from tests.conftest import small_recipe
 
