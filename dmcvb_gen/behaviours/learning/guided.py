@@ -58,7 +58,7 @@ class GuidedSettings:
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    half_life: Positive = 30_000
+    half_life: Positive = 25_000
     layers: Count = 2
     fresh: bool = False
     updates_per_step: Positive = 0.25
@@ -67,7 +67,7 @@ class GuidedSettings:
     guided_share: Share = 0.2
     mean_share: Share = 0.5
     sunken_starts: Share = 0.3
-    least_std: Positive = 0.1
+    least_std: Positive = 0.3
     train_episode_steps: Natural = 300
 
 

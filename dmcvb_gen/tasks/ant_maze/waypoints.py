@@ -18,8 +18,9 @@ CLEARANCE = 1.1
 """Meters to a wall below which a heading turns away from it; the middle of a corridor has 1.25."""
 PUSH = 2.0
 """Weight of turning away at the wall itself, against 1 for going on."""
-AHEAD = 2.0
-"""Meters down the way at which guides are shown where to go."""
+AHEAD = 1.25
+"""Meters down the way at which guides are shown where to go. On 40 episodes of medium7x7a the open maze's expert, so
+guided, returned -61.8; with 2 m -64.9, with 3 m -74.5."""
 LENGTH = 3.0
 """Meters to the point that is headed for: policies of the open maze know goals this far away best."""
 _AROUND = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column)
