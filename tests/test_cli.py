@@ -13,7 +13,7 @@ from dmcvb_gen.behaviours.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.store import open_release
 
-SMALL = ["rollout", "walker-walk", "--episodes", "1", "--size", "16", "--samples", "1"]
+SMALL = ["rollout", "walker-walk", "--episodes", "1", "--size", "16"]
 
 
 def run(*arguments):
@@ -83,8 +83,6 @@ def test_mixed_takes_its_policies_in_turn(tmp_path):
         "9",
         "--size",
         "8",
-        "--samples",
-        "1",
         "--out",
         tmp_path / "m",
     )

@@ -24,7 +24,7 @@ from dmcvb_gen.store import open_release
 from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 
-SMALL = dict(size=16, samples=1)
+SMALL = dict(size=16)
 
 
 def test_every_task_and_distractor_is_registered():
@@ -123,8 +123,7 @@ def test_pictures_are_those_that_the_store_has_for_the_same_physics_and_labels(s
 def test_a_maze_shows_its_views_and_hides_its_goal():
     views = ["top", "egocentric"]
     seen, hidden = (
-        gymnasium.make(f"dmcvb_gen/ant-maze-empty7x7-{goal}-v0", views=views, size=32, samples=1)
-        for goal in ("visible", "hidden")
+        gymnasium.make(f"dmcvb_gen/ant-maze-empty7x7-{goal}-v0", views=views, size=32) for goal in ("visible", "hidden")
     )
     one, other = seen.reset(seed=1)[0], hidden.reset(seed=1)[0]
     np.testing.assert_array_equal(one["state"], other["state"])
@@ -139,7 +138,7 @@ def test_a_maze_shows_its_views_and_hides_its_goal():
 
 def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     maze, views = "ant-maze-empty7x7", ["top"]
-    env = gymnasium.make(f"dmcvb_gen/{maze}-fixed-v0", views=views, goal_seed=3, size=48, samples=2)
+    env = gymnasium.make(f"dmcvb_gen/{maze}-fixed-v0", views=views, goal_seed=3, size=48)
     task = get_task(maze)
     pairs, cells = fixed_pairs(task.layout, FIXED_GOALS, 3), []
     for _ in range(FIXED_GOALS + 1):

@@ -77,7 +77,7 @@ def test_streams_of_an_episode_are_independent_of_each_other():
 
 
 COMMAND = [sys.executable, "-m", "dmcvb_gen", "rollout", "walker-walk", "--level", "random", "--distractor", "none"]
-COMMAND += ["--distractor", "dynamic", "--episodes", "5", "--episodes-per-shard", "1", "--size", "16", "--samples", "1"]
+COMMAND += ["--distractor", "dynamic", "--episodes", "5", "--episodes-per-shard", "1", "--size", "16"]
 
 
 @pytest.mark.slow
@@ -262,7 +262,7 @@ RECIPE = ["rollout", "--recipe", "dmcvb-mini", "walker-walk", "--level", "random
 
 
 def test_options_beside_a_recipe_are_heard(tmp_path):
-    changes = ["--episodes", "1", "--seed", "7", "--size", "8", "--max-steps", "3", "--samples", "1"]
+    changes = ["--episodes", "1", "--seed", "7", "--size", "8", "--max-steps", "3"]
     result = CliRunner().invoke(main, [*RECIPE, *changes, "--out", str(tmp_path / "r"), "--json"])
     assert result.exit_code == 0, result.output
     manifest = open_release(tmp_path / "r").manifest

@@ -146,7 +146,7 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
 @click.option("--distractor", help="none, static or dynamic.  [default: as each subset has]")
 @click.option("--difficulty", type=click.Choice(["easy", "medium", "hard"]), help="[default: as each subset has]")
 @click.option("--size", type=int, help="Pixels a side.  [default: as each subset has]")
-@click.option("--renderer", help="warp or opengl.  [default: as each subset has]")
+@click.option("--renderer", help="native, warp or opengl.  [default: as each subset has]")
 @click.option("--samples", type=click.IntRange(1, 8), help="Samples a pixel: 1, 2, 4 or 8.")
 @click.option("--backgrounds", metavar="FOLDER", help="builtin, or a folder of videos.  [default: the recipe's]")
 @click.option("--split", type=click.Choice(["train", "val"]), help="Videos and styles.  [default: the recipe's]")

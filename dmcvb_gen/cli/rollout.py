@@ -47,9 +47,11 @@ def _out_default(name: str) -> str:
 @click.option("--range", "episode_range", metavar="A:B", help="Only the shards that hold episodes A to B - 1.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
-@click.option("--renderer", default="warp", show_default=True, help="warp or opengl.")
+@click.option("--renderer", default="native", show_default=True, help="native, warp or opengl.")
 @click.option(
-    "--samples", type=click.IntRange(1, 8), help="Samples a pixel: 1, 2, 4 or 8.  [default: warp 2, opengl 4]"
+    "--samples",
+    type=click.IntRange(1, 8),
+    help="Samples a pixel: 1, 2, 4 or 8; native: 4.  [default: warp 2, others 4]",
 )
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
 @click.option("--backgrounds", default="builtin", show_default=True, help="builtin, or a folder of videos.")

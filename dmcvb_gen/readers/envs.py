@@ -59,7 +59,7 @@ class Scene:
     distractor: str = "none"
     difficulty: str | None = None
     size: int = 64
-    renderer: str = "warp"
+    renderer: str = "native"
     samples: int | None = None
     split: str = "val"
     backgrounds: str = "builtin"

@@ -74,9 +74,9 @@ Names = Annotated[tuple[str, ...], pydantic.BeforeValidator(_as_tuple), pydantic
 
 
 class RendererChoice(_Model):
-    """Which renderer paints: backend "warp" or "opengl"; samples a pixel (None: the renderer's default)."""
+    """Which renderer paints: backend "native", "warp" or "opengl"; samples a pixel (None: the renderer's default)."""
 
-    backend: str = "warp"
+    backend: str = "native"
     samples: int | None = pydantic.Field(default=None, ge=1, le=8)
 
 
