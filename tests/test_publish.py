@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import http.client
-import http.server
 import json
 import logging
 import re
@@ -13,7 +11,6 @@ import shutil
 import signal
 import threading
 import types
-import urllib.parse
 
 import numpy as np
 import pytest
@@ -30,6 +27,7 @@ from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.remote import public, reason
 from dmcvb_gen.store.writer import finish_release
 from tests.conftest import roll_out, small_recipe
+from tests.faults.proxy import Proxy
 
 pytest.importorskip("s3fs")
 ThreadedMotoServer = pytest.importorskip("moto.server").ThreadedMotoServer
@@ -40,64 +38,6 @@ CREDENTIALS = {
     "AWS_SECRET_ACCESS_KEY": SECRET,
     "AWS_DEFAULT_REGION": "us-east-1",
 }
-
-
-class Proxy:
-    """Passes requests on to the server, and spoils those that `fault(method, path)` names.
-
-    Faults: "500", "403", "cut" (half of the answer), "corrupt" (a flipped byte), "drop" (no answer at all).
-    """
-
-    def __init__(self, host, port):
-        self.fault, self.requests = lambda method, path: None, []
-        proxy = self
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def log_message(self, *args):
-                pass
-
-            def answer(self):
-                length = int(self.headers.get("Content-Length") or 0)
-                body = self.rfile.read(length)
-                path = urllib.parse.unquote(self.path)
-                kind = proxy.fault(self.command, path)
-                proxy.requests.append((self.command, path, self.headers.get("Range")))
-                self.close_connection = True
-                if kind == "drop":
-                    return
-                if kind in ("500", "403"):
-                    code, word = {"500": (500, "InternalError"), "403": (403, "AccessDenied")}[kind]
-                    self.reply(code, f"<Error><Code>{word}</Code><Message>{word}</Message></Error>".encode(), {})
-                    return
-                inner = http.client.HTTPConnection(host, port, timeout=30)
-                headers = {k: v for k, v in self.headers.items() if k.lower() != "connection"}
-                inner.request(self.command, self.path, body, headers)
-                answer = inner.getresponse()
-                data = answer.read()
-                inner.close()
-                if kind == "corrupt" and data:
-                    data = data[:-1] + bytes([data[-1] ^ 1])
-                self.reply(answer.status, data, dict(answer.getheaders()), cut=kind == "cut")
-
-            def reply(self, status, data, headers, cut=False):
-                self.send_response(status)
-                for name, value in headers.items():
-                    if name.lower() not in ("connection", "content-length", "transfer-encoding", "date", "server"):
-                        self.send_header(name, value)
-                length = headers.get("Content-Length", len(data)) if self.command == "HEAD" else len(data)
-                self.send_header("Content-Length", str(length))
-                self.send_header("Connection", "close")
-                self.end_headers()
-                if self.command != "HEAD":
-                    self.wfile.write(data[: len(data) // 2] if cut else data)
-
-            do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = answer
-
-        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
-        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +87,7 @@ def s3(server, bucket, monkeypatch):
     bucket.invalidate_cache()
     if bucket.exists("bucket/x"):
         bucket.rm("bucket/x", recursive=True)
-    proxy = Proxy(*server)
+    proxy = Proxy(*server).start()
     proxy.direct, proxy.options = bucket, {"endpoint_url": proxy.url}
     yield proxy
     proxy.server.shutdown()
