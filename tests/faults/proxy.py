@@ -1,6 +1,6 @@
 """A bad network: a proxy before an HTTP server that spoils chosen requests; in this process, or as a program.
 
-    python -m tests.faults.proxy 127.0.0.1:9000        # prints its own port; POST /__faults__ sets what it spoils
+python -m tests.faults.proxy 127.0.0.1:9000        # prints its own port; POST /__faults__ sets what it spoils
 """
 
 from __future__ import annotations
