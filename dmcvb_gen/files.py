@@ -105,6 +105,18 @@ def json_bytes(value: Any) -> bytes:
     return (json.dumps(value, indent=1) + "\n").encode()
 
 
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+      ValueError: it is not JSON, not UTF-8, or nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Put `value` (plain, or a pydantic model) as JSON in place of the file at `path`, see `write_bytes`."""
     write_bytes(path, json_bytes(value))

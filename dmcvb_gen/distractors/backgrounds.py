@@ -25,6 +25,10 @@ FRAME_SIZE = 256
 """Frames are cut to their central square and resized to this many pixels a side (Kubric MOVi-D's size)."""
 MAX_FRAMES = 1000
 """A longer video counts with its first frames; a walk of 500 agent steps sees 101 of them."""
+MAX_PIXELS = 2**26
+"""Pixels of a frame before it is cut and resized, at most; more is a mistake or meant to fill the memory."""
+DECODING_SECONDS = 600
+"""Seconds that a video may take to decode."""
 CACHE_BYTES = 256 * 2**20
 """Decoded frames that an open source keeps (and always the video asked for last)."""
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp"}
@@ -184,9 +188,14 @@ def _decode(files: tuple[Path, ...]) -> np.ndarray:
 
 def _read_pictures(path: Path) -> np.ndarray:
     with Image.open(path) as picture:
+        if picture.width * picture.height > MAX_PIXELS:
+            raise ValueError(f"{picture.width} x {picture.height} is more than {MAX_PIXELS:,} pixels")
         frames = []
-        for index in range(min(getattr(picture, "n_frames", 1), MAX_FRAMES)):
-            picture.seek(index)
+        for index in range(MAX_FRAMES):  # to count the frames of a hostile file takes for ever
+            try:
+                picture.seek(index)
+            except EOFError:
+                break
             frames.append(square(picture.convert("RGB")))
     return np.stack(frames)
 
@@ -201,10 +210,14 @@ def _read_video(path: Path) -> np.ndarray:
 
     middle = "crop='min(iw,ih)':'min(iw,ih)'"
     resize = f"scale={FRAME_SIZE}:{FRAME_SIZE}:flags=lanczos+accurate_rnd+full_chroma_int+bitexact"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-protocol_whitelist", "file,pipe"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-xerror"]
+    command += ["-protocol_whitelist", "file,pipe", "-max_pixels", str(MAX_PIXELS)]
     command += ["-i", f"file:{path}", "-map", "0:v:0", "-frames:v", str(MAX_FRAMES), "-fps_mode", "passthrough"]
     command += ["-vf", f"{middle},{resize},format=rgb24", "-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
-    run = subprocess.run(command, capture_output=True, check=False)
+    try:
+        run = subprocess.run(command, capture_output=True, check=False, timeout=DECODING_SECONDS)
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"decoding it takes more than {DECODING_SECONDS} s") from None
     complaint = re.sub(r"\[[^]]*\]\s*", "", run.stderr.decode(errors="replace")).strip()
     if complaint or run.returncode:
         raise ValueError(complaint or f"ffmpeg ended with code {run.returncode}")

@@ -81,18 +81,27 @@ def check_card(root: str | Path) -> list[str]:
         path = release.path / name
         if not path.is_file():
             findings.append(f"{name} is missing")
-        elif path.read_text() != text:
-            line = _first_difference(path.read_text(), text)
+        elif path.read_bytes() != text.encode():
+            line = _first_difference(path.read_text(errors="replace"), text)
             findings.append(f"{name} does not fit the release at line {line}")
     sheet = release.path / SHEET
     if not sheet.is_file() or not (release.path / PLOT).is_file():
         findings.append(f"a picture in {CARD_FOLDER}/ is missing")
-    elif not np.array_equal(np.asarray(Image.open(sheet)), _sheet(release)):
+    elif not _shows(sheet, _sheet(release)):
         findings.append(f"{SHEET} does not show the release's episodes")
     changelog = release.path / CHANGELOG
-    if not changelog.is_file() or f"## {release.manifest.version}\n" not in changelog.read_text():
+    if not changelog.is_file() or f"## {release.manifest.version}\n" not in changelog.read_text(errors="replace"):
         findings.append(f"{CHANGELOG} does not speak of version {release.manifest.version}")
     return findings
+
+
+def _shows(path: Path, pixels: np.ndarray) -> bool:
+    """Whether a file is the picture of these pixels; its size is compared before it is decoded."""
+    try:
+        with Image.open(path) as picture:
+            return picture.size == pixels.shape[1::-1] and np.array_equal(np.asarray(picture), pixels)
+    except Exception:  # decoders raise many kinds; none is that picture
+        return False
 
 
 def _first_difference(one: str, other: str) -> int:

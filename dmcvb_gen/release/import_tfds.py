@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.files import sha256_file
+from dmcvb_gen.files import parse_json, sha256_file
 from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
@@ -184,10 +183,10 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
 def _step_features(path: Path) -> dict[str, Any]:
     """Flat names of a step's features -> their JSON."""
     try:
-        tree = json.loads((path / "features.json").read_text())
+        tree = parse_json((path / "features.json").read_bytes())
         steps = tree["featuresDict"]["features"]["steps"]["sequence"]["feature"]
         return dict(_flatten(steps))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise StoreError(f"{path}/features.json does not describe RLDS steps ({type(error).__name__})") from None
 
 

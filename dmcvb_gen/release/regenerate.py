@@ -8,7 +8,6 @@ beside.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import copy_file, folder_in_the_making, remove_partial, write_json
+from dmcvb_gen.files import copy_file, folder_in_the_making, parse_json, remove_partial, write_json
 from dmcvb_gen.pool import Tick, Workers, ignore
 from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
@@ -332,7 +331,7 @@ def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardO
 
 def _is_json(path: Path) -> bool:
     try:
-        json.loads(path.read_bytes())
+        parse_json(path.read_bytes())
     except (OSError, ValueError):
         return False
     return True

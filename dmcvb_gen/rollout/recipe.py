@@ -366,7 +366,7 @@ def load_recipe(source: str | Path) -> Recipe:
             ) from None
     try:
         data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise RecipeError(f"{source} is not YAML: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
         raise RecipeError(f"{source} holds no mapping of recipe fields; see `dmcvb-gen rollout --help`")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import platform
 import re
 from importlib import metadata
@@ -14,11 +13,15 @@ import pydantic
 
 from dmcvb_gen import __version__
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
 from dmcvb_gen.store.schema import SCHEMA_VERSION
 
 __all__ = ["write_json_atomically"]
 MANIFEST = "manifest.json"
+
+MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
+"""More than any release has; what asks for more is damaged or hostile, and would keep a reader busy for hours."""
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
 
@@ -102,19 +105,19 @@ class SubsetRecord(_Model):
     task: str
     level: str
     setting: str
-    episodes: int = pydantic.Field(gt=0)
-    episodes_per_shard: int = pydantic.Field(gt=0)
-    size: int
+    episodes: int = pydantic.Field(gt=0, le=MAX_EPISODES)
+    episodes_per_shard: int = pydantic.Field(gt=0, le=MAX_EPISODES)
+    size: int = pydantic.Field(gt=0, le=MAX_SIZE)
     deterministic: bool = False
     policies: tuple[PolicyRecord, ...] = ()
     renderer: dict[str, Any] = {}
     backgrounds: dict[str, Any] | None = None
     family: str = "locomotion"
-    views: tuple[str, ...] = ("pixels",)
+    views: tuple[str, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
     hidden_goal: bool = False
-    max_steps: int = 500
-    fixed_goals: int | None = None
-    episodes_per_goal: int | None = None
+    max_steps: int = pydantic.Field(default=500, gt=0, le=MAX_STEPS)
+    fixed_goals: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
+    episodes_per_goal: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
     split: str = "train"
     pixels: bool = True
     digest: Digest | None = None
@@ -134,6 +137,12 @@ class Addition(_Model):
     recipe: dict[str, Any]
     generator: str
     subsets: dict[RelativePath, tuple[int, int]]
+
+
+def _check_shards(subsets: tuple[SubsetRecord, ...]) -> tuple[SubsetRecord, ...]:
+    if (count := sum(map(shard_count, subsets))) > MAX_SHARDS:
+        raise ValueError(f"{count:,} shards are more than the {MAX_SHARDS:,} that a release may have")
+    return subsets
 
 
 class Manifest(_Model):
@@ -156,7 +165,7 @@ class Manifest(_Model):
     generator: str = f"dmcvb-gen {__version__}"
     recipe: dict[str, Any]
     additions: tuple[Addition, ...] = ()
-    subsets: tuple[SubsetRecord, ...]
+    subsets: Annotated[tuple[SubsetRecord, ...], pydantic.AfterValidator(_check_shards)]
     environments: tuple[dict[str, str], ...] = ()
     lineage: tuple[dict[str, Any], ...] = ()
     complete: bool = False
@@ -267,7 +276,7 @@ def _span(episodes: tuple[int, int]) -> str:
 
 def _parse(model, text, where):
     try:
-        data = json.loads(text)
+        data = parse_json(text)
     except ValueError as error:
         raise StoreError(f"{where} is not JSON ({error}); fetch or regenerate the release again") from None
     version = data.get("schema_version", SCHEMA_VERSION) if isinstance(data, dict) else None

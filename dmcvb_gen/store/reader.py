@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,11 @@ from dmcvb_gen.store.manifest import (
 from dmcvb_gen.store.pictures import picture_of
 from dmcvb_gen.store.remote import file_system, is_url, public, storage_errors
 from dmcvb_gen.store.writer import read_commits
+
+MAX_STEP_BYTES = 2**20
+"""Bytes of a step that is no picture, at most."""
+MANY_EPISODES = 10**6
+"""An array with more episodes than that, and ten times the manifest's, is damaged or hostile."""
 
 
 class StoredArray:
@@ -132,6 +138,7 @@ class Subset:
         unpainted = self.unpainted if picture else None
         with storage_errors(self.path, decoding=True):
             array = self.group[self.paths[name]]
+            self._check_shape(array, name)
             return StoredArray(array, name, f"{self.path}/{self.paths[name]}", unpainted, self._without_pictures)
 
     @property
@@ -148,6 +155,20 @@ class Subset:
             f"{self.name} has no pictures for (all of) its episodes; paint them: `dmcvb-gen paint "
             f"{public(self.root)}`, or open the release with paint=True"
         )
+
+    def _check_shape(self, array: zarr.Array, name: str) -> None:
+        """Raises StoreError for an array of more episodes, steps or bytes a step than the manifest can mean."""
+        record = self.record
+        largest = (record.max_steps + 1) * max(16 * record.size**2, MAX_STEP_BYTES)
+        entry = math.prod(array.shape[1:]) * array.dtype.itemsize
+        rows = array.shape[1] if array.ndim > 1 else 1
+        episodes = array.shape[0] if array.ndim else 0
+        many = episodes > max(10 * record.episodes, MANY_EPISODES)
+        if not episodes or many or entry > largest or rows > record.max_steps + 1:
+            raise StoreError(
+                f"{name} of {self.name} is {array.dtype} {array.shape}, which does not fit {record.episodes} episodes "
+                f"of {record.max_steps} steps; regenerate or fetch the release again"
+            )
 
     @property
     def pixel_arrays(self) -> tuple[str, ...]:

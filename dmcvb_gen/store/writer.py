@@ -296,8 +296,11 @@ def find_array(group: zarr.Group, name: str) -> tuple[zarr.Array, str]:
 def read_commits(root: Path, subset: SubsetRecord) -> dict[int, CommitRecord]:
     """The committed shards of a subset, shard -> record (those whose files are all there at their size)."""
     commits = {}
+    with storage_errors(root):
+        folder = (root / commit_path(subset.name, 0)).parent
+        there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     for shard in range(shard_count(subset)):
-        commit = _read_commit(root, subset, shard)
+        commit = _read_commit(root, subset, shard) if f"{shard:05d}.json" in there else None
         if commit:
             commits[shard] = commit
     return commits

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import contextlib
 import copy
 import functools
 import io
@@ -540,27 +541,34 @@ KINDS: dict[str, Kind] = {
 
 
 class Taker:
-    """A child that takes the cases of one kind, one after the other, under a bound on its memory."""
+    """A child that takes cases, one after the other, under a bound on its memory; another takes its place if it dies."""
 
-    def __init__(self, kind: str):
-        self.kind = kind
+    def __init__(self):
+        self._process: subprocess.Popen | None = None
+
+    def __enter__(self) -> Taker:
+        return self
+
+    def __exit__(self, *_) -> None:
+        if self._process:
+            self._process.stdin.close()
+            self._process.wait(timeout=60)
+
+    def _start(self) -> subprocess.Popen:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(TOP), os.environ.get("PYTHONPATH", "")])}
-        command = [sys.executable, "-m", "tests.faults.hostile", "--take", kind]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=TOP
-        )
+        command = [sys.executable, "-m", "tests.faults.hostile", "--serve"]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=TOP)
 
-    def close(self) -> None:
-        self._process.stdin.close()
-        self._process.wait(timeout=60)
-
-    def take(self, files: Files) -> dict[str, Any]:
+    def take(self, kind: str, files: Files) -> dict[str, Any]:
         """status ("refused", "accepted", "wrong", "died"), text, and what it took: seconds, bytes."""
+        self._process = self._process or self._start()
         case = {name: base64.b64encode(data).decode() for name, data in files.items()}
-        self._process.stdin.write(json.dumps(case) + "\n")
+        self._process.stdin.write(json.dumps([kind, case]) + "\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         if not line:
+            self._process = None
             return {"status": "died", "text": "the process died", "seconds": 0.0, "bytes": 0}
         answer = json.loads(line)
         if answer["seconds"] > SECONDS:
@@ -610,35 +618,41 @@ class _Guard:
             self.noted.append(f"{event} {path}")
 
 
-def serve(kind: str) -> None:
-    """Take cases from standard input, a line each."""
-    from dmcvb_gen.errors import DmcvbError
-
+def serve() -> None:
+    """Take cases from standard input, a line each: its kind and its files."""
     sys.dont_write_bytecode = True
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    chosen, guard = KINDS[kind], _Guard()
-    base = chosen.base()
+    guard, kind, base = _Guard(), None, {}
+    signal.signal(signal.SIGALRM, _too_late)
+    signal.signal(signal.SIGPROF, _too_late)
+    sys.addaudithook(guard)
     with tempfile.TemporaryDirectory(prefix="hostile-") as outer:
         folder = Path(os.path.realpath(outer)) / "case"
-        lay_out(folder, base)
-        try:
-            chosen.take(folder)  # whatever is imported or made once for all is so before the bound is set
-        except (DmcvbError, OSError):
-            pass
-        resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, resource.RLIM_INFINITY))
-        signal.signal(signal.SIGALRM, _too_late)
-        signal.signal(signal.SIGPROF, _too_late)
-        sys.addaudithook(guard)
         for line in iter(requests.readline, ""):
-            files = {name: base64.b64decode(data) for name, data in json.loads(line).items()}
-            shutil.rmtree(folder)
-            lay_out(folder, base | files)
-            answers.write(json.dumps(_take(chosen.take, folder, guard)) + "\n")
+            asked, case = json.loads(line)
+            if asked != kind:
+                kind, base = asked, KINDS[asked].base()
+                _warm_up(KINDS[kind], folder, base)
+            lay_out(folder, base | {name: base64.b64decode(data) for name, data in case.items()})
+            answers.write(json.dumps(_take(KINDS[kind].take, folder, guard)) + "\n")
             answers.flush()
 
 
+def _warm_up(kind: Kind, folder: Path, base: Files) -> None:
+    """Take a sound case without bounds (what is imported or made once for all counts for none), then set them."""
+    from dmcvb_gen.errors import DmcvbError
+
+    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    lay_out(folder, base)
+    with contextlib.suppress(DmcvbError, OSError):
+        kind.take(folder)
+    resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, resource.RLIM_INFINITY))
+
+
 def lay_out(folder: Path, files: Files) -> None:
+    """Make a folder of these files alone."""
+    shutil.rmtree(folder, ignore_errors=True)
     for name, data in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
@@ -694,22 +708,21 @@ class Outcome:
         )
 
 
-def run_kind(kind: str, examples: int, seed: int | None = None) -> Outcome:
-    """Give a kind's taker `examples` cases, the same ones for the same seed."""
-    outcome, takers = Outcome(), [Taker(kind)]
+def run_kind(taker: Taker, kind: str, examples: int, seed: int = 0) -> Outcome:
+    """Give `examples` cases of a kind to a taker, the same ones for the same seed."""
+    outcome = Outcome()
 
+    @hypothesis.seed(seed)
     @settings(
         max_examples=examples,
         deadline=None,
         suppress_health_check=list(HealthCheck),
         database=None,
         phases=[Phase.generate],
-        derandomize=seed is None,
     )
     @given(KINDS[kind].cases())
     def every(files):
-        taker = takers[-1]
-        answer = taker.take(files)
+        answer = taker.take(kind, files)
         outcome.slowest, outcome.most = max(outcome.slowest, answer["seconds"]), max(outcome.most, answer["bytes"])
         if answer["status"] == "refused":
             outcome.refused += 1
@@ -718,14 +731,8 @@ def run_kind(kind: str, examples: int, seed: int | None = None) -> Outcome:
         else:
             shown = {name: data if len(data) < 600 else data[:600] + b"..." for name, data in files.items()}
             outcome.wrong.setdefault(answer["text"].strip().splitlines()[-1][:100], f"{answer['text']}\nof {shown}")
-        if answer["status"] == "died":
-            taker.close()
-            takers.append(Taker(kind))
 
-    try:
-        (every if seed is None else hypothesis.seed(seed)(every))()
-    finally:
-        takers[-1].close()
+    every()
     return outcome
 
 
@@ -734,18 +741,19 @@ def main() -> int:
     parser.add_argument("kinds", nargs="*", help=f"{', '.join(KINDS)}; all by default")
     parser.add_argument("--examples", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--take", help=argparse.SUPPRESS)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.take:
-        serve(options.take)
+    if options.serve:
+        serve()
         return 0
     failed = 0
-    for kind in options.kinds or KINDS:
-        outcome = run_kind(kind, options.examples, options.seed)
-        failed += bool(outcome.wrong)
-        print(f"{kind}: {outcome}", flush=True)
-        for name, text in outcome.wrong.items():
-            print(f"--- {kind}: {name}\n{text}", flush=True)
+    with Taker() as taker:
+        for kind in options.kinds or KINDS:
+            outcome = run_kind(taker, kind, options.examples, options.seed)
+            failed += bool(outcome.wrong)
+            print(f"{kind}: {outcome}", flush=True)
+            for name, text in outcome.wrong.items():
+                print(f"--- {kind}: {name}\n{text}", flush=True)
     return 1 if failed else 0
 
 

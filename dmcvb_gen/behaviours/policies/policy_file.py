@@ -6,7 +6,6 @@ Loading one runs no code from the file, allocates no more than the file holds, a
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from safetensors.numpy import save as dump_safetensors
 from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
 from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.files import parse_json
 from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -54,7 +54,7 @@ def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
         raise PolicyFileError(f"cannot read policy file {path}: {error.strerror}; give the path of one") from None
     try:
         size = int.from_bytes(data[:8], "little")
-        metadata = json.loads(data[8 : 8 + size]).get("__metadata__", {})
+        metadata = parse_json(data[8 : 8 + size]).get("__metadata__", {})
         header = PolicyHeader.model_validate_json(metadata["header"])
         weights = load_safetensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
