@@ -16,7 +16,7 @@ from pathlib import Path
 
 from tests.faults.inject import arm
 
-PATIENCE = 300
+PATIENCE = 1200
 """Seconds after which a command counts as hung."""
 GRACE = 20
 """Seconds that what a command has started may outlive it."""

@@ -541,7 +541,7 @@ KINDS: dict[str, Kind] = {
 
 
 class Taker:
-    """A child that takes cases, one after the other, under a bound on its memory; another takes its place if it dies."""
+    """A child that takes cases, one after the other, under a bound on its memory; another follows if it dies."""
 
     def __init__(self):
         self._process: subprocess.Popen | None = None
