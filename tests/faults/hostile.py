@@ -361,7 +361,7 @@ def _read_all(root: str) -> None:
     from dmcvb_gen.store import open_release
 
     release = open_release(root)
-    list(check_files(release))
+    list(check_files(Path(root)))
     describe_release(root)
     for subset in release.subsets.values():
         for episode in subset.episodes[:2]:
