@@ -21,6 +21,7 @@ from dmcvb_gen.files import parse_json, sha256_file
 from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
+from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD
 from dmcvb_gen.store.manifest import Manifest, SubsetRecord, environment
 from dmcvb_gen.store.pictures import picture_arrays, picture_of
@@ -162,6 +163,14 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
     family = get_task(task).family
     fixed = setting == FIXED
+    try:
+        size = int(pictures[views[0]]["shape"]["dimensions"][0])
+        if not 0 < size <= MAX_SIZE:
+            raise ValueError(f"{size} pixels")
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise StoreError(
+            f"the features.json of {name} does not say a size of pictures ({error}); fetch the folder again"
+        ) from None
     return SubsetRecord(
         name=name,
         task=task,
@@ -169,7 +178,7 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         setting=setting,
         episodes=sum(counts),
         episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD[family], sum(counts)),
-        size=int(pictures[views[0]]["shape"]["dimensions"][0]),
+        size=size,
         renderer={"name": "imported"},
         family=family,
         views=views,
@@ -247,15 +256,23 @@ def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], record: SubsetR
         arrays["state"][0, :count] = _state(task, values, count, terminated)
         for view, name in zip(record.views, picture_arrays(record.views, record.hidden_goal), strict=True):
             files = values[f"steps/observation/{picture_feature(task.id, view, record.hidden_goal)}"]
-            arrays[name][0, :count] = [np.asarray(Image.open(io.BytesIO(data))) for data in files]
+            arrays[name][0, :count] = [_picture(data, record.size) for data in files]
         arrays["action"][0, :length] = np.reshape(values["steps/action"], (count, -1))[:length]
         arrays["reward"][0, :length] = np.asarray(values["steps/reward"])[:length]
         arrays["discount"][0, :length] = 1
         arrays["discount"][0, length - 1] = 0 if terminated else 1
-    except (KeyError, ValueError, TypeError, OSError) as error:
+    except (KeyError, ValueError, TypeError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise StoreError(f"an episode of {file} is not one of {task.id}: {error}; fetch the file again") from None
     arrays["length"][0], arrays["terminated"][0] = length, terminated
     arrays["return"][0] = arrays["reward"][0].astype(np.float64).sum()
+
+
+def _picture(data: bytes, size: int) -> np.ndarray:
+    """(size, size, 3) uint8; what says that it is larger is not decoded. Raises ValueError."""
+    with Image.open(io.BytesIO(data)) as picture:
+        if picture.size != (size, size):
+            raise ValueError(f"a picture of {picture.size} pixels instead of {size}")
+        return np.asarray(picture)
 
 
 def _state(task: Task, values: dict[str, Any], count: int, terminated: bool) -> np.ndarray:
