@@ -168,3 +168,21 @@ def test_a_torch_loader_with_workers_paints(made):
 def test_a_way_of_painting_that_there_is_not_is_refused(made):
     with pytest.raises(DmcvbError, match="resample"):
         dmcvb_gen.open(str(made / "light"), paint=True, distractors="new")
+
+
+def test_a_release_travels_without_pictures_and_is_painted_where_it_arrives(made, tmp_path):
+    url = f"file:{tmp_path / 'there'}"
+    sent = run("publish", made / "painted", url, "--no-pixels")
+    assert sent.exit_code == 0, sent.output
+    assert not any("/pixels" in name for name in files(tmp_path / "there"))
+    assert not [path for path in made.iterdir() if path.name.startswith(".")]
+    light = sum(map(len, files(tmp_path / "there").values()))
+    assert light < sum(map(len, files(made / "painted").values()))
+    came = run("fetch", url, "--paint", "--out", tmp_path / "here")
+    assert came.exit_code == 0 and "not those" not in came.output, came.output
+    for name, subset in open_release(made / "painted").subsets.items():
+        for array in subset.pixel_arrays:
+            assert np.array_equal(open_release(tmp_path / "here")[name].read(array), subset.read(array))
+    part = run("fetch", url, "--episodes", "0:1", "--paint", "--out", tmp_path / "part")
+    assert part.exit_code == 0, part.output
+    assert all(list(s.episodes) == [0, 1] and s.pixel_arrays for s in open_release(tmp_path / "part").subsets.values())

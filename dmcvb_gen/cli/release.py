@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import os
+import tempfile
+from pathlib import Path
 
 import click
 from tqdm import tqdm
@@ -189,34 +193,52 @@ transfers_option = click.option(
 @remote_option
 @click.option("--take-over", is_flag=True, help="Go on although another publisher's claim is there.")
 @transfers_option
+@click.option("--no-pixels", is_flag=True, help="Leave the pictures behind; their digests travel, `paint` restores.")
 @json_option
-def publish(path, url, options, take_over, workers, as_json):
+def publish(path, url, options, take_over, workers, no_pixels, as_json):
     """Put a complete release at a URL: every file checked, the manifest last, a published version never changed.
 
     Run again after an interruption, it goes on. Credentials come from the environment.
 
     \b
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
+    dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
     from dmcvb_gen.release.publish import publish as run
     from dmcvb_gen.store.remote import public
 
-    with tqdm(unit=" files", disable=as_json or None) as bar:
-        moved = run(path, url, options=options, take_over=take_over, workers=workers, tick=bar.update)
+    with tqdm(unit=" files", disable=as_json or None) as bar, contextlib.ExitStack() as stack:
+        sent = stack.enter_context(_left_behind(path)) if no_pixels else path
+        moved = run(sent, url, options=options, take_over=take_over, workers=workers, tick=bar.update)
     if as_json:
         return print_json(dataclasses.asdict(moved))
     click.echo(f"{public(url)}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
+
+
+@contextlib.contextmanager
+def _left_behind(path):
+    """A copy (of links) of a release without its pictures, beside it."""
+    from dmcvb_gen.release.paint import without_pictures
+    from dmcvb_gen.store.remote import storage_errors
+
+    folder = Path(path)
+    with storage_errors(folder, "write beside"):
+        made = tempfile.TemporaryDirectory(dir=folder.resolve().parent, prefix=f".{folder.name}-light-")
+    with made as light:
+        without_pictures(folder, light)
+        yield light
 
 
 @click.command()
 @click.argument("url")
 @only_option
 @episodes_option
+@click.option("--paint", is_flag=True, help="Then fill in the pictures that travelled without; see `paint`.")
 @click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the release here.")
 @remote_option
 @transfers_option
 @json_option
-def fetch(url, only, episodes, out, options, workers, as_json):
+def fetch(url, only, episodes, out, options, workers, paint, as_json):
     """Bring a published release, or only the shards that hold some episodes; run again, it goes on or adds.
 
     \b
@@ -226,8 +248,15 @@ def fetch(url, only, episodes, out, options, workers, as_json):
 
     with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
         moved = run(url, out, only, episodes, options=options, workers=workers, tick=bar.update)
+    if paint:
+        from dmcvb_gen.release.paint import paint_release
+
+        with frames_bar(as_json) as bar:
+            done = paint_release(out, workers=min(workers, os.cpu_count() or 1), tick=bar.update)
+        for name in done.differing:
+            click.echo(f"note: pictures of {name} are not those that were published", err=True)
     if as_json:
-        return print_json(dataclasses.asdict(moved))
+        return print_json(dataclasses.asdict(moved) | ({"painted": done.shards} if paint else {}))
     click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
 
 
