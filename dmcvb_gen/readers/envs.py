@@ -187,8 +187,10 @@ class DistractedEnv(gymnasium.Env):
     `reset` decides initial states, distractors and all episodes after it.
 
     Args:
-      task, distractor, options: see `Scene`.
+      task: its name, see `Scene`.
+      distractor: its setting, see `Scene`.
       render_mode: None or "rgb_array".
+      **options: those of `Scene`.
 
     Raises:
       DmcvbError: what is asked for does not exist; the message lists what does.
