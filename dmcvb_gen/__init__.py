@@ -9,7 +9,7 @@ from dmcvb_gen.readers.register import register
 if TYPE_CHECKING:
     from dmcvb_gen.readers.release import ReleaseReader
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def open(path: str, storage_options: dict | None = None, *, paint: bool = False, **painting: Any) -> ReleaseReader:
