@@ -7,6 +7,9 @@ import json
 import os
 import resource
 import signal
+import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -60,6 +63,14 @@ def test_files_have_the_rights_of_any_new_file(tmp_path):
 
 def test_what_killed_writers_left_is_removed(tmp_path):
     files.write_text(tmp_path / "sub/kept", "")
-    (tmp_path / "sub" / ".kept.x8.partial").write_text("half")
+    killed = subprocess.Popen([sys.executable, "-c", ""])
+    killed.wait()
+    (tmp_path / "sub" / f".kept.{socket.gethostname()}@{killed.pid}.x8.partial").write_text("half")
+    living = tmp_path / "sub" / f".kept.{socket.gethostname()}@{os.getpid()}.x8.partial"
+    nobodys = tmp_path / "sub" / ".kept.x8.partial"
+    for path in (living, nobodys):
+        path.write_text("half")
     files.remove_partial(tmp_path)
-    assert os.listdir(tmp_path / "sub") == ["kept"]
+    assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, nobodys.name, "kept"])
+    files.remove_partial(tmp_path, foreign=True)
+    assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, "kept"])

@@ -187,8 +187,8 @@ class FolderSite(Site):
         with storage_errors(self.root / path):
             try:
                 return (self.root / path).read_bytes()
-            except FileNotFoundError:
-                return None
+            except (FileNotFoundError, NotADirectoryError):
+                return None  # where a file is in the way, the first one who writes says so
 
     def listing(self):
         with storage_errors(self.root):
