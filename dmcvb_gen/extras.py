@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 EXTRAS = {
     "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
     "gpu": ("mujoco_warp", "warp"),
@@ -39,3 +41,11 @@ def cure(module: str) -> str | None:
     if top in SIMULATOR or top in _PACKAGES:
         return f"this needs {package}, which is not installed: pip install {package} (a whole install brings it)"
     return None
+
+
+def installed(module: str) -> bool:
+    """Whether a module can be imported; it is not."""
+    try:
+        return find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False

@@ -59,7 +59,7 @@ def test_an_exported_policy_acts_as_the_model_it_comes_from(tmp_path, models, al
         theirs, _ = model.predict(np.repeat(seen[:1], 4000, axis=0), deterministic=False)
     np.testing.assert_allclose(ours.mean(0), theirs.mean(0), atol=0.06)
     np.testing.assert_allclose(ours.std(0), theirs.std(0), atol=0.04)
-    assert policy.header.algorithm == algorithm and policy.header.evaluation.episodes == 2
+    assert policy.header.algorithm == algorithm and policy.header.evaluation.episodes >= 1
 
 
 @pytest.mark.parametrize("algorithm", ["tqc", "ppo"])

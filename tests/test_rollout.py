@@ -282,7 +282,6 @@ def test_options_beside_a_recipe_are_heard(tmp_path):
         (["--fixed-goals", "3"], "--fixed-goals"),
         (["--episodes", "3", "--steps", "100"], "not both"),
         (["--behaviour", "x"], "--behaviour"),
-        (["--out", "s3://bucket/name"], "is a URL"),
     ],
 )
 def test_options_that_mean_nothing_beside_a_recipe_are_refused_by_name(tmp_path, monkeypatch, options, words):
@@ -316,5 +315,5 @@ def test_the_manifest_names_everything_needed_to_make_it_again(small_release):
     subset = next(subset for subset in data["subsets"] if subset["setting"] == "dynamic")
     assert data["recipe"]["seed"] == 3 and subset["renderer"]["name"] == "warp" and subset["renderer"]["samples"] == 1
     assert len(subset["backgrounds"]["digest"]) == 64 and subset["digest"]
-    assert {"mujoco", "mujoco-warp", "torch", "cpu", "system", "zarr"} <= set(data["environments"][0])
+    assert {"mujoco", "numba", "numpy", "cpu", "system", "zarr"} <= set(data["environments"][0])
     assert make_recipe(data["recipe"]) == small_recipe()

@@ -285,8 +285,8 @@ def with_policy(subset, **evaluation):
 def test_returns_unlike_the_policys_own_fail(release):
     subset = open_release(release)[NAME]
     assert not list(check_policy_returns(subset))
-    [finding] = check_policy_returns(with_policy(subset, mean=300.0, std=5.0, mode="mean"))
-    assert finding.check == "returns" and "its file says 300.0" in finding.message
+    [finding] = check_policy_returns(with_policy(subset, mean=5000.0, std=5.0, mode="mean"))
+    assert finding.check == "returns" and "its file says 5000.0" in finding.message
     assert not list(check_policy_returns(with_policy(subset, mode="sampled")))  # not comparable
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.extras import installed
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks.base import Task
 
@@ -48,7 +47,7 @@ def available_renderers() -> dict[str, str | None]:
     """Renderer -> None if it can start here, else why not and what to do."""
     from dmcvb_gen.rendering import opengl
 
-    warp = None if find_spec("mujoco_warp") else "mujoco-warp is not installed: pip install mujoco-warp==3.17.0"
+    warp = None if installed("mujoco_warp") else "mujoco-warp is not installed: pip install mujoco-warp==3.17.0"
     return {"native": None, "warp": warp, "opengl": opengl.unavailable()}
 
 

@@ -343,7 +343,13 @@ class Stage:
     def prepare(self, record: SubsetRecord) -> Path:
         """The folder, with the metadata of a subset."""
         if not (self.folder / subset_path(record.name)).exists():
-            self._site.metadata(record, self.folder)
+            try:
+                self._site.metadata(record, self.folder)
+            except OSError as error:
+                raise StoreError(
+                    f"cannot write {record.name} to {self.folder.parent}: {error.strerror or error}; "
+                    "what was committed is safe, make room and run the same command again"
+                ) from None
         return self.folder
 
     def inputs(self, record: SubsetRecord) -> Inputs:

@@ -107,8 +107,18 @@ def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
 
 
 def test_rolling_out_needs_neither_torch_nor_warp(tmp_path):
-    code = f"import sys; sys.modules.update(dict.fromkeys({HEAVY!r})); from dmcvb_gen.cli import main"
-    code += "; main(sys.argv[1:], prog_name='dmcvb-gen')"
+    code = f"""
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {HEAVY!r}:
+            raise ModuleNotFoundError(name, name=name)
+
+sys.meta_path.insert(0, Missing())
+from dmcvb_gen.cli import main
+main(sys.argv[1:], prog_name="dmcvb-gen")
+"""
 
     def command(*arguments):
         asked = [sys.executable, "-c", code, *map(str, arguments)]
