@@ -517,7 +517,11 @@ def _recipes() -> st.SearchStrategy[Files]:
 KINDS: dict[str, Kind] = {
     "manifest": Kind(_one_of_release(lambda name: name == "manifest.json"), take_release, valid_release),
     "commit": Kind(_one_of_release(lambda name: name.startswith("commits/")), take_release, valid_release),
-    "zarr": Kind(_one_of_release(lambda name: name.endswith("zarr.json")), take_release, valid_release),
+    "zarr": Kind(
+        _one_of_release(lambda name: name.endswith((".zarr/zarr.json", "/length/zarr.json"))),
+        take_release,
+        valid_release,
+    ),
     "chunk": Kind(_one_of_release(lambda name: "/c/" in name), take_release, valid_release),
     "published": Kind(_one_of_release(lambda name: name.endswith(".json"), "there/"), take_published, _published),
     "recipe": Kind(_recipes, take_recipe, lambda: {"recipe.yaml": RECIPE.encode()}),
