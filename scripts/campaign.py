@@ -47,7 +47,7 @@ KINDS = {
     "walker": ["walker-walk", "--distractor", "none", "--distractor", "dynamic", "--episodes", "3"],
     "maze": ["ant-maze-empty7x7", "--goal", "hidden", "--episodes", "3"],
 }
-SMALL = ["--level", "random", "--episodes-per-shard", "1", "--size", "8", "--samples", "1"]
+SMALL = ["--level", "random", "--episodes-per-shard", "1", "--size", "8", "--max-steps", "12"]
 CARD = ("README.md", "CHANGELOG.md", "croissant.json", "card/")
 STRIKES = ("die", "disk full", "ctrl-c", "cut off", "quota")
 MODES = {"die": "kill", "disk full": "full", "ctrl-c": "interrupt", "cut off": "cut", "quota": "quota"}

@@ -1,4 +1,4 @@
-"""Rollouts that take a moment: episodes of a few steps and a painter that is only arithmetic, for many faults an hour.
+"""Rollouts that take a moment: a painter that is only arithmetic, for many faults an hour.
 
 What is painted does not matter to a campaign of faults; that the same state gives the same picture does.
 """
@@ -11,17 +11,12 @@ import numpy as np
 
 from dmcvb_gen.rendering.base import Renderer, check_frames
 
-STEPS = 12
-"""Agent steps an episode."""
-
 
 class Painter(Renderer):
     """Pictures whose every byte follows from the bytes of the state, the labels and the view."""
 
-    name = "warp"
-
-    def __init__(self, task, size, **settings):
-        self.task, self.size = task, size
+    def __init__(self, name, task, size):
+        self.name, self.task, self.size = name, task, size
 
     def render(self, physics, exogenous, views=None, hide_goal=False):
         indices = check_frames(self.task, physics, exogenous, views)
@@ -39,11 +34,7 @@ class Painter(Renderer):
 
 
 def shrink() -> None:
-    """Have every task of this process (and of those that are forked from it) be of that kind."""
-    from dmcvb_gen.rollout import plan
-    from dmcvb_gen.tasks.ant_maze.task import AntMaze
-    from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
+    """Have this process (and those that are forked from it) paint so."""
+    from dmcvb_gen.rollout import painting
 
-    for task in (WalkerWalk, CheetahRun, HumanoidWalk, AntMaze):
-        task.max_steps = STEPS
-    plan.make_renderer = lambda name, task, size, **settings: Painter(task, size)
+    painting.make_renderer = lambda name, task, size, **settings: Painter(name, task, size)
