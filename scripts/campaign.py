@@ -71,7 +71,9 @@ class Wrong(Exception):
 def tree(folder: Path) -> dict[str, bytes]:
     """Every file below a folder, card and marks apart."""
     names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]
-    return {n: (folder / n).read_bytes() for n in names if not n.startswith(CARD) and not n.endswith(".created")}
+    return {
+        n: (folder / n).read_bytes() for n in names if not n.startswith(CARD) and not n.endswith((".created", ".lock"))
+    }
 
 
 def unlike(found: dict[str, bytes], wanted: dict[str, bytes]) -> list[str]:

@@ -116,19 +116,11 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
         with storage_errors(path, "write to"):
             _grow(path, subset, attributes)
         return
-    version = attributes.get("schema_version", SCHEMA_VERSION)
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
-    try:
-        if any((root / "commits" / subset.name).glob("*.json")):
-            _write_metadata(path, specs, attributes, shape, keep=True)
-            mark_created(root, subset)
-            return
-        group = zarr.create_group(str(path), attributes=attributes, overwrite=True)
-        create_arrays(group, specs, *shape, schema_version=version)
-        zarr.consolidate_metadata(str(path))
+    with storage_errors(path, "write to"):
+        # File by file, each whole: of two who begin at the same time, none may clear away what the other has written.
+        _write_metadata(path, specs, attributes, shape, keep=any((root / "commits" / subset.name).glob("*.json")))
         mark_created(root, subset)  # an interrupted creation is done again from the start
-    except OSError as error:
-        raise StoreError(f"cannot write to {path}: {error.strerror or error}") from None
 
 
 def _grow(path: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> None:

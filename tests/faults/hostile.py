@@ -72,7 +72,7 @@ def changed_tree(draw, tree: Any) -> Any:
     for _ in range(draw(st.integers(1, 3))):
         path = draw(st.sampled_from(places(tree)[1:] or [()]))
         if not path:
-            return draw(st.sampled_from(HOSTILE))
+            return copy.deepcopy(draw(st.sampled_from(HOSTILE)))
         parent = functools.reduce(lambda inner, key: inner[key], path[:-1], tree)
         action = draw(st.sampled_from(["replace", "replace", "replace", "near", "delete", "add", "swap"]))
         old = parent[path[-1]]
@@ -80,7 +80,7 @@ def changed_tree(draw, tree: Any) -> Any:
             del parent[path[-1]]
         elif action == "add":
             if isinstance(old, dict):
-                old[draw(st.sampled_from(["x", "__proto__", "extends", "format"]))] = draw(st.sampled_from(HOSTILE))
+                old[draw(st.sampled_from(["x", "__proto__", "extends", "format"]))] = copy.deepcopy(draw(st.sampled_from(HOSTILE)))
             else:
                 parent[path[-1]] = [old] * draw(st.sampled_from([0, 1, 2, 1000]))
         elif action == "near" and isinstance(old, (int, float)) and not isinstance(old, bool):
@@ -89,7 +89,7 @@ def changed_tree(draw, tree: Any) -> Any:
             other = draw(st.sampled_from(places(tree)))
             parent[path[-1]] = copy.deepcopy(functools.reduce(lambda inner, key: inner[key], other, tree))
         else:
-            parent[path[-1]] = draw(st.sampled_from(HOSTILE))
+            parent[path[-1]] = copy.deepcopy(draw(st.sampled_from(HOSTILE)))
     return tree
 
 
