@@ -256,6 +256,8 @@ class History:
         """What is committed in a folder has the reference's bytes, and nothing that was committed is gone."""
         folder, reference = self.folder / name, self.reference / REFERENCE.get(name, name)
         now = set()
+        if not (folder / "manifest.json").exists():
+            return  # what is being published or fetched is no release before its manifest is there
         for path in sorted(folder.glob("commits/**/*.json")):
             record = path.relative_to(folder).as_posix()
             if record in self.damaged:

@@ -27,6 +27,7 @@ from dmcvb_gen.rollout.site import FolderSite
 from dmcvb_gen.store.index import restore_index, restored_commit
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import load_manifest
+from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import (
@@ -363,8 +364,9 @@ class _Workshop:
             except OSError as error:
                 raise StoreError(f"cannot write to {self._root}: {error.strerror or error}; give --out") from None
             create_groups(folder, self._manifest, self._records)
-            for record in self._records:
-                _take_metadata(self._root, folder, record)
+            with storage_errors(self._root, "write to"):
+                for record in self._records:
+                    _take_metadata(self._root, folder, record)
             self._stack = stack.pop_all()
         return folder
 
