@@ -80,7 +80,9 @@ def changed_tree(draw, tree: Any) -> Any:
             del parent[path[-1]]
         elif action == "add":
             if isinstance(old, dict):
-                old[draw(st.sampled_from(["x", "__proto__", "extends", "format"]))] = copy.deepcopy(draw(st.sampled_from(HOSTILE)))
+                old[draw(st.sampled_from(["x", "__proto__", "extends", "format"]))] = copy.deepcopy(
+                    draw(st.sampled_from(HOSTILE))
+                )
             else:
                 parent[path[-1]] = [old] * draw(st.sampled_from([0, 1, 2, 1000]))
         elif action == "near" and isinstance(old, (int, float)) and not isinstance(old, bool):
