@@ -170,6 +170,11 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
             save_paths_picture(task.layout, panels, pictures / f"{task_id}.png")
     if as_json:
         return print_json(rows)
+    _show_returns(rows, episodes, seed)
+
+
+def _show_returns(rows, episodes, seed):
+    """Print returns, the paper's under each."""
     mazes = any("success" in row for row in rows)
     table = Table(title=f"{episodes} episodes each, seed {seed}, {rows[0]['mode']} actions")
     columns = ("mean", "std", "min", "p25", "median", "p75", "max")

@@ -18,10 +18,10 @@ from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.names import ANT_MAZE, distractor_of
 from dmcvb_gen.release.croissant import croissant
 from dmcvb_gen.rollout.info import describe_release
 from dmcvb_gen.rollout.preview import contact_sheet
-from dmcvb_gen.rollout.recipe import distractor_of, is_maze
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.store.manifest import Manifest
@@ -252,7 +252,7 @@ STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 def _distractors(manifest: Manifest) -> list[str]:
     settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
-        if not is_maze(record.task):
+        if record.family != ANT_MAZE:
             settings.setdefault(record.setting, distractor_of(record.task, record.setting))
     rows = []
     for name, setting in settings.items():
@@ -271,7 +271,7 @@ def _distractors(manifest: Manifest) -> list[str]:
         sky = f"{videos}; " + (f"a frame every {background.TICKS_A_FRAME} ticks" if moving else "one frame an episode")
         rows.append((name, f"s = {s:g}", place, paint, sky))
     lines = _table(("setting", "scale", "camera", "colors", "background"), rows) if rows else []
-    if any(is_maze(record.task) for record in manifest.subsets):
+    if any(record.family == ANT_MAZE for record in manifest.subsets):
         lines += ["", "Mazes vary in the style of walls and floor, drawn for each episode (label `exogenous/style`)."]
     return lines + ["", "A tick is a control step, two in a step. Distractors never touch physics or rewards."]
 

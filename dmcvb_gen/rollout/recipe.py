@@ -30,18 +30,13 @@ from dmcvb_gen.names import (
     FAMILIES,
     FIXED,
     GOAL_MODES,
-    LEVELS,
     LOCOMOTION,
     VISIBLE,
     DistractorSetting,
     check_level,
-    distractor_of,
     family_of,
-    matches,
     normalize_setting,
-    select,
     subset_name,
-    task_folder,
 )
 from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
 from dmcvb_gen.tasks import get_task
@@ -51,15 +46,6 @@ DEFAULT_EPISODES_PER_SHARD = {LOCOMOTION: 50, ANT_MAZE: 10}
 """Episodes a shard: what a worker holds in memory and what a crash can cost."""
 MAX_STEPS = 5000
 """Longest episode that a recipe may ask for; a shard is held in memory."""
-
-
-# Their place is dmcvb_gen.names; those who still ask here find them.
-MAZE_SETTINGS = GOAL_MODES
-__all__ = ["LEVELS", "distractor_of", "is_maze", "matches", "normalize_setting", "select", "task_folder"]
-
-
-def is_maze(task: str) -> bool:
-    return family_of(task) == ANT_MAZE
 
 
 class _Model(pydantic.BaseModel):

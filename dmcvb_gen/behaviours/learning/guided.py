@@ -25,6 +25,7 @@ from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD
 
 GUIDE = "ant-maze-empty7x7"
@@ -77,7 +78,7 @@ class GuidedRun(Run):
     @functools.cached_property
     def guide(self) -> Policy:
         """The policy that is shown the way."""
-        if not self.task.id.startswith("ant-maze"):
+        if self.task.family != ANT_MAZE:
             raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
         source = self.config.init_from
         path = resolve_policies(self.task.id if source else GUIDE, "expert", source)[0]

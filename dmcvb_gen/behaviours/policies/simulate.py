@@ -132,16 +132,13 @@ def simulate(
     )
     behaviour = (episodes % len(policies)).astype(np.int16)
     pair = np.full(size, -1, np.int16) if goal_pairs is None else (episodes // episodes_per_goal).astype(np.int16)
-    started = time.perf_counter()
-    batch = task.batch(size, threads)
-    fixed = None if goal_pairs is None else [goal_pairs[k] for k in pair]
-    state = batch.reset(starts) if fixed is None else batch.reset_fixed(starts, fixed)
-    begun = time.perf_counter() - started
-
     out = _empty(task, episodes, limit)
     out.behaviour[:], out.goal_pair[:] = behaviour, pair
     out.seed[:] = [episode_seed(seed, names, int(i)) for i in episodes]
-    out.seconds["physics"] += begun
+    started = time.perf_counter()
+    batch = task.batch(size, threads)
+    state = batch.reset(starts) if goal_pairs is None else batch.reset_fixed(starts, [goal_pairs[k] for k in pair])
+    out.seconds["physics"] += time.perf_counter() - started
     active = np.ones(size, bool)
     for step in range(limit + 1):
         out.state[active, step] = state[active]
