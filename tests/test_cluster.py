@@ -239,7 +239,16 @@ def s3_server(monkeypatch):
 
 def test_an_address_where_no_cluster_answers_is_one_line(tmp_path):
     pytest.importorskip("ray")
-    arguments = [*BUCKET, str(tmp_path / "r"), "--executor", "ray", "--ray-address", "127.0.0.1:9"]
+    arguments = [
+        *BUCKET,
+        str(tmp_path / "r"),
+        "--renderer",
+        "warp",
+        "--executor",
+        "ray",
+        "--ray-address",
+        "127.0.0.1:9",
+    ]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2 and re.search("error: no Ray cluster answers at 127.0.0.1:9", result.stderr)
 
@@ -260,6 +269,10 @@ def test_a_ray_cluster_that_loses_a_node_and_gains_one_makes_the_same_release(wh
         assert len(list(results)) == len(plan.jobs) - 1
     finally:
         cluster.shutdown()
-    assert digests(finish(plan)) == digests(open_release(whole).manifest)
+    manifest, deadline = finish(plan), time.time() + 60
+    while list((tmp_path / "r").glob(".*.partial")) and time.time() < deadline:
+        time.sleep(1)  # workers of the lost node may take a moment to die; what they left goes with the next finish
+        manifest = finish(plan)
+    assert digests(manifest) == digests(open_release(whole).manifest)
     assert contents(tmp_path / "r") == contents(whole)
     assert {subset.family for subset in plan.manifest.subsets} >= {ANT_MAZE}
