@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 
 import pytest
 from click.testing import CliRunner
@@ -165,3 +167,16 @@ def test_a_missing_gl_library_names_the_cure(monkeypatch, tmp_path):
     result = run(*SMALL, "--renderer", "opengl", "--out", tmp_path / "x")
     opengl.unavailable.cache_clear()
     assert result.exit_code == 2 and "libegl1" in result.output and "--renderer warp" in result.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_that_foreign_code_turns_into_its_own_error_is_no_traceback(tmp_path, monkeypatch, number):
+    def foreign(*_):
+        try:
+            os.kill(os.getpid(), number)
+        except KeyboardInterrupt:
+            raise ValueError("argument 1: KeyboardInterrupt") from None  # as ctypes does
+
+    monkeypatch.setattr("dmcvb_gen.rollout.info.describe_release", foreign)
+    result = run("info", tmp_path)
+    assert result.exit_code == 1 and "Aborted" in result.output and isinstance(result.exception, SystemExit)

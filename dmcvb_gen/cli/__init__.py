@@ -56,13 +56,15 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
     def invoke(self, ctx):
+        _asked_to_stop.clear()
         try:
             return super().invoke(ctx)
-        except DmcvbError as error:
-            click.echo(f"error: {error}", err=True)
-            ctx.exit(2)
-        except ModuleNotFoundError as error:
-            what = cure(error.name or "")
+        except Exception as error:
+            if _asked_to_stop.is_set():  # Ctrl-C within foreign code comes out as that code's own kind of error
+                raise click.Abort() from None
+            what = str(error) if isinstance(error, DmcvbError) else None
+            if isinstance(error, ModuleNotFoundError):
+                what = cure(error.name or "")
             if what is None:
                 raise
             click.echo(f"error: {what}", err=True)
@@ -78,18 +80,22 @@ def main():
     dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8 --out releases/demo
     dmcvb-gen preview releases/demo
     """
-    _stop_on_sigterm(click.get_current_context())
+    _stop_on_signals(click.get_current_context())
 
 
-def _stop_on_sigterm(context: click.Context) -> None:
+_asked_to_stop = threading.Event()
+
+
+def _stop_on_signals(context: click.Context) -> None:
     """SIGTERM ends a command as Ctrl-C does: its workers stop with it, what is finished stays."""
 
     def stop(*_):
+        _asked_to_stop.set()
         raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():
-        before = signal.signal(signal.SIGTERM, stop)
-        context.call_on_close(lambda: signal.signal(signal.SIGTERM, before))
+        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+        context.call_on_close(lambda: [signal.signal(number, handler) for number, handler in before.items()])
 
 
 if __name__ == "__main__":
