@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +50,8 @@ def bucket(monkeypatch):
         monkeypatch.setenv(name, value)
     import boto3
 
+    # The server's objects outlive it in this process; each page finds an empty bucket.
+    urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
     boto3.client("s3").create_bucket(Bucket="bucket")
     yield address
     server.stop()

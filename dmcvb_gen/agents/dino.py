@@ -6,7 +6,6 @@ whose names are those of the DINO release (Caron et al. 2021) and of timm.
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 
 import torch
@@ -83,7 +82,7 @@ class DinoEncoder(nn.Module):
 
 
 def dino_digest(path: str | Path | None) -> str:
-    """SHA-256 of the file of weights; read anew only where the file has changed.
+    """SHA-256 of the file of weights.
 
     Raises:
       DmcvbError: no file is given, or it cannot be read.
@@ -91,15 +90,9 @@ def dino_digest(path: str | Path | None) -> str:
     if path is None:
         raise DmcvbError(MISSING)
     try:
-        facts = Path(path).stat()
-        return _digest(str(path), facts.st_mtime_ns, facts.st_size)
+        return sha256_file(path)
     except OSError as error:
         raise DmcvbError(f"cannot read DINO weights {path} ({error}); give a safetensors file") from None
-
-
-@functools.lru_cache(maxsize=4)
-def _digest(path: str, modified: int, size: int) -> str:
-    return sha256_file(path)
 
 
 def load_dino(path: str | Path | None, channels: int, size: int = 64) -> DinoEncoder:
