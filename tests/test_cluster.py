@@ -228,7 +228,7 @@ def s3_server(monkeypatch):
     for name, value in CREDENTIALS.items():
         monkeypatch.setenv(name, value)
     direct = s3fs.S3FileSystem(endpoint_url=f"http://{host}:{port}", skip_instance_cache=True)
-    direct.mkdir("bucket")
+    direct.makedirs("bucket", exist_ok=True)
     yield proxy, direct, os.environ | {"OMP_NUM_THREADS": "1"}
     proxy.server.shutdown()
     moto.stop()

@@ -54,6 +54,7 @@ def bucket(monkeypatch):
     urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
     boto3.client("s3").create_bucket(Bucket="bucket")
     yield address
+    urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
     server.stop()
 
 

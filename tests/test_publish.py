@@ -73,7 +73,7 @@ def bucket(server, small_release):
             patch.setenv(name, value)
         options = {"endpoint_url": "http://{}:{}".format(*server)}
         direct = s3fs.S3FileSystem(**options)
-        direct.mkdir("bucket")
+        direct.makedirs("bucket", exist_ok=True)  # all servers of one process share what is in them
         publish(small_release, "s3://bucket/small", options=options)
         yield direct
 

@@ -605,7 +605,10 @@ class _Guard:
             if isinstance(path, (str, bytes, os.PathLike)):
                 self._inside(os.fsdecode(path), event)
         elif event in ("os.mkdir", "os.remove", "os.rename", "os.link", "os.symlink", "os.rmdir", "shutil.rmtree"):
-            self._inside(os.fsdecode(arguments[0]), event)
+            path = os.fsdecode(arguments[0])
+            if event in ("os.remove", "os.rmdir", "os.mkdir") and arguments[-1] != -1:  # relative to an open folder
+                path = os.path.join(os.readlink(f"/proc/self/fd/{arguments[-1]}"), path)
+            self._inside(path, event)
         elif event in (
             "os.system",
             "os.exec",
