@@ -1,4 +1,4 @@
-"""Students of a guide through mazes: what they learn, and what they may see."""
+"""Policies that learn the way through a maze: what they learn, and what they may see."""
 
 from __future__ import annotations
 
@@ -7,100 +7,134 @@ import pytest
 import torch
 
 from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.guided import GuidedRun, Imitation, deepened, divergence
-from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
+from dmcvb_gen.behaviours.learning.guided import Student, draw_places
+from dmcvb_gen.behaviours.learning.networks import Way, as_arrays
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.training import open_run
+from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
+from dmcvb_gen.behaviours.policies.way import headed, places
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
+from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
+from dmcvb_gen.tasks.base import PHYSICS_SPEC
 
 
 def config(task="ant-maze-easy7x7a", steps=640, **changes):
-    settings = dict(simulations=8, batch_size=32, updates_per_step=0.25) | changes.pop("settings", {})
+    settings = dict(simulations=8, batch_size=64, updates_per_step=0.5) | changes.pop("settings", {})
     fields = dict(algorithm="guided", seed=0, evaluate_every=steps, evaluate_sparse=steps)
     return RunConfig(task=task, steps=steps, settings=settings, **fields | changes)
 
 
-def test_divergence_is_torchs():
-    rng = torch.Generator().manual_seed(0)
-    mean, own_mean = (torch.randn(20, 3, generator=rng) for _ in range(2))
-    std, own_std = (torch.rand(20, 3, generator=rng) + 0.1 for _ in range(2))
-    normal = torch.distributions.Normal
-    wanted = torch.distributions.kl_divergence(normal(mean, std), normal(own_mean, own_std)).sum(dim=1).mean()
-    torch.testing.assert_close(divergence(mean, std, own_mean, own_std), wanted)
+def walked(task, steps=30, size=6):
+    """A batch whose ants have tumbled about for a while."""
+    batch, rng = task.batch(size), np.random.default_rng(3)
+    batch.reset([np.random.default_rng(i) for i in range(size)])
+    for _ in range(steps):
+        batch.step(rng.uniform(-1, 1, (size, task.action_size)).astype(np.float32))
+    return batch
 
 
-def test_saturated_actions_need_not_be_met_to_the_digit():
-    std = torch.full((1, 1), 0.5)
-    same = divergence(torch.tensor([[3.5]]), std, torch.tensor([[9.0]]), std)
-    assert float(same) == 0
-    assert float(divergence(torch.tensor([[3.5]]), std, torch.tensor([[2.0]]), std)) > 1
+def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
+    import mujoco
 
+    batch = walked(get_task("ant-maze-medium7x7a"))
+    batch.set_physics(batch.physics())  # what is seen is of this very state, touch sensors too
+    vector = np.random.default_rng(0).uniform(-3, 3, (6, 2))
+    seen = headed(batch.behaviour_observation(), vector)
+    assert seen.dtype == np.float32
 
-def test_a_deeper_student_begins_as_its_guide(tmp_path):
-    torch.manual_seed(0)
-    run = open_run(tmp_path / "run", config(settings={"layers": 4}), False)
-    weights = as_tensors(run.guide.weights)
-    student, guide = Actor(run.header), Actor(run.guide.header)
-    assert run.header.hidden == (256, 256, 256, 256) and run.guide.header.hidden == (256, 256)
-    student.load_state_dict(deepened(weights, student.state_dict()))
-    guide.load_state_dict(weights)
-    begun = {fresh: begin(tmp_path / f"fresh_{fresh}", fresh) for fresh in (False, True)}
-    for name, value in as_tensors(weights).items():
-        assert torch.equal(begun[False][name], value)
-        assert torch.equal(begun[True][name], value) == name.startswith("observation")
-    observation = weights["observation_mean"] + torch.randn(64, run.header.observation_size)
-    for own, other in zip(student(observation), guide(observation), strict=True):
-        torch.testing.assert_close(own, other)
-
-
-def begin(folder, fresh):
-    """The weights that a student begins with."""
-    (folder / "resume").mkdir(parents=True)
-    return Imitation(GuidedRun(folder, config(settings={"fresh": fresh}))).student.state_dict()
-
-
-def test_a_student_sees_the_goal_and_its_guide_the_way():
-    task = get_task("ant-maze-medium7x7a")
-    batch = task.batch(4)
-    batch.reset([np.random.default_rng(i) for i in range(4)])
+    # The same ants in another maze, their torsos moved to its middle, their goals to where they are told to go.
+    open_task = get_task("ant-maze-empty7x7")
+    other, physics = open_task.batch(6), batch.physics().copy()
+    other.reset([np.random.default_rng(i) for i in range(6)])
+    physics[:, 1:3] -= places(batch.behaviour_observation())[:, :2]
+    goal = mujoco.mj_stateSize(open_task.model, PHYSICS_SPEC & (int(mujoco.mjtState.mjSTATE_MOCAP_POS) - 1))
+    physics[:, goal : goal + 2] = vector
+    other.set_physics(physics)
     ends = np.cumsum([FIELDS[name] for name in BEHAVIOUR_FIELDS])[:-1]
-    own, shown = (
-        dict(zip(BEHAVIOUR_FIELDS, np.split(seen, ends, axis=1), strict=True))
-        for seen in (batch.behaviour_observation(), batch.guided_observation(2.0))
-    )
-    told = ("target_position", "target_vector", "egocentric_target_vector", "walker_position")
-    for name in set(BEHAVIOUR_FIELDS) - set(told):
-        np.testing.assert_array_equal(own[name], shown[name])
-    apart = shown["target_position"] - shown["walker_position"]
-    np.testing.assert_allclose(apart, shown["target_vector"], atol=1e-6)
-    for seen in (own, shown):
-        lengths = (np.linalg.norm(seen[name], axis=1) for name in ("target_vector", "egocentric_target_vector"))
-        np.testing.assert_allclose(*lengths, rtol=1e-5)
-    assert (shown["walker_position"][:, :2] == 0).all()
+    for name, ours, theirs in zip(
+        BEHAVIOUR_FIELDS,
+        np.split(seen, ends, axis=1),
+        np.split(other.behaviour_observation(), ends, axis=1),
+        strict=True,
+    ):
+        if name != "sensors_touch":  # there are no walls to touch
+            np.testing.assert_allclose(ours, theirs, atol=2e-5, err_msg=name)
 
 
-def test_a_student_comes_nearer_to_its_guide(tmp_path, monkeypatch):
+def test_the_actor_and_the_network_that_learns_agree(tmp_path):
+    run = open_run(tmp_path / "run", config(), False)
+    (tmp_path / "run" / "resume").mkdir(parents=True, exist_ok=True)
+    student = Student(run)
+    policy = Policy(run.header, as_arrays(student.weights()), "")
+    seen = walked(run.task).behaviour_observation()
+    with torch.no_grad():
+        learned = student.way(torch.from_numpy(places(seen))).numpy()
+    np.testing.assert_allclose(policy.heading(seen), learned, atol=1e-5)
+    plain = Policy(run.walker.header, run.walker.weights, "")
+    wanted = plain.act(headed(seen, policy.heading(seen)), deterministic=True)
+    np.testing.assert_array_equal(policy.act(seen, deterministic=True), wanted)
+
+
+def test_one_that_knows_the_goal_s_direction_walks_as_in_the_open_maze(tmp_path):
+    """Far from the middle of an empty maze, a heading straight at the goal changes what is seen of places alone."""
+    batch = walked(get_task("ant-maze-empty7x7"))
+    seen = batch.behaviour_observation()
+    ant, goal = places(seen)[:, :2], places(seen)[:, 2:]
+    changed = np.flatnonzero((np.abs(headed(seen, goal - ant) - seen) > 1e-4).any(axis=0))
+    assert len(changed) == 4  # x and y of ant and of goal
+
+
+def test_places_are_drawn_on_the_floor():
+    layout = get_task("ant-maze-medium7x7b").layout
+    drawn = draw_places(layout, np.random.default_rng(0), 500)
+    free = np.array([layout.world(cell) for cell in layout.free])
+    for part, most in ((drawn[:, :2], 1.25), (drawn[:, 2:], 0.5)):
+        nearest = np.abs(part[:, None] - free).max(axis=2).min(axis=1)
+        assert nearest.max() <= most + 1e-6 and nearest.max() > 0.9 * most
+    assert np.isfinite(headings(layout, drawn[:, :2], drawn[:, 2:], AHEAD)).all()
+
+
+def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
     run = open_run(tmp_path / "run", config(), False)
-    losses, update = [], Imitation.update
-    monkeypatch.setattr(Imitation, "update", lambda *args: losses.append(update(*args)) or losses[-1])
     run.train()
-    assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:20])
-    header = read_header(next((tmp_path / "run" / "checkpoints").iterdir()))
-    assert header.algorithm == "guided" and header.training["guide"] == run.guide.digest
-    assert "--algo guided" in header.command
-    assert load_policy(next((tmp_path / "run" / "checkpoints").iterdir()), run.task).digest != run.guide.digest
+    path = next((tmp_path / "run" / "checkpoints").iterdir())
+    header, policy = read_header(path), load_policy(path, run.task)
+    assert header.algorithm == "guided" and header.training["walker"] == run.walker.digest
+    assert "--algo guided" in header.command and header.way == (256, 256, 256)
+    for name, value in run.walker.weights.items():
+        np.testing.assert_array_equal(policy.weights[name], value)
+
+    place = draw_places(run.task.layout, np.random.default_rng(9), 500)
+    told = torch.from_numpy(headings(run.task.layout, place[:, :2], place[:, 2:], AHEAD))
+    errors = []
+    for weights in (Way(header.way).state_dict(), {n[4:]: torch.tensor(v) for n, v in policy.weights.items()}):
+        way = Way(header.way)
+        way.load_state_dict({name: value for name, value in weights.items() if name in way.state_dict()})
+        with torch.no_grad():
+            errors.append(float(((way(torch.from_numpy(place)) - told) ** 2).sum(1).mean()))
+    assert errors[1] < 0.5 * errors[0]
 
 
-def test_a_run_does_not_go_on_with_another_guide(tmp_path, monkeypatch):
+def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 1)
+    rare = dict(evaluate_every=10_000, evaluate_sparse=10_000)
+    open_run(tmp_path / "run", config(steps=128, **rare), False).train()
+    open_run(tmp_path / "run", config(steps=256, **rare), True).train()
+    open_run(tmp_path / "whole", config(steps=256, **rare), False).train()
+    ends = [load_policy(tmp_path / name / "checkpoints/0000000256.safetensors").weights for name in ("run", "whole")]
+    assert all(np.array_equal(ends[0][name], value) for name, value in ends[1].items())
+
+
+def test_a_run_does_not_go_on_with_another_walker(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
     open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000, evaluate_sparse=10_000), False).train()
     longer = open_run(tmp_path / "run", config(steps=128, evaluate_every=10_000, evaluate_sparse=10_000), True)
-    longer.guide.digest = "another"
-    with pytest.raises(DmcvbError, match="another guide"):
+    longer.walker.digest = "another"
+    with pytest.raises(DmcvbError, match="another policy"):
         longer.train()
 
 

@@ -1,9 +1,10 @@
-"""Imitating a guide through a maze: a policy of the open maze in, an actor that knows one layout out.
+"""Learning the way through a maze: a policy of the open maze in, one that knows a layout out.
 
-A policy that walks straight to goals gets through every maze when it is shown a point on the way instead
-of the goal. This guide knows the layout, which behaviour policies must not see; so a student, which sees what
-behaviour policies see, learns to act as it does (DAgger, Ross et al. 2011: the student walks, the guide
-says what it would have done there). Minutes, where reinforcement learning in a maze takes hours.
+A policy that walks straight to goals gets through every maze when it is shown a point on the way instead of the
+goal. A guide that has the layout before it can show such points, but behaviour policies must not see the layout; so
+a small network before the policy learns to say where the guide would point, from where ant and goal are. It is asked
+where the student itself walks (DAgger, Ross et al. 2011), and anywhere else in the maze too. Minutes, where
+reinforcement learning in a maze takes hours; and a student half-way runs as fast as an expert, but gets lost.
 """
 
 from __future__ import annotations
@@ -17,19 +18,23 @@ import numpy as np
 import torch
 
 from dmcvb_gen.behaviours.learning.episodes import Episodes
-from dmcvb_gen.behaviours.learning.networks import Actor, as_tensors
+from dmcvb_gen.behaviours.learning.networks import Way, as_arrays, as_tensors
 from dmcvb_gen.behaviours.learning.runs import SAVE_SECONDS, Report, Run, Tick
 from dmcvb_gen.behaviours.learning.sac import RowBuffer
 from dmcvb_gen.behaviours.learning.settings import Count, Natural, NonNegative, Positive, Share
 from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
+from dmcvb_gen.behaviours.policies.header import WAY_SIZE
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
+from dmcvb_gen.behaviours.policies.way import places
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import ANT_MAZE
-from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD
+from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
+from dmcvb_gen.tasks.ant_maze.task import GOAL_NOISE
+from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 
 GUIDE = "ant-maze-empty7x7"
-"""The task whose bundled expert is the guide where --init-from names none."""
+"""The task whose bundled expert walks where --init-from names none."""
 
 
 @dataclass(frozen=True)
@@ -40,74 +45,59 @@ class GuidedSettings:
       simulations: episodes stepped side by side.
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       buffer_size: agent steps remembered.
-      ahead: how far down the way the guide is shown where to go, meters.
-      mean_share: share of the simulations in which the student acts by its mean, as data are made: it learns what the
-        guide would do where its own mean stands still.
-      sunken_starts: share of training episodes that start deep in the floor, see sac's.
-      guided_share: share of training episodes that the guide walks itself.
-      least_std: the guide's standard deviations count as at least this, so that no action weighs without bound.
-      train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
-      fresh: begin with random weights instead of the guide's: in an open maze, where the guide's own weights are an
-        expert from the first step on, a student that learns to run passes through what medium is picked from.
+      ramp: agent steps in which the learning rate rises to `learning_rate`: so that there are checkpoints on the way to
+        an expert, which medium is picked from.
       half_life: agent steps in which the learning rate halves.
-      layers: hidden layers of the student; those that the guide lacks begin as identities. More fit a fixed set of
-        steps better (medium7x7a, an earlier guide, after 7,500 updates: 1.9, 1.5 and 1.4 nats on unseen steps with 2,
-        3 and 4 layers of 256), but an update of 4 takes twice the time of 2, and no student with 4 was seen to walk
-        better.
+      ahead: how far down the way the guide points, meters.
+      mean_share: share of the simulations in which the student acts by its mean, as data are made.
+      drawn_share: share of a batch that lies at places drawn anew all over the maze; the rest is where students were.
+      sunken_starts: share of training episodes that start deep in the floor, see sac's.
+      train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
+      layers, width: hidden layers of the network that learns the way, and units of one.
     """
 
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    half_life: Positive = 25_000
-    layers: Count = 2
-    fresh: bool = False
-    updates_per_step: Positive = 0.25
+    ramp: Natural = 10_000
+    half_life: Positive = 20_000
+    layers: Count = 3
+    width: Count = 256
+    updates_per_step: Positive = 0.06
     buffer_size: Count = 400_000
     ahead: NonNegative = AHEAD
-    guided_share: Share = 0.2
     mean_share: Share = 0.5
+    drawn_share: Share = 0.5
     sunken_starts: Share = 0.3
-    least_std: Positive = 0.3
     train_episode_steps: Natural = 300
 
 
 class GuidedRun(Run):
-    """A run of guided imitation. The student starts from the guide's weights, or from none of them."""
+    """A run that learns the way. The student walks as the policy that it starts from, which stays as it is."""
 
     @functools.cached_property
-    def guide(self) -> Policy:
-        """The policy that is shown the way."""
+    def walker(self) -> Policy:
+        """The policy that knows how to walk, not where."""
         if self.task.family != ANT_MAZE:
             raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
         source = self.config.init_from
         path = resolve_policies(self.task.id if source else GUIDE, "expert", source)[0]
-        policy = load_policy(path, self.task)
-        header = policy.header
-        if (header.distribution, header.activation, header.layer_norm) != ("squashed_gaussian", "relu", False):
-            raise DmcvbError(
-                f"the guide {path} must be a squashed Gaussian on plain ReLU layers, as policies of sac are"
-            )
-        return policy
+        return load_policy(path, self.task)
 
     def network(self) -> dict[str, Any]:
-        header = self.guide.header
-        more = max(0, self.settings.layers - len(header.hidden))
-        return {
-            "hidden": (*header.hidden, *[header.hidden[-1]] * more),
-            "activation": header.activation,
-            "clip_observation": header.clip_observation,
-        }
+        header, settings = self.walker.header, self.settings
+        kept = ("hidden", "activation", "layer_norm", "distribution", "noise", "clip_observation")
+        return {name: getattr(header, name) for name in kept} | {"way": (settings.width,) * settings.layers}
 
     def describe(self) -> dict[str, Any]:
-        return {"guide": self.guide.digest}
+        return {"walker": self.walker.digest}
 
     def warmup(self) -> int:
         return 0
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
         settings, config = self.settings, self.config
-        learner, next_evaluation = Imitation(self), config.evaluate_every
+        learner, next_evaluation = Student(self), config.evaluate_every
         if saved:
             learner.load_state(saved["learner"])
             next_evaluation = saved["next_evaluation"]
@@ -116,7 +106,6 @@ class GuidedRun(Run):
             observation = episodes.restore(saved["episodes"])
         else:
             observation = episodes.start(np.arange(settings.simulations))
-            learner.choose_walkers(np.arange(settings.simulations))
         last_saved = self._started
 
         def save() -> None:
@@ -124,16 +113,14 @@ class GuidedRun(Run):
             self.save(parts | {"next_evaluation": next_evaluation})
 
         while self.step < config.steps:
-            action = learner.act(observation, episodes.batch.guided_observation(settings.ahead))
-            result = episodes.batch.step(action)
+            result = episodes.batch.step(learner.act(observation))
             self.step += settings.simulations
             observation = episodes.restart_ended(episodes.batch.behaviour_observation(), result.terminated)
-            learner.choose_walkers(np.flatnonzero(episodes.elapsed == 0))
             learner.learn(self.step)
             tick(settings.simulations)
             if self.step >= min(next_evaluation, config.steps):
-                metrics = {"divergence": learner.loss}
-                progress = self.record(learner.student.state_dict(), learner.updates, metrics, report)
+                metrics = {"squared_error": learner.loss}
+                progress = self.record(learner.weights(), learner.updates, metrics, report)
                 next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
                 if self._started - last_saved > SAVE_SECONDS:
                     save()
@@ -141,70 +128,66 @@ class GuidedRun(Run):
         save()
 
 
-class Imitation:
-    """A student beside its guide: it acts, notes what the guide would have done, and learns that.
+class Student:
+    """A student beside its guide: it walks, notes where it was and where the guide would have pointed, and learns that.
 
     Attributes:
       updates: gradient updates so far.
-      loss: the last one's divergence, nats an action.
+      loss: the last one's mean squared error, square meters.
     """
 
     def __init__(self, run: GuidedRun):
         self.run, self.settings = run, run.settings
         task, config, settings = run.task, run.config, run.settings
         torch.manual_seed(config.seed)
-        self.student = Actor(run.header)
-        begin = deepened(as_tensors(run.guide.weights), self.student.state_dict())
-        if settings.fresh:
-            begin = self.student.state_dict() | {name: begin[name] for name in ("observation_mean", "observation_std")}
-        self.student.load_state_dict(begin)
-        self.guide = Actor(run.guide.header).requires_grad_(False)
-        self.guide.load_state_dict(as_tensors(run.guide.weights))
-        self.optimizer = torch.optim.Adam(self.student.parameters(), lr=settings.learning_rate, fused=True)
-        shapes = {"observation": (task.behaviour_size,), "mean": (task.action_size,), "std": (task.action_size,)}
+        self.way = Way((settings.width,) * settings.layers)
+        self.optimizer = torch.optim.Adam(self.way.parameters(), lr=settings.learning_rate, fused=True)
         rows = max(min(settings.buffer_size, config.steps), settings.simulations)
-        self.buffer = RowBuffer(rows, shapes, run.folder / "resume")
+        self.buffer = RowBuffer(rows, {"place": (WAY_SIZE,), "heading": (2,)}, run.folder / "resume")
         self.rng = np.random.default_rng([config.seed, 0xB0FF])
-        self.guided = np.zeros(settings.simulations, bool)
+        self.noise = self.rng.spawn(settings.simulations)
+        self.layout = task.layout
         self.owed, self.updates, self.loss = 0.0, 0, 0.0
 
-    def choose_walkers(self, ids: np.ndarray) -> None:
-        """Draw who walks in the new episodes of the simulations `ids`, the guide or the student."""
-        self.guided[ids] = self.rng.random(len(ids)) < self.settings.guided_share
+    def weights(self) -> dict[str, torch.Tensor]:
+        """Of the whole policy: it walks as ever, and knows the way as far as it has been learned."""
+        known = {name: value for name, value in self.run.walker.weights.items() if not name.startswith("way.")}
+        return as_tensors(known) | self.way.weights()
 
-    def act(self, observation: np.ndarray, shown: np.ndarray) -> np.ndarray:
-        """Actions of whoever walks, (n, action) float32; what the guide would have done is noted.
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Actions, (n, action) float32, by mean and drawn; where the guide would point is noted."""
+        place = places(observation)
+        self.buffer.add(place=place, heading=self._shown(place))
+        policy = Policy(self.run.header, as_arrays(self.weights()), "")
+        action = policy.act(observation, deterministic=True)
+        by_mean = round(self.settings.mean_share * len(observation))
+        if by_mean < len(observation):
+            action[by_mean:] = policy.act(observation[by_mean:], self.noise[by_mean:])
+        return action
 
-        Args:
-          observation: (n, observation), what the student sees.
-          shown: (n, observation), what the guide is shown.
-        """
-        with torch.no_grad():
-            own_mean, own_std = self.student(torch.from_numpy(observation))
-            mean, std = self.guide(torch.from_numpy(shown))
-            walks = torch.from_numpy(self.guided)[:, None]
-            noise = torch.randn_like(mean)
-            noise[: round(self.settings.mean_share * len(noise))] = 0
-            action = torch.tanh(torch.where(walks, mean, own_mean) + torch.where(walks, std, own_std) * noise)
-        self.buffer.add(observation=observation, mean=mean.numpy(), std=std.numpy())
-        return action.numpy()
+    def _shown(self, place: np.ndarray) -> np.ndarray:
+        return headings(self.layout, place[:, :2], place[:, 2:], self.settings.ahead).astype(np.float32)
 
     def learn(self, step: int) -> None:
         """The updates that a step of all simulations is worth."""
         settings = self.settings
-        if len(self.buffer) < settings.batch_size:
-            return
-        self.optimizer.param_groups[0]["lr"] = settings.learning_rate * 0.5 ** (step / settings.half_life)
+        risen = min(1.0, step / max(settings.ramp, 1))
+        self.optimizer.param_groups[0]["lr"] = settings.learning_rate * risen * 0.5 ** (step / settings.half_life)
         self.owed += settings.updates_per_step * settings.simulations
+        drawn = round(settings.drawn_share * settings.batch_size)
         while self.owed >= 1:
-            self.loss = self.update(self.buffer.sample(self.rng, settings.batch_size))
+            place = draw_places(self.layout, self.rng, drawn)
+            batch = self.buffer.sample(self.rng, settings.batch_size - drawn)
+            self.loss = self.update(
+                torch.cat([batch["place"], torch.from_numpy(place)]),
+                torch.cat([batch["heading"], torch.from_numpy(self._shown(place))]),
+            )
             self.owed -= 1
             self.updates += 1
 
-    def update(self, batch: dict[str, torch.Tensor]) -> float:
-        """One gradient step; gives the divergence before it."""
-        std = batch["std"].clamp(min=self.settings.least_std)
-        loss = divergence(batch["mean"], std, *self.student(batch["observation"]))
+    def update(self, place: torch.Tensor, heading: torch.Tensor) -> float:
+        """One gradient step; gives the error before it."""
+        loss = ((self.way(place) - heading) ** 2).sum(dim=1).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
@@ -214,13 +197,11 @@ class Imitation:
         """Everything that learning goes on from."""
         self.buffer.flush()
         return {
-            "guide": self.run.guide.digest,
-            "student": self.student.state_dict(),
+            "walker": self.run.walker.digest,
+            "way": self.way.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "torch_rng": torch.get_rng_state(),
-            "rng": json.dumps(self.rng.bit_generator.state),
+            "rng": json.dumps([rng.bit_generator.state for rng in (self.rng, *self.noise)]),
             "buffer": {"position": self.buffer.position, "full": self.buffer.full, "rows": self.buffer.size},
-            "guided": torch.from_numpy(self.guided.copy()),
             "owed": self.owed,
             "updates": self.updates,
         }
@@ -229,42 +210,24 @@ class Imitation:
         """Go on from `state()`.
 
         Raises:
-          DmcvbError: it learned from another guide.
+          DmcvbError: it walked as another policy.
         """
-        if state["guide"] != self.run.guide.digest:
+        if state["walker"] != self.run.walker.digest:
             raise DmcvbError(
-                f"{self.run.folder} learned from another guide than the one that is here now; choose another --out"
+                f"{self.run.folder} walks as another policy than the one that is here now; choose another --out"
             )
-        self.student.load_state_dict(state["student"])
+        self.way.load_state_dict(state["way"])
         self.optimizer.load_state_dict(state["optimizer"])
-        torch.set_rng_state(state["torch_rng"])
-        self.rng.bit_generator.state = json.loads(state["rng"])
+        for rng, saved in zip((self.rng, *self.noise), json.loads(state["rng"]), strict=True):
+            rng.bit_generator.state = saved
         self.buffer.restore(**state["buffer"])
-        self.guided = state["guided"].numpy().copy()
         self.owed, self.updates = state["owed"], state["updates"]
 
 
-def deepened(weights: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Weights of a deeper actor that acts as the given one does: layers it lacks are identities.
-
-    After a ReLU an identity with another ReLU changes nothing (Net2Net, Chen et al. 2016).
-    """
-    grown = {}
-    for name, value in wanted.items():
-        if name in weights:
-            grown[name] = weights[name].clone()
-        else:
-            grown[name] = torch.zeros_like(value) if name.endswith("bias") else torch.eye(len(value))
-    return grown
-
-
-def divergence(mean: torch.Tensor, std: torch.Tensor, own_mean: torch.Tensor, own_std: torch.Tensor) -> torch.Tensor:
-    """Mean Kullback-Leibler divergence of the student's Gaussian from the guide's, nats an action, (1).
-
-    Of the Gaussians before squashing; means count as within +-3, where tanh leaves nothing to tell.
-    """
-    limit = 3.0
-    # Beyond the limit there is no gradient outwards, so a student may be further out, where the guide is out too.
-    apart = torch.where(mean.abs() < limit, own_mean - mean, own_mean.clamp(-limit, limit) - mean.clamp(-limit, limit))
-    log_ratio = own_std.log() - std.log()
-    return (log_ratio + (std**2 + apart**2) / (2 * own_std**2) - 0.5).sum(dim=1).mean()
+def draw_places(layout: Layout, rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, `WAY_SIZE`) float32: an ant anywhere on the floor and a goal where goals are put, meters."""
+    free = np.array([layout.world(cell) for cell in layout.free])
+    ant, goal = free[rng.integers(len(free), size=(2, count))]
+    ant = ant + rng.uniform(-CELL / 2, CELL / 2, ant.shape)
+    goal = goal + rng.uniform(-GOAL_NOISE, GOAL_NOISE, goal.shape)
+    return np.concatenate([ant, goal], axis=1, dtype=np.float32)

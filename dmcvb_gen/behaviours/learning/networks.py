@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import nn
 
-from dmcvb_gen.behaviours.policies.header import LOG_STD_RANGE, PolicyHeader
+from dmcvb_gen.behaviours.policies.header import LOG_STD_RANGE, WAY_SIZE, PolicyHeader
+from dmcvb_gen.behaviours.policies.way import PLACE_SCALE
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
 
@@ -55,6 +57,24 @@ class Actor(nn.Module):
         else:
             std = torch.full_like(mean, self.header.noise)
         return mean, std
+
+
+class Way(nn.Sequential):
+    """An MLP from places of ant and goal, (n, `WAY_SIZE`) meters, to where to head, (n, 2) meters seen from the ant."""
+
+    def __init__(self, hidden: Sequence[int]):
+        widths = [WAY_SIZE, *hidden]
+        layers: list[nn.Module] = []
+        for fan_in, fan_out in itertools.pairwise(widths):
+            layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
+        super().__init__(*layers, nn.Linear(widths[-1], 2))
+
+    def forward(self, places: torch.Tensor) -> torch.Tensor:
+        return super().forward(places / float(PLACE_SCALE))
+
+    def weights(self) -> dict[str, torch.Tensor]:
+        """Its part of a policy file."""
+        return {f"way.{name}": value for name, value in self.state_dict().items()}
 
 
 def as_arrays(weights: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:

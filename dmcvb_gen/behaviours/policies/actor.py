@@ -13,6 +13,7 @@ import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.behaviours.policies.header import LOG_STD_RANGE, PolicyHeader
+from dmcvb_gen.behaviours.policies.way import PLACE_SCALE, headed, places
 from dmcvb_gen.tasks.base import Task
 
 NORM_EPSILON = 1e-5
@@ -94,8 +95,18 @@ class Policy:
         _affine(x, weight, self._biases[f"{name}.bias"], out)
         return out
 
+    def heading(self, observation: np.ndarray) -> np.ndarray:
+        """(n, observation) -> (n, 2) float32 meters: where a policy that knows the way heads, seen from the ant."""
+        x = places(np.asarray(observation)) / PLACE_SCALE
+        last = 2 * len(self.header.way)
+        for place in range(0, last, 2):
+            x = np.maximum(self._dense(f"way.{place}", x), np.float32(0))
+        return self._dense(f"way.{last}", x)
+
     def _features(self, observation: np.ndarray) -> np.ndarray:
         header, weights = self.header, self.weights
+        if header.way is not None:
+            observation = headed(observation, self.heading(observation))
         limit = np.float32(header.clip_observation)
         x = (np.asarray(observation, np.float32) - weights["observation_mean"]) / weights["observation_std"]
         x = np.ascontiguousarray(np.clip(x, -limit, limit))

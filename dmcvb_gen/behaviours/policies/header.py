@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any, Literal
 
 import pydantic
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""2: a network that knows the way may come before the actor (`way`)."""
+WAY_SIZE = 4
+"""What the network that knows the way sees: x and y of the ant, x and y of the goal."""
 LOG_STD_RANGE = (-20.0, 2.0)
 """Where the log standard deviation of a squashed Gaussian is clipped (Haarnoja et al. 2018)."""
 MAX_LAYERS, MAX_WIDTH = 16, 65_536
@@ -18,7 +22,7 @@ Mode = Annotated[
 """Which actions were taken; "deterministic" is what version 0.1 wrote for "mean"."""
 ORIGINS = {
     "sac": "by soft actor-critic (SAC)",
-    "guided": "by imitation of a guide that knows the way (DAgger)",
+    "guided": "on a policy of the open maze, by imitation of a guide that knows the way (DAgger)",
     "sb3-sac": "by Stable-Baselines3's SAC",
     "td3": "by Stable-Baselines3's TD3",
     "tqc": "by sb3-contrib's TQC",
@@ -62,6 +66,8 @@ class PolicyHeader(_Model):
       layer_norm: whether each hidden layer is normalized before its activation.
       distribution: "squashed_gaussian": tanh(mean + std * noise); "gaussian": clipped to [-1, 1];
         "deterministic": the mean, with fixed `noise` added when sampling.
+      way: widths of the hidden layers of the network that says where to head in a maze (`policies.way`); None: the
+        policy heads for its goal.
       clip_observation: normalized observations are clipped to +- this.
       training: settings, seed, wall time, versions.
       command: what trains it again.
@@ -77,6 +83,7 @@ class PolicyHeader(_Model):
     agent_step: int = pydantic.Field(ge=0)
     level: str | None = None
     hidden: Annotated[tuple[Width, ...], pydantic.Field(max_length=MAX_LAYERS)]
+    way: Annotated[tuple[Width, ...] | None, pydantic.Field(max_length=MAX_LAYERS)] = None
     activation: Literal["relu", "tanh", "elu", "gelu"] = "relu"
     layer_norm: bool = False
     distribution: Literal["squashed_gaussian", "gaussian", "deterministic"] = "squashed_gaussian"
@@ -102,8 +109,13 @@ def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
 
     `body.<i>` are hidden layers (numbered with their norms and activations), `mean` and `log_std` the heads (for
     "gaussian" a free vector `log_std_vector`); `observation_mean` and `observation_std` normalize what comes in.
+    `way.<i>` are the layers of the network that knows the way, where there is one.
     """
     shapes: dict[str, tuple[int, ...]] = {}
+    if header.way is not None:
+        widths = (WAY_SIZE, *header.way, 2)
+        for index, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
+            shapes |= {f"way.{2 * index}.weight": (fan_out, fan_in), f"way.{2 * index}.bias": (fan_out,)}
     width, place = header.observation_size, 0
     for hidden in header.hidden:
         shapes |= {f"body.{place}.weight": (hidden, width), f"body.{place}.bias": (hidden,)}

@@ -27,7 +27,6 @@ from dmcvb_gen.tasks.ant_maze.arena import (
 )
 from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
-from dmcvb_gen.tasks.ant_maze.waypoints import headings
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
 
 EPISODE_STEPS, EVALUATION_STEPS = 600, 1200
@@ -195,25 +194,10 @@ class AntMazeBatch(EpisodeBatch):
 
     def behaviour_observation(self):
         position, goal = self._xpos[:, self._torso], self.goal()
-        return self._observation(position, goal, goal - position)
-
-    def guided_observation(self, ahead: float) -> np.ndarray:
-        """(size, behaviour_size) float32: as if the ant stood in the middle of an open maze, its goal where `headings`
-        point."""
-        position, goal = self._xpos[:, self._torso], self.goal()
-        vector = headings(self.task.layout, position[:, :2], goal[:, :2], ahead)
-        height, goal_height = position[:, 2:], goal[:, 2:]
-        return self._observation(
-            np.concatenate([np.zeros_like(vector), height], axis=1),
-            np.concatenate([vector, goal_height], axis=1),
-            np.concatenate([vector, goal_height - height], axis=1),
-        )
-
-    def _observation(self, position: np.ndarray, goal: np.ndarray, vector: np.ndarray) -> np.ndarray:
         values = self._proprioception() | {
             "target_position": goal,
-            "target_vector": vector,
-            "egocentric_target_vector": self._egocentric(vector),
+            "target_vector": goal - position,
+            "egocentric_target_vector": self._egocentric(goal - position),
             "walker_position": position,
         }
         return np.concatenate([values[name] for name in BEHAVIOUR_FIELDS], axis=1, dtype=np.float32)
