@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.readers.register import register
+from dmcvb_gen.readers.register import register_with_gymnasium
 
 if TYPE_CHECKING:
     from dmcvb_gen.readers.release import ReleaseReader
@@ -35,4 +35,4 @@ def open(path: str, storage_options: dict | None = None, *, paint: bool = False,
     return open_for_reading(path, storage_options)
 
 
-register()  # so that gymnasium.make knows our names wherever this package is imported
+register_with_gymnasium()  # so that gymnasium.make knows our names wherever this package is imported

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import copyreg
 import difflib
 from collections.abc import Iterable
+
+
+def _made_again(kind: type[Exception], *arguments: object) -> Exception:
+    """An error from its class and arguments, without its constructor."""
+    return kind.__new__(kind, *arguments)
 
 
 class DmcvbError(Exception):
@@ -23,8 +27,8 @@ class UnknownNameError(DmcvbError, KeyError):
     def __str__(self) -> str:  # KeyError would print the repr
         return str(self.args[0])
 
-    def __reduce__(self):  # to come back from a worker process, made anew from its message
-        return copyreg.__newobj__, (type(self), *self.args)
+    def __reduce__(self) -> tuple:  # to come back from a worker process, made anew from its message
+        return _made_again, (type(self), *self.args)
 
 
 class PolicyFileError(DmcvbError):

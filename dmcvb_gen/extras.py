@@ -5,7 +5,9 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 EXTRAS = {
-    "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
+    "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "jinja2"),
+    "pictures": ("imageio_ffmpeg", "matplotlib"),
+    "xarray": ("xarray",),
     "gpu": ("mujoco_warp", "warp"),
     "s3": ("s3fs",),
     "gs": ("gcsfs",),
@@ -16,7 +18,7 @@ EXTRAS = {
     "ray": ("ray",),
 }
 """Extra -> the modules that it brings."""
-SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safetensors", "PIL", "imageio", "gymnasium")
+SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safetensors", "PIL", "gymnasium")
 """Modules of a whole install that one who only reads may leave out."""
 _PACKAGES = {
     "stable_baselines3": "stable-baselines3",
@@ -26,6 +28,7 @@ _PACKAGES = {
     "skfmm": "scikit-fmm",
     "dm_control": "dm-control",
     "PIL": "pillow",
+    "imageio_ffmpeg": "imageio-ffmpeg",
     "yaml": "PyYAML",
 }
 """Module -> its package, where the names differ."""

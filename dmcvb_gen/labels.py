@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Exogenous:
     background_frame: np.ndarray
     style: np.ndarray
 
-    def __getitem__(self, index) -> Exogenous:
+    def __getitem__(self, index: Any) -> Exogenous:
         """Index the leading axes of all labels alike."""
         return Exogenous(**{name: value[index] for name, value in self.items()})
 

@@ -88,7 +88,7 @@ class DistractorSetting:
     kind: str = "none"
     difficulty: str = "medium"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.kind not in DISTRACTOR_KINDS:
             raise UnknownNameError("distractor", self.kind, DISTRACTOR_KINDS)
         if self.difficulty not in DIFFICULTIES:

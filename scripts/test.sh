@@ -4,4 +4,5 @@ extras=test
 . "$(dirname "$0")/setup.sh"
 ruff check .
 ruff format --check .
+mypy
 exec python -m pytest "$@"

@@ -48,7 +48,10 @@ def test_rollout_info_preview_verify_one_after_the_other(tmp_path):
     files = json.loads(run("preview", out, "--episodes", "1", "--json").output)
     assert Image.open(files[0]).size[0] == 10 * 16 * 2
     assert (tmp_path / "demo/preview/preview.mp4").stat().st_size > 1000
-    assert run("preview", out, "--gif", "--out", tmp_path / "gif").exit_code == 0
+    asked = ["--video", "webp", "--frames", "12", "--scale", "1", "--out", tmp_path / "webp"]
+    assert run("preview", out, *asked).exit_code == 0
+    moving = Image.open(tmp_path / "webp/preview.webp")
+    assert moving.n_frames == 12 and moving.size == (16, 16 + 14)
     verified = run("verify", out, "--json")
     assert verified.exit_code == 0 and json.loads(verified.output)["sound"]
     again = json.loads(run(*SMALL, "--level", "expert", "--distractor", "dynamic", "--out", out, "--json").output)

@@ -418,9 +418,14 @@ def info(path, options, as_json):
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the files.  [default: PATH/preview]")
 @click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes of each subset.")
 @click.option("--scale", type=click.IntRange(1, 8), default=2, show_default=True, help="Enlarge the pictures.")
-@click.option("--gif", is_flag=True, help="Write a gif instead of an mp4.")
+@click.option("--frames", type=click.IntRange(1), default=200, show_default=True, help="Of the video, 20 a second.")
+@click.option(
+    "--video",
+    type=click.Choice(["mp4", "webp", "gif"]),
+    help="Kind of video.  [default: mp4, or webp where imageio-ffmpeg is not installed]",
+)
 @json_option
-def preview(path, only, out, episodes, scale, gif, as_json):
+def preview(path, only, out, as_json, **options):
     """Write a contact sheet (PNG) and a video of what is in a release.
 
     \b
@@ -428,7 +433,7 @@ def preview(path, only, out, episodes, scale, gif, as_json):
     """
     from dmcvb_gen.rollout.preview import write_preview
 
-    files = write_preview(path, out, only=only, episodes=episodes, scale=scale, gif=gif)
+    files = write_preview(path, out, only=only, **options)
     if as_json:
         return print_json([str(file) for file in files])
     for file in files:

@@ -67,7 +67,7 @@ class Backgrounds:
         for video in range(len(self)):
             frames = self.frames(video)
             lengths.append(len(frames))
-            digest.update(frames)
+            digest.update(frames.data)
         self.lengths, self.digest = tuple(lengths), digest.hexdigest()
 
     def __len__(self) -> int:

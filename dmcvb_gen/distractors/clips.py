@@ -214,7 +214,7 @@ def make_clip(seed: int, split: str, index: int) -> np.ndarray:
     data, step = mujoco.MjData(model), model.opt.timestep
     mujoco.mj_step(model, data, nstep=round(SETTLING / step))
     speed = data.qvel.reshape(-1, 6)
-    for index in np.flatnonzero(np.isfinite(velocities[:, 0])):
+    for index in np.flatnonzero(np.isfinite(velocities[:, 0])).tolist():
         model.body_gravcomp[index + 1] = 0
         speed[index] = [*velocities[index], *rng.normal(0, 3, 3)]
     frames = np.empty((FRAMES, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)

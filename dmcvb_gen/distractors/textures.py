@@ -152,7 +152,7 @@ FLOORS = (_marble, _wood, _fabric, _stones, _foliage, _bricks)
 def texture(rng: np.random.Generator, size: int = 256, materials: Sequence[Callable] = MATERIALS) -> np.ndarray:
     """(size, size, 3) uint8: marble, wood, rust, cloth, stones, print, leaves or bricks (or one of `materials`)."""
     y, x = np.mgrid[:size, :size] / size
-    kind = materials[rng.integers(len(materials))]
+    kind = materials[int(rng.integers(len(materials)))]
     return (np.clip(kind(rng, size, (x, y)), 0, 1) * 255).astype(np.uint8)
 
 

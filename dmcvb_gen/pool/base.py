@@ -70,7 +70,8 @@ class SerialPool(Pool):
     """One after the other, in this process, when the result is asked for."""
 
     def __init__(self, tick: Tick = ignore):
-        self._tick, self._waiting = tick, deque()
+        self._tick = tick
+        self._waiting: deque[tuple[Any, Callable, tuple]] = deque()
 
     def submit(self, key, function, *arguments):
         self._waiting.append((key, function, arguments))

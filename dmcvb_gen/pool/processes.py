@@ -111,8 +111,8 @@ class ProcessPool(Pool):
 # -- in a worker ----------------------------------------------------------------------------------
 
 
-_ticks: multiprocessing.Queue | None = None
-_late: multiprocessing.Queue | None = None
+_ticks: multiprocessing.Queue
+_late: multiprocessing.Queue
 
 
 class _OnItsWay:

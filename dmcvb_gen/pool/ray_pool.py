@@ -6,6 +6,7 @@ Only the results travel back (commit records, not data), so the work must leave 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import socket
 from collections import deque
@@ -37,7 +38,7 @@ class RayPool(Pool):
         if self._ours:
             _check_answers(address or os.environ.get("RAY_ADDRESS"))
             try:
-                ray.init(address=address, logging_level="ERROR", log_to_driver=False, configure_logging=False)
+                ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, configure_logging=False)
             except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
                 reason = " ".join(str(error).split())[:200]
                 raise _nobody(address or "RAY_ADDRESS", reason) from None
@@ -89,7 +90,7 @@ def _check_answers(address: str | None) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=10).close()
     except OSError as error:
-        raise _nobody(address, error.strerror or str(error)) from None
+        raise _nobody(str(address), error.strerror or str(error)) from None
 
 
 def _nobody(address: str, reason: str) -> DmcvbError:

@@ -6,6 +6,7 @@ Everything is imported when first asked for: `import dmcvb_gen` passes here, and
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 _HOMES = {
     "ReleaseReader": "release",
@@ -24,7 +25,7 @@ _HOMES = {
 __all__ = sorted(_HOMES)
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

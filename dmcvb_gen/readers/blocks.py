@@ -44,7 +44,7 @@ class Block:
     """
 
     def __init__(
-        self, subset: Subset, episodes: Sequence[int], pictures: Sequence[str], stack: int = 3, next_step: bool = False
+        self, subset: Subset, episodes: Iterable[int], pictures: Sequence[str], stack: int = 3, next_step: bool = False
     ):
         names = ["state", "action", "reward", "discount", "length"]
         loaded = [subset.episode(int(episode), [*names, *pictures]) for episode in episodes]
@@ -81,7 +81,7 @@ class Block:
             values |= self._observe(rows + 1, self._start[steps], "next_")
         return values
 
-    def _observe(self, rows, starts, prefix):
+    def _observe(self, rows: np.ndarray, starts: np.ndarray, prefix: str) -> dict[str, np.ndarray]:
         values = {f"{prefix}state": self._state[rows]}
         if self._frames is not None:
             back = np.arange(self.stack - 1, -1, -1)
@@ -156,5 +156,5 @@ def stream(
         yield _join(rest)
 
 
-def _join(parts):
+def _join(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return parts[0] if len(parts) == 1 else {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}

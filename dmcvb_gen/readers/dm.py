@@ -40,14 +40,14 @@ class DmEnv(dm_env.Environment):
         return dm_env.transition(reward, observation)
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        spaces = self._env.observation_space
+        spaces, _ = self._env.spaces()
         return {
             "pixels": specs.BoundedArray(spaces["pixels"].shape, np.uint8, 0, 255, name="pixels"),
             "state": specs.Array(spaces["state"].shape, np.float32, name="state"),
         }
 
     def action_spec(self) -> specs.BoundedArray:
-        return specs.BoundedArray(self._env.action_space.shape, np.float32, -1.0, 1.0, name="action")
+        return specs.BoundedArray(self._env.spaces()[1].shape, np.float32, -1.0, 1.0, name="action")
 
     def close(self) -> None:
         self._env.close()

@@ -7,9 +7,9 @@ and one call of the renderer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -26,8 +26,8 @@ from dmcvb_gen.rollout.painting import check_renderer
 from dmcvb_gen.rollout.recipe import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.store.pictures import Pictures
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
-from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
+from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 
 PURPOSE = "evaluation"
 """Names the random streams: no episode here has those of released data."""
@@ -119,14 +119,15 @@ class _Stage:
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
         """Of one place: observations {"pixels", "state"}, and actions."""
         shape = (self.size, self.size, 3 * len(self.pictures.views))
-        observation = {
+        observation: dict[str, spaces.Space] = {
             "pixels": spaces.Box(0, 255, shape, np.uint8),
             "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
         }
         return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
 
-    def start(self, places: Sequence[int], seeds: Sequence[int]) -> None:
+    def start(self, places: Iterable[int], seeds: Sequence[int]) -> None:
         """Start the next episode of some places, from the streams of their seeds."""
+        places = list(places)
         for place, seed in zip(places, seeds, strict=True):
             number = int(self.started[place])
             self._episodes[place] = seed, number
@@ -170,13 +171,13 @@ class _Stage:
         return result.reward, result.terminated, truncated
 
 
-def _pairs(task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """The (start, goal) cells that "fixed" episodes go round."""
     if scene.goal_pair is None:
-        return fixed_pairs(task.layout, scene.fixed_goals, scene.goal_seed)
+        return fixed_pairs(as_maze(task).layout, scene.fixed_goals, scene.goal_seed)
     if scene.goal_pair < 0:
         raise DmcvbError(f"goal_pair is {scene.goal_pair}; give 0 for the first pair, 1 for the second, ...")
-    return fixed_pairs(task.layout, scene.goal_pair + 1, scene.goal_seed)[-1:]
+    return fixed_pairs(as_maze(task).layout, scene.goal_pair + 1, scene.goal_seed)[-1:]
 
 
 class DistractedEnv(gymnasium.Env):
@@ -205,16 +206,21 @@ class DistractedEnv(gymnasium.Env):
         self.task, self.render_mode = self._stage.task, render_mode
         self.observation_space, self.action_space = self._stage.spaces()
         self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
-        self._seed, self._pixels = None, None
+        self._seed: int | None = None
+        self._pixels: np.ndarray | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
+    def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
+        """Of observations {"pixels", "state"}, and of actions."""
+        return self._stage.spaces()
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
         super().reset(seed=seed)
         if seed is not None or self._seed is None:
             self._seed, self._stage.started[0] = int(self.np_random.integers(2**63)), 0
         self._stage.start([0], [self._seed])
         return self._observation(), self._info()
 
-    def step(self, action: np.ndarray):
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict]:
         if self._seed is None:
             raise DmcvbError("step before reset; call reset() first")
         reward, terminated, truncated = self._stage.step(np.asarray(action)[None], np.ones(1, bool))
@@ -258,7 +264,9 @@ class DistractedVectorEnv(VectorEnv):
         self._seeds: list[int] | None = None
         self._ended = np.zeros(num_envs, bool)
 
-    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict]:
         """Start all episodes; an int seeds place i with seed + i, as Gymnasium's own vector environments do."""
         if seed is not None or self._seeds is None:
             given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
@@ -270,7 +278,7 @@ class DistractedVectorEnv(VectorEnv):
         self._ended[:] = False
         return self._stage.observe(), {}
 
-    def step(self, actions: np.ndarray):
+    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict]:
         if self._seeds is None:
             raise DmcvbError("step before reset; call reset() first")
         restarted = self._ended.copy()
@@ -281,5 +289,5 @@ class DistractedVectorEnv(VectorEnv):
         self._ended = terminated | truncated
         return self._stage.observe(), reward, terminated, truncated, {}
 
-    def close_extras(self, **kwargs) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         self._stage.renderer.close()

@@ -6,7 +6,7 @@ each with its views in their order, and the first frame of an episode repeated b
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -20,10 +20,11 @@ from dmcvb_gen.errors import DmcvbError
 class _Stack:
     """The last frames of episodes side by side, (place, stack, channel, size, size) uint8."""
 
-    def __init__(self, places: int, stack: int, space: spaces.Box):
+    def __init__(self, places: int, stack: int, observations: gymnasium.Space):
         if stack < 1:
             raise DmcvbError(f"stack is {stack}; give at least 1")
-        size, _, channels = space.shape
+        assert isinstance(observations, spaces.Dict)
+        size, _, channels = observations["pixels"].shape or ()
         self._frames = np.zeros((places, stack, channels, size, size), np.uint8)
 
     @property
@@ -44,8 +45,12 @@ class _Stack:
         return self._frames.reshape(len(pixels), *self.shape).copy()
 
 
-def _space(space: spaces.Dict, shape: tuple[int, int, int]) -> spaces.Dict:
+def _space(space: gymnasium.Space, shape: tuple[int, int, int]) -> spaces.Dict:
+    assert isinstance(space, spaces.Dict)
     return spaces.Dict({**space.spaces, "pixels": spaces.Box(0, 255, shape, np.uint8)})
+
+
+Observation = dict[str, np.ndarray]
 
 
 class DataLayout(gymnasium.Wrapper):
@@ -53,18 +58,18 @@ class DataLayout(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env, stack: int = 3):
         super().__init__(env)
-        self._stack = _Stack(1, stack, env.observation_space["pixels"])
+        self._stack = _Stack(1, stack, env.observation_space)
         self.observation_space = _space(env.observation_space, self._stack.shape)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
         return self._stacked(observation, True), info
 
-    def step(self, action):
-        observation, *rest = self.env.step(action)
-        return self._stacked(observation, False), *rest
+    def step(self, action: np.ndarray) -> tuple[Observation, SupportsFloat, bool, bool, dict]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._stacked(observation, False), reward, terminated, truncated, info
 
-    def _stacked(self, observation, first):
+    def _stacked(self, observation: Observation, first: bool) -> Observation:
         return {**observation, "pixels": self._stack.push(observation["pixels"][None], np.array([first]))[0]}
 
 
@@ -75,22 +80,22 @@ class VectorDataLayout(VectorWrapper):
         super().__init__(env)
         if env.metadata.get("autoreset_mode") != AutoresetMode.NEXT_STEP:
             raise DmcvbError("the vector environment does not restart at the next step; give one of dmcvb_gen's")
-        self._stack = _Stack(env.num_envs, stack, env.single_observation_space["pixels"])
+        self._stack = _Stack(env.num_envs, stack, env.single_observation_space)
         self.single_observation_space = _space(env.single_observation_space, self._stack.shape)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._ended = np.zeros(env.num_envs, bool)
 
-    def reset(self, *, seed=None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
         self._ended[:] = False
         return self._stacked(observation, np.ones(self.num_envs, bool)), info
 
-    def step(self, actions):
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
         observation, reward, terminated, truncated, info = self.env.step(actions)
         first, self._ended = self._ended, terminated | truncated
         return self._stacked(observation, first), reward, terminated, truncated, info
 
-    def _stacked(self, observation, first):
+    def _stacked(self, observation: Observation, first: np.ndarray) -> Observation:
         return {**observation, "pixels": self._stack.push(observation["pixels"], first)}
 
 

@@ -11,6 +11,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.readers.release import ReleaseReader, SubsetReader
+from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.jobs import background_source, stream_names
 from dmcvb_gen.rollout.painting import exogenous_of, paint, renderer_for
 from dmcvb_gen.store import open_release
@@ -49,7 +51,7 @@ class Painting:
     backgrounds: str | None = None
     cache_bytes: int = DEFAULT_CACHE
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.distractors not in DISTRACTORS:
             raise DmcvbError(f"distractors={self.distractors!r} is unknown; give one of {', '.join(DISTRACTORS)}")
 
@@ -64,7 +66,7 @@ class PaintedArray:
         self.dtype, self.ndim = np.dtype(np.uint8), 5
         self.dimensions = ("episode", "step", "height", "width", "channel")
 
-    def __getitem__(self, selection) -> np.ndarray:
+    def __getitem__(self, selection: Any) -> np.ndarray:
         first, *rest = selection if isinstance(selection, tuple) else (selection,)
         episodes = np.arange(self.shape[0])[first]
         if np.ndim(episodes) == 0:
@@ -101,13 +103,14 @@ class PaintedSubset(SubsetReader):
 
     def _start(self) -> None:
         self._kept: OrderedDict[tuple[int, int], dict[str, np.ndarray]] = OrderedDict()
-        self._bytes, self._painter, self._lock = 0, None, threading.Lock()
+        self._painter: tuple[Renderer, Any] | None = None
+        self._bytes, self._lock = 0, threading.Lock()
 
-    def __getstate__(self):  # painters and what they painted stay where they are
+    def __getstate__(self) -> dict[str, Any]:  # painters and what they painted stay where they are
         left = ("_kept", "_bytes", "_painter", "_lock")
         return {name: value for name, value in super().__getstate__().items() if name not in left}
 
-    def __setstate__(self, state):
+    def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._start()
 
@@ -125,7 +128,7 @@ class PaintedSubset(SubsetReader):
     def arrays(self) -> tuple[str, ...]:
         return tuple(sorted({*super().arrays, *self.picture_names}))
 
-    def array(self, name: str):
+    def array(self, name: str) -> Any:
         return PaintedArray(self, name) if picture_of(name) is not None else super().array(name)
 
     def painted(self, episode: int) -> dict[str, np.ndarray]:
@@ -170,7 +173,7 @@ class PaintedSubset(SubsetReader):
             return given  # fresh distractors may show other videos
         if is_url(self.root) and not given and (self.record.backgrounds or {}).get("source", "builtin") != "builtin":
             raise StoreError(f"{self.name} shows videos of its own; fetch the release, or give backgrounds=FOLDER")
-        return background_source(self.root, self.record, given)
+        return background_source(Path(self.root), self.record, given)
 
 
 def _size(pictures: dict[str, np.ndarray]) -> int:

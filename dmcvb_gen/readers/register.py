@@ -1,8 +1,20 @@
-"""Gymnasium names of all tasks and distractors; light, because this runs whenever `dmcvb_gen` is imported."""
+"""Gymnasium names of all tasks and distractors, registered as soon as both packages are imported, in either order.
+
+This runs whenever `dmcvb_gen` is imported, so it imports nothing itself: who only reads, or asks for --help, neither
+needs Gymnasium nor waits for it.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import sys
+from typing import TYPE_CHECKING, Any
+
 from dmcvb_gen.names import DISTRACTOR_KINDS, GOAL_MODES
+
+if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
 
 TASKS = ("walker-walk", "cheetah-run", "humanoid-walk")
 """Locomotion tasks (a test holds these lists equal to the tasks' own, which would import MuJoCo)."""
@@ -32,10 +44,7 @@ def environment_ids() -> tuple[str, ...]:
 
 def register() -> None:
     """Register the environments, so that `gymnasium.make` and `make_vec` know them; done once."""
-    try:
-        import gymnasium
-    except ImportError:
-        return  # whoever only reads needs no environments
+    import gymnasium
 
     for name, (task, setting) in environments().items():
         if name not in gymnasium.registry:
@@ -45,3 +54,42 @@ def register() -> None:
                 vector_entry_point=VECTOR_ENTRY_POINT,
                 kwargs={"task": task, "distractor": setting},
             )
+
+
+def register_with_gymnasium() -> None:
+    """`register` now if Gymnasium is imported already, else when it is."""
+    if "gymnasium" in sys.modules:
+        register()
+    elif not any(isinstance(finder, _GymnasiumFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _GymnasiumFinder())
+
+
+class _GymnasiumFinder:
+    """Finds `gymnasium` as the other finders do, once, with a loader that calls `register` afterwards."""
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        if fullname != "gymnasium":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(fullname)
+        if spec is not None and spec.loader is not None:
+            loader: Any = _RegisteringLoader(spec.loader)
+            spec.loader = loader
+        return spec
+
+
+class _RegisteringLoader:
+    """Another loader, and `register` after it."""
+
+    def __init__(self, loader: Any):
+        self._loader = loader
+
+    def __getattr__(self, name: str) -> Any:  # get_source, get_data, ...
+        return getattr(self._loader, name)
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return self._loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        self._loader.exec_module(module)
+        register()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -34,11 +34,11 @@ class SubsetReader(Subset):
         import xarray
 
         chosen = choose(self, episodes)
-        options = {"storage_options": self._storage_options} if "://" in self.root else {}
+        options = self._storage_options if "://" in self.root else None
         path = f"{self.root}/{self.name}.zarr"
         parts = []
         for folder in sorted({path.rpartition("/")[0] for path in self.paths.values()}):
-            part = xarray.open_zarr(path, group=folder or None, consolidated=None, chunks=None, **options)
+            part = xarray.open_zarr(path, group=folder or None, consolidated=None, chunks=None, storage_options=options)
             # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
             part = part.reset_coords().rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
             parts.append(part.rename({name: f"{folder}_{name}".replace("/", "_") for name in part} if folder else {}))
@@ -46,7 +46,7 @@ class SubsetReader(Subset):
         merged = merged.isel(episode=chosen).assign_coords(episode=chosen, step=np.arange(merged.sizes["step"]))
         return merged.assign_attrs(self.attrs)
 
-    def torch(self, kind: str = "steps", **options: Any):
+    def torch(self, kind: str = "steps", **options: Any) -> Any:
         """A torch data set.
 
         Args:
@@ -80,6 +80,11 @@ class SubsetReader(Subset):
 
 class ReleaseReader(Release):
     """A release whose subsets are `SubsetReader`s."""
+
+    subsets: Mapping[str, SubsetReader]
+
+    def __getitem__(self, name: str) -> SubsetReader:
+        return cast(SubsetReader, super().__getitem__(name))
 
 
 def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseReader:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +97,9 @@ class StepSource:
         """All steps, in memory."""
         return Block(self.subset, self.episodes, self.pictures, self.stack, self.next_step)
 
-    def __getstate__(self):  # what is held is read again where the source lands: quicker than sending it
+    def __getstate__(
+        self,
+    ) -> dict[str, Any]:  # what is held is read again where the source lands: quicker than sending it
         return {name: value for name, value in self.__dict__.items() if name != "block"}
 
     def _read(self, place: int) -> dict[str, np.ndarray]:

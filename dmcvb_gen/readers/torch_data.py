@@ -6,6 +6,7 @@ They hold no open files, so they may be sent to the workers of a `DataLoader`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ class StepDataset(Dataset):
       options: of `StepSource`: episodes, pictures, stack, next_step, in_memory.
     """
 
-    def __init__(self, subset: Subset, **options):
+    def __init__(self, subset: Subset, **options: Any):
         self.source = StepSource(subset, **options)
         if self.source.in_memory:
             _ = self.source.block  # read now, so that workers that are forked share it
@@ -91,7 +92,7 @@ class StreamDataset(IterableDataset):
       rank, world: this process's share; those of torch.distributed by default, where it runs.
     """
 
-    def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options):
+    def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options: Any):
         self.subset, self.options = subset, options
         # In shared memory: a loader's persistent workers keep the data set that they were started with.
         self._epoch = torch.tensor(options.pop("epoch", 0)).share_memory_()

@@ -160,7 +160,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
             labels = Exogenous(**{name: values[f"exogenous/{name}"] for name in EXOGENOUS_NAMES})
             for name in subset.pixel_arrays:
                 stored = values[name][steps]
-                view, hidden = picture_of(name)
+                view, hidden = picture_of(name) or (name, False)
                 painted = renderer.render(values["physics"][steps], labels[steps], [view], hide_goal=hidden)[:, 0]
                 gaps = np.abs(painted.astype(int) - stored).reshape(len(steps), -1).mean(axis=1)
                 for step, gap in zip(steps, gaps, strict=True):

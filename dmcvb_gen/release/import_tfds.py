@@ -216,7 +216,12 @@ def _import_subset(source: _Source, out: Path, tick) -> None:
     task = get_task(record.task)
     rows = task.max_steps + 1
     specs = imported_specs(record)
-    attributes = {"task": record.task, "level": record.level, "setting": record.setting, "imported": "DMC-VB"}
+    attributes: dict[str, Any] = {
+        "task": record.task,
+        "level": record.level,
+        "setting": record.setting,
+        "imported": "DMC-VB",
+    }
     attributes["state_fields"] = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
     attributes["views"] = list(record.views)
     create_subset(out, record, specs, rows, attributes)
@@ -235,10 +240,9 @@ def _import_subset(source: _Source, out: Path, tick) -> None:
             spec.name: np.zeros((len(places), *([rows] if spec.steps else []), *spec.shape), spec.dtype)
             for spec in specs
         }
-        for row, (goal, *place) in enumerate(places):
-            _fill(
-                {name: array[row : row + 1] for name, array in arrays.items()}, read_example(*place), record, place[0]
-            )
+        for row, (goal, file, *place) in enumerate(places):
+            one = {name: array[row : row + 1] for name, array in arrays.items()}
+            _fill(one, read_example(file, *place), record, file)
             arrays["goal_pair"][row] = goal if record.setting == FIXED else -1
             tick(1)
         write_shard(out, record, shard, arrays.items(), arrays["length"])

@@ -8,7 +8,7 @@ without a manifest is no release, so readers never see half of one.
 from __future__ import annotations
 
 import json
-import os
+import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -380,10 +380,10 @@ def _strangers(out: Path, manifest: Manifest) -> Iterable[Path]:
 
 
 def _check_room(out: Path, files: list[FileRecord]) -> None:
-    needed, free = sum(file.bytes for file in files), os.statvfs(out)
-    if needed > free.f_bavail * free.f_frsize:
+    needed, free = sum(file.bytes for file in files), shutil.disk_usage(out).free
+    if needed > free:
         raise StoreError(
-            f"{needed / 1e9:.1f} GB are to be fetched and {free.f_bavail * free.f_frsize / 1e9:.1f} GB are free at "
+            f"{needed / 1e9:.1f} GB are to be fetched and {free / 1e9:.1f} GB are free at "
             f"{out}; make room, choose another --out, or fetch less with --only and --episodes"
         )
 

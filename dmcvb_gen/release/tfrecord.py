@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -21,25 +22,26 @@ _LISTS = {"bytes_list": ("BytesList", _FIELD.TYPE_BYTES), "float_list": ("FloatL
 }
 
 
-def _example_class() -> type[message.Message]:
+def _example_class() -> Any:
     """tf.train.Example as its published definition (tensorflow/core/example) says it."""
     file = descriptor_pb2.FileDescriptorProto(name="dmcvb_gen/example.proto", package="dmcvb_gen", syntax="proto3")
-    feature = descriptor_pb2.DescriptorProto(name="Feature", oneof_decl=[{"name": "kind"}])
+    feature = descriptor_pb2.DescriptorProto(name="Feature")
+    feature.oneof_decl.add(name="kind")
     for number, (field, (kind, of)) in enumerate(_LISTS.items(), 1):
         values = file.message_type.add(name=kind).field.add(name="value", number=1, type=of)
         values.label = _FIELD.LABEL_REPEATED
-        one = feature.field.add(name=field, number=number, type=_FIELD.TYPE_MESSAGE, type_name=f".dmcvb_gen.{kind}")
-        one.label, one.oneof_index = _FIELD.LABEL_OPTIONAL, 0
+        member = feature.field.add(name=field, number=number, type=_FIELD.TYPE_MESSAGE, type_name=f".dmcvb_gen.{kind}")
+        member.label, member.oneof_index = _FIELD.LABEL_OPTIONAL, 0
     file.message_type.append(feature)
     features = file.message_type.add(name="Features")
     entry = features.nested_type.add(name="FeatureEntry", options={"map_entry": True})
     entry.field.add(name="key", number=1, type=_FIELD.TYPE_STRING, label=_FIELD.LABEL_OPTIONAL)
-    of = dict(type=_FIELD.TYPE_MESSAGE, type_name=".dmcvb_gen.Feature", label=_FIELD.LABEL_OPTIONAL)
-    entry.field.add(name="value", number=2, **of)
-    of = dict(type=_FIELD.TYPE_MESSAGE, type_name=".dmcvb_gen.Features.FeatureEntry", label=_FIELD.LABEL_REPEATED)
-    features.field.add(name="feature", number=1, **of)
-    of = dict(type=_FIELD.TYPE_MESSAGE, type_name=".dmcvb_gen.Features", label=_FIELD.LABEL_OPTIONAL)
-    file.message_type.add(name="Example").field.add(name="features", number=1, **of)
+    whole, one, many = _FIELD.TYPE_MESSAGE, _FIELD.LABEL_OPTIONAL, _FIELD.LABEL_REPEATED
+    entry.field.add(name="value", number=2, type=whole, type_name=".dmcvb_gen.Feature", label=one)
+    entries = ".dmcvb_gen.Features.FeatureEntry"
+    features.field.add(name="feature", number=1, type=whole, type_name=entries, label=many)
+    example = file.message_type.add(name="Example")
+    example.field.add(name="features", number=1, type=whole, type_name=".dmcvb_gen.Features", label=one)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("dmcvb_gen.Example"))
@@ -48,7 +50,7 @@ def _example_class() -> type[message.Message]:
 _Example = _example_class()
 
 
-def encode_example(features: dict[str, np.ndarray | Iterable[bytes]]) -> bytes:
+def encode_example(features: Mapping[str, np.ndarray | Iterable[bytes]]) -> bytes:
     """A tf.train.Example: lists of bytes, floats (float arrays) or integers (integer and boolean arrays), flattened."""
     example = _Example()
     for name, value in features.items():

@@ -45,7 +45,7 @@ def verify_url(
     findings = []
     if source.manifest.digest not in (None, root_digest(source.index.files, source.manifest)):
         findings.append(Finding("files", INDEX, "its files do not give the root digest of the manifest"))
-    chosen = source.index.files
+    chosen = list(source.index.files)
     if not everything:
         places = np.unique(np.linspace(0, len(chosen) - 1, min(SAMPLE_FILES, len(chosen))).round().astype(int))
         chosen = [chosen[place] for place in places]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.extras import installed
 from dmcvb_gen.rendering.base import Renderer
@@ -32,12 +34,19 @@ def make_renderer(
     Raises:
       UnknownNameError, RenderingError: no such renderer, or it cannot start here.
     """
+    chosen: Callable[..., Renderer]
     if name == "native":
-        from dmcvb_gen.rendering.native import NativeRenderer as chosen
+        from dmcvb_gen.rendering.native import NativeRenderer
+
+        chosen = NativeRenderer
     elif name == "warp":
-        from dmcvb_gen.rendering.warp import WarpRenderer as chosen
+        from dmcvb_gen.rendering.warp import WarpRenderer
+
+        chosen = WarpRenderer
     elif name == "opengl":
-        from dmcvb_gen.rendering.opengl import OpenglRenderer as chosen
+        from dmcvb_gen.rendering.opengl import OpenglRenderer
+
+        chosen = OpenglRenderer
     else:
         raise UnknownNameError("renderer", name, RENDERERS)
     return chosen(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha, device=device, samples=samples)

@@ -72,7 +72,7 @@ class OpenglRenderer(Renderer):
         self._samples = int(self._model.vis.quality.offsamples)
         skies = np.flatnonzero(self._model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(skies[0]) if len(skies) else -1
-        self._own_sky = None
+        self._own_sky: tuple[int, np.ndarray] | None = None
         if self._sky >= 0:
             address = int(self._model.tex_adr[self._sky])
             height, width = int(self._model.tex_height[self._sky]), int(self._model.tex_width[self._sky])
@@ -169,7 +169,7 @@ class OpenglRenderer(Renderer):
         """Put a video frame on the sky: a square texture, which MuJoCo repeats on the six faces."""
         if self._sky < 0 or (video, frame) == self._shown:
             return
-        if video < 0:
+        if video < 0 and self._own_sky:
             height, pixels = self._own_sky
             self._model.tex_height[self._sky] = height
             self._model.tex_data[self._sky_range] = pixels

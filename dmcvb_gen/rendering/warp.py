@@ -104,7 +104,7 @@ class WarpRenderer(Renderer):
         self._contexts: dict[tuple[int, bool, int], Any] = {}
         self._data: dict[int, Any] = {}
         self._skies: dict[tuple[int, int], Any] = {}
-        self._model = None
+        self._model: Any = None
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -147,8 +147,8 @@ class WarpRenderer(Renderer):
         if pixels.shape[1] > width:
             faces = pixels.shape[0] // pixels.shape[1]
             parts = pixels.reshape(faces, -1, *pixels.shape[1:]) if faces > 1 else pixels[None]
-            parts = [np.asarray(Image.fromarray(part).resize((width, width), Image.Resampling.BOX)) for part in parts]
-            pixels = np.concatenate(parts)
+            smaller = [Image.fromarray(part).resize((width, width), Image.Resampling.BOX) for part in parts]
+            pixels = np.concatenate([np.asarray(part) for part in smaller])
         return self._upload(pixels)
 
     def _upload(self, pixels: np.ndarray):

@@ -74,7 +74,7 @@ class RendererCache:
     def get(self, record: SubsetRecord, backgrounds: str, device: str) -> tuple[Renderer, Any]:
         """As `renderer_for`."""
         setting = distractor_of(record.task, record.setting)
-        key = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
+        key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
         key += (backgrounds, record.split, device)
         if key not in self._made:
             for renderer, _ in self._made.values():
@@ -154,10 +154,10 @@ def paint(
         for first in range(0, len(seen), PAINT_FRAMES):
             e, r = episode[seen[first : first + PAINT_FRAMES]], row[seen[first : first + PAINT_FRAMES]]
             hidden[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view], hide_goal=True)[:, 0]
-        for (e, rows_of), before in zip(spans, shown, strict=True):
-            behind = hidden[e, rows_of[0]]
+        for (one, rows_of), before in zip(spans, shown, strict=True):
+            behind = hidden[one, rows_of[0]]
             covered = (behind != before).any(axis=-1, keepdims=True)
-            hidden[e, rows_of[1:]] = np.where(covered, behind, hidden[e, rows_of[1:]])
+            hidden[one, rows_of[1:]] = np.where(covered, behind, hidden[one, rows_of[1:]])
         yield hidden_name, hidden
 
 

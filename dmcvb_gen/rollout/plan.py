@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
@@ -19,7 +19,7 @@ from dmcvb_gen.pool import ignore
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs, part_of
 from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
-from dmcvb_gen.rollout.site import CONNECTIONS, FolderSite, Site
+from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment
@@ -28,7 +28,7 @@ from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
 from dmcvb_gen.store.writer import create_subset, finish_release, start_release
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
 
 
@@ -145,7 +145,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
     per_goal = request.episodes_per_goal
     goals = per_goal and request.episodes // per_goal
     if goals:
-        fixed_pairs(task.layout, goals, recipe.seed)
+        fixed_pairs(as_maze(task).layout, goals, recipe.seed)
     return SubsetRecord(
         name=request.name,
         task=request.task,
@@ -229,9 +229,9 @@ def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False,
         if not other_versions:
             check_versions(there)
     if isinstance(plan.site, FolderSite):
-        manifest = _prepare_folder(plan, there, expected_bytes, shared)
+        manifest = _prepare_folder(plan, plan.site.root, there, expected_bytes, shared)
     elif there is None:
-        manifest = _prepare_bucket(plan)
+        manifest = _prepare_bucket(plan, cast(BucketSite, plan.site))
     else:
         manifest = _unchanged(plan.site, there, plan.manifest)
     return replace(plan, manifest=manifest)
@@ -262,14 +262,15 @@ def check_versions(manifest: Manifest) -> None:
             )
 
 
-def _prepare_folder(plan: Plan, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
-    root = plan.site.root
-    same = there is not None and merged(there, plan.manifest, str(root)) is there
-    manifest = there if same and shared else start_release(root, plan.manifest)
-    free = os.statvfs(root)
-    if expected_bytes > free.f_bavail * free.f_frsize:
+def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
+    if there is not None and shared and merged(there, plan.manifest, str(root)) is there:
+        manifest = there
+    else:
+        manifest = start_release(root, plan.manifest)
+    free = shutil.disk_usage(root).free
+    if expected_bytes > free:
         raise StoreError(
-            f"about {expected_bytes / 1e9:.1f} GB are needed and {free.f_bavail * free.f_frsize / 1e9:.1f} GB are free "
+            f"about {expected_bytes / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free "
             f"at {root}; make room, choose another --out or fewer --episodes"
         )
     wanted = {record.name for job in plan.jobs for record in job.subsets}
@@ -280,12 +281,11 @@ def _prepare_folder(plan: Plan, there: Manifest | None, expected_bytes: float, s
     return manifest
 
 
-def _prepare_bucket(plan: Plan) -> Manifest:
+def _prepare_bucket(plan: Plan, site: BucketSite) -> Manifest:
     """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
-    site = plan.site
     with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
         root = Path(folder)
-        copy_inputs(root, plan.manifest.subsets, plan.inputs)
+        copy_inputs(root, plan.manifest.subsets, plan.inputs or {})
         create_groups(root, plan.manifest, plan.manifest.subsets)
         begun = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
         begun = {name: path for name, path in begun.items() if not Path(name).name.startswith(".")}
@@ -298,7 +298,7 @@ def _prepare_bucket(plan: Plan) -> Manifest:
         in_parallel(lambda piece: site.write(*piece), pieces, CONNECTIONS, ignore)
     if site.create(MANIFEST, json_bytes(plan.manifest)):
         return plan.manifest
-    return _unchanged(site, site.manifest(), plan.manifest)
+    return _unchanged(site, site.manifest() or plan.manifest, plan.manifest)
 
 
 def copy_inputs(root: Path, records: Iterable[SubsetRecord], inputs: Mapping[str, Inputs]) -> None:
@@ -389,5 +389,5 @@ def finish_site(site: Site, manifest: Manifest) -> Manifest:
         in_parallel(bring, small, CONNECTIONS, ignore)
         manifest = finish_release(mirror, manifest, commits)
         for name in (INDEX, MANIFEST):
-            site.write(name, (mirror / name).read_bytes())
+            cast(BucketSite, site).write(name, (mirror / name).read_bytes())
     return manifest

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.extras import installed
 from dmcvb_gen.names import ANT_MAZE, select
 from dmcvb_gen.store import Subset, open_release
 from dmcvb_gen.store.pictures import shown
@@ -16,7 +18,10 @@ from dmcvb_gen.store.remote import storage_errors
 
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
-VIDEO_SECONDS = 8.0
+VIDEO_FRAMES, VIDEO_FPS = 200, 20
+RAMP, RAMP_PLACES = ((60, 20, 90), (30, 145, 140), (250, 230, 40)), (0.0, 0.5, 1.0)
+"""Colors of distances to a goal, from the farthest to the nearest."""
+FORMATS = ("mp4", "webp", "gif")
 LABEL_HEIGHT = 14
 
 
@@ -38,13 +43,12 @@ def _top(subset: Subset) -> str:
 
 def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale: int) -> np.ndarray:
     """(step, h, w, 3): the top view under the distance field, with the path walked so far."""
-    from matplotlib import colormaps
-
     from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.ant_maze import as_maze
     from dmcvb_gen.tasks.ant_maze.distance import look_up, make_field
     from dmcvb_gen.tasks.ant_maze.layouts import CELL
 
-    task = get_task(subset.task)
+    task = as_maze(get_task(subset.task))
     frames = _enlarge(values[_top(subset)][steps], scale)
     size, reach = frames.shape[1], max(task.layout.shape) * CELL / 2  # the outer walls end at the edge
     place = (np.arange(size) + 0.5) / size * 2 * reach - reach
@@ -53,11 +57,12 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
     state = values["state"]
     goal = state[0, task.state_slices["target_position"]]
     field = make_field(task.reward, task.layout, goal)
-    floor = np.kron(~task.layout.walls, np.ones((10, 10)))
+    floor = np.kron((~task.layout.walls).astype(float), np.ones((10, 10)))
     stacked = np.broadcast_to(field.values, (len(where), *field.values.shape))
     distance = look_up("geodesic", task.layout, stacked, where) / field.largest
     open_ = look_up("geodesic", task.layout, np.broadcast_to(floor, stacked.shape), where) > 0.5
-    colors = (colormaps["viridis"](1 - distance)[:, :3] * 255).reshape(size, size, 3)
+    near = [np.interp(1 - distance, RAMP_PLACES, channel) for channel in zip(*RAMP, strict=True)]
+    colors = np.stack(near, axis=-1).reshape(size, size, 3)
     blend = np.where(open_.reshape(size, size, 1), 0.45, 0.0)
     frames = (frames * (1 - blend) + colors * blend).astype(np.uint8)
     position = state[:, task.state_slices["walker_position"]][:, :2]
@@ -109,7 +114,7 @@ def contact_sheet(
     return np.concatenate(strips)
 
 
-def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = 200) -> np.ndarray:
+def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = VIDEO_FRAMES) -> np.ndarray:
     """The first episode of every subset side by side; (frame, height, width, 3) uint8."""
     columns = []
     for subset in subsets:
@@ -123,7 +128,7 @@ def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = 200) -
         picture = np.concatenate(rows, axis=1)
         label = _label(subset.name, picture.shape[2])
         columns.append(np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1))
-    per_row = max(1, int(np.ceil(np.sqrt(len(columns) * 1.5))))
+    per_row = min(len(columns), int(np.ceil(np.sqrt(len(columns) * 1.5))))
     height = max(column.shape[1] for column in columns)
     width = max(column.shape[2] for column in columns)
     columns = [
@@ -143,23 +148,28 @@ def write_preview(
     only: Sequence[str] = (),
     episodes: int = 4,
     scale: int = 2,
-    gif: bool = False,
+    frames: int = VIDEO_FRAMES,
+    video: str | None = None,
 ) -> list[Path]:
-    """Write contact_sheet.png and preview.mp4 (or .gif) of a release.
+    """Write contact_sheet.png and preview.mp4 (or .webp, .gif) of a release.
 
     Args:
       out: folder of the files; `<release>/preview` by default.
       only: subset patterns.
       episodes: of each subset on the sheet.
+      frames: of the video, 20 a second.
+      video: "mp4", "webp" or "gif"; by default mp4 where imageio-ffmpeg is installed, else webp.
 
     Returns:
       The files.
 
     Raises:
       StoreError: the release has no episodes yet, or the folder cannot be written.
+      UnknownNameError: no such kind of video.
     """
-    import imageio.v3 as iio
-
+    kind = video or ("mp4" if installed("imageio_ffmpeg") else "webp")
+    if kind not in FORMATS:
+        raise UnknownNameError("kind of video", kind, FORMATS)
     release = open_release(path)
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
@@ -170,11 +180,25 @@ def write_preview(
         folder.mkdir(parents=True, exist_ok=True)
         sheet = folder / "contact_sheet.png"
         Image.fromarray(contact_sheet(subsets, episodes, scale=scale)).save(sheet)
-        frames = video_frames(subsets, scale)
-        video = folder / ("preview.gif" if gif else "preview.mp4")
-        if gif:
-            iio.imwrite(video, frames, duration=1000 / 20, loop=0)
-        else:
-            frames = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)))
-            iio.imwrite(video, frames, plugin="FFMPEG", fps=20, macro_block_size=2, quality=8)
-    return [sheet, video]
+        moving = folder / f"preview.{kind}"
+        (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames))
+    return [sheet, moving]
+
+
+def _write_animation(path: Path, frames: np.ndarray) -> None:
+    """(frame, height, width, 3) uint8 as a WebP or GIF."""
+    first, *rest = [Image.fromarray(frame) for frame in frames]
+    options: dict[str, Any] = {"quality": 80, "method": 4} if path.suffix == ".webp" else {}
+    first.save(path, save_all=True, append_images=rest, duration=1000 // VIDEO_FPS, loop=0, **options)
+
+
+def _write_mp4(path: Path, frames: np.ndarray) -> None:
+    import imageio_ffmpeg
+
+    even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)))
+    size = even.shape[2], even.shape[1]
+    encoder = imageio_ffmpeg.write_frames(str(path), size, fps=VIDEO_FPS, quality=8, macro_block_size=2)
+    encoder.send(None)
+    for frame in even:
+        encoder.send(np.ascontiguousarray(frame))
+    encoder.close()

@@ -332,7 +332,8 @@ class Stage:
     """This process's folder to make a site's shards in; what killed processes of this machine left beside it goes."""
 
     def __init__(self, site: Site):
-        self._site, self._inputs, self._exit = site, {}, contextlib.ExitStack()
+        self._site, self._exit = site, contextlib.ExitStack()
+        self._inputs: dict[str, Inputs] = {}
         parent = site.workshop
         with storage_errors(parent, "write to"):
             parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from dmcvb_gen.rollout.site import Site, stage_of
 from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, commit_path, environment
 from dmcvb_gen.store.writer import write_shard
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_
     """
     record = job.subsets[0]
     task = get_task(record.task)
-    pairs = fixed_pairs(task.layout, record.fixed_goals, job.seed) if record.fixed_goals else None
+    pairs = fixed_pairs(as_maze(task).layout, record.fixed_goals, job.seed) if record.fixed_goals else None
     return simulate(
         task,
         load_policies(job),

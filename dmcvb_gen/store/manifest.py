@@ -207,7 +207,7 @@ def environment(device: str = "cpu") -> dict[str, str]:
 
 @functools.cache
 def _environment(device: str) -> dict[str, str]:
-    packages = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
+    packages: tuple[str, ...] = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
     packages += ("mujoco-warp", "warp-lang") if device != "cpu" else ()
     versions = {name: version for name in packages if (version := _version(name))}
     return {

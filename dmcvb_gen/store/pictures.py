@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.errors import UnknownNameError
 
@@ -92,7 +92,8 @@ def shown(subset: Subset | SubsetRecord, views: Sequence[str] | None = None) -> 
     Raises:
       UnknownNameError: no such view.
     """
-    record = getattr(subset, "record", subset)
+    found: Any = subset
+    record: SubsetRecord = getattr(found, "record", found)
     return Pictures(record.views, record.hidden_goal).select(views)
 
 

@@ -108,7 +108,7 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
         name = error.name or reason(error)
         return f"{name.split('.')[0]} is needed for {place} and not installed: pip install {name.split('.')[0]}"
     number = error.errno if isinstance(error, OSError) else None
-    if number in NO_ROOM:
+    if isinstance(error, OSError) and number in NO_ROOM:
         return f"no room to {doing} {place} ({error.strerror}); make room and run the same command again"
     if writing and not remote and isinstance(error, OSError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}; choose a writable --out"

@@ -162,7 +162,7 @@ def picture_codecs(layout: str) -> dict[str, Any]:
     width_last = TransposeCodec(order=(0, 1, 4, 2, 3))
     channel_first = TransposeCodec(order=(0, 4, 1, 2, 3))
     delta = numcodecs.Delta(dtype="|u1")
-    layouts = {
+    layouts: dict[str, dict[str, Any]] = {
         "zstd": dict(filters=(), compressors=(ZstdCodec(level=3),)),
         "blosc-bitshuffle": dict(
             filters=(), compressors=(BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle", typesize=1),)

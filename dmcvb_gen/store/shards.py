@@ -33,6 +33,7 @@ def chosen_shards(
             if episodes is None or (first < episodes[1] and episodes[0] < last):
                 chosen[record.name, shard] = record
     if not chosen:
-        most = max(record.episodes for record in manifest.subsets)
-        raise StoreError(f"no subset has episodes {episodes[0]}:{episodes[1]}; the longest has 0:{most}")
+        most = max((record.episodes for record in manifest.subsets), default=0)
+        first, last = episodes or (0, most)
+        raise StoreError(f"no subset has episodes {first}:{last}; the longest has 0:{most}")
     return chosen

@@ -46,13 +46,15 @@ def retry(place: str, path: str, attempt):
     """
     import tenacity  # only where something is sent or fetched
 
+    def said(state: tenacity.RetryCallState) -> None:
+        error = state.outcome and state.outcome.exception()
+        log.info("try %d of %s failed: %s", state.attempt_number, path, error and reason(error))
+
     attempts = tenacity.Retrying(
         stop=tenacity.stop_after_attempt(ATTEMPTS),
         wait=tenacity.wait_exponential(multiplier=PAUSE, min=0),
         retry=tenacity.retry_if_exception(_may_pass),
-        before_sleep=lambda state: log.info(
-            "try %d of %s failed: %s", state.attempt_number, path, reason(state.outcome.exception())
-        ),
+        before_sleep=said,
         reraise=True,
     )
     try:
@@ -230,8 +232,9 @@ def in_parallel(work, items, workers: int, tick) -> list:
         while waiting:
             done, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
             for future in done:
-                if future.exception():
+                error = future.exception()
+                if error:
                     pool.shutdown(wait=True, cancel_futures=True)
-                    raise future.exception()
+                    raise error
                 tick(future.result())
     return [future.result() for future in futures]

@@ -157,7 +157,8 @@ def _write_metadata(path: Path, specs: tuple[ArraySpec, ...], attributes: dict, 
     """Put a group's metadata in place file by file, beside chunks that may be there; `keep` what is there."""
     with tempfile.TemporaryDirectory() as folder:
         group = zarr.create_group(folder, attributes=attributes, overwrite=True)
-        create_arrays(group, specs, *shape, schema_version=attributes.get("schema_version", SCHEMA_VERSION))
+        version = attributes.get("schema_version", SCHEMA_VERSION)
+        create_arrays(group, specs, *shape, schema_version=version)  # type: ignore[misc]
         zarr.consolidate_metadata(folder)
         for source in sorted(Path(folder).rglob("zarr.json"), key=lambda file: -len(file.parts)):
             target = path / source.relative_to(folder)
@@ -282,7 +283,9 @@ def find_array(group: zarr.Group, name: str) -> tuple[zarr.Array, str]:
     """An array by its name, and its path, in the layout that the group has."""
     path = stored_name(name)
     path = path if path in group else name
-    return group[path], path
+    array = group[path]
+    assert isinstance(array, zarr.Array)
+    return array, path
 
 
 def read_commits(root: Path, subset: SubsetRecord) -> dict[int, CommitRecord]:

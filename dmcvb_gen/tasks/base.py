@@ -19,6 +19,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from dmcvb_gen import arithmetic
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import LOCOMOTION
 
 ACTION_REPEAT = 2
@@ -192,6 +193,19 @@ class EpisodeBatch(abc.ABC):
             self._initialize(ids, generators)
         return self.state()
 
+    def reset_fixed(
+        self,
+        generators: Sequence[np.random.Generator],
+        pairs: Sequence[tuple],
+        ids: np.ndarray | Sequence[int] | None = None,
+    ) -> np.ndarray:
+        """As `reset`, at given (start, goal) cells: mazes have them.
+
+        Raises:
+          DmcvbError: the task has no goals.
+        """
+        raise DmcvbError(f"{self.task.id} has no cells to start at; give an ant-maze task")
+
     def step(self, actions: np.ndarray, active: np.ndarray | None = None) -> StepResult:
         """One agent step.
 
@@ -253,7 +267,8 @@ class EpisodeBatch(abc.ABC):
 
 def physics_columns(model: mujoco.MjModel) -> np.ndarray:
     """Indices of the `PHYSICS_SPEC` components inside a state vector of `mjSTATE_INTEGRATION`."""
-    columns, offset = [], 0
+    columns: list[int] = []
+    offset = 0
     for bit in range(32):
         component = 1 << bit
         if not component & int(mujoco.mjtState.mjSTATE_INTEGRATION):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,7 +24,9 @@ class _KeptBatch:
     def __init__(self, task: Task):
         self._model, self._columns = task.model, physics_columns(task.model)
         self._lock = threading.Lock()  # the simulations are one caller's until it has copied its poses
-        self._size, self._batch, self._bound = 0, None, {}
+        self._size = 0
+        self._batch: Any = None
+        self._bound: dict[str, Any] = {}
 
     def __call__(self, physics: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
         with self._lock:

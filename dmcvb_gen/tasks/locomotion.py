@@ -26,7 +26,9 @@ def _suite_model(domain: str) -> mujoco.MjModel:
 
     The XML files are read in place: importing `dm_control.suite` would load every domain and a GL library.
     """
-    suite = Path(importlib.util.find_spec("dm_control").submodule_search_locations[0]) / "suite"
+    found = importlib.util.find_spec("dm_control")
+    assert found and found.submodule_search_locations  # a dependency of ours, and a package
+    suite = Path(found.submodule_search_locations[0]) / "suite"
     assets = {f"./common/{path.name}": path.read_bytes() for path in (suite / "common").glob("*.xml")}
     mujoco.set_mju_user_warning(lambda message: None)  # an attribute of the cheetah's file is deprecated
     try:

@@ -14,7 +14,9 @@ import pytest
 ROOT = Path(__file__).parents[2]
 READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "filelock", "tenacity", "h5py")
 """What one who only reads, fetches and exports to HDF5 installs (each brings what it needs)."""
-HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "mujoco_warp", "warp")
+HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "jinja2", "mujoco_warp", "warp")
+HEAVY += ("matplotlib", "imageio", "imageio_ffmpeg", "xarray", "pandas")
+"""What the core does without."""
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +108,7 @@ def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
     assert refused.returncode == 2 and "pip install" in refused.stderr and "Traceback" not in refused.stderr
 
 
-def test_rolling_out_needs_neither_torch_nor_warp(tmp_path):
+def test_the_core_makes_and_shows_data_without_any_extra(tmp_path):
     code = f"""
 import sys
 
@@ -126,7 +128,10 @@ main(sys.argv[1:], prog_name="dmcvb-gen")
 
     small = ["--episodes", "1", "--max-steps", "4", "--size", "16", "--level", "expert"]
     for task in ("walker-walk", "ant-maze-empty7x7"):
-        for done in (command("rollout", task, *small, "--out", task), command("info", task)):
+        commands = (["rollout", task, *small, "--out", task], ["info", task], ["preview", task])
+        for done in [command(*asked) for asked in commands]:
             assert done.returncode == 0, done.stderr
-    refused = command("train-behaviour", "walker-walk")
-    assert refused.returncode == 2 and "pip install torch" in refused.stderr
+        assert (tmp_path / task / "preview/preview.webp").exists()
+    for asked, package in (("train-behaviour", "torch"), ("show-maze", "matplotlib")):
+        refused = command(asked, "walker-walk" if package == "torch" else "easy7x7a")
+        assert refused.returncode == 2 and f"pip install {package}" in refused.stderr, refused.stderr

@@ -98,7 +98,7 @@ class Policy:
     def heading(self, observation: np.ndarray) -> np.ndarray:
         """(n, observation) -> (n, 2) float32 meters: where a policy that knows the way heads, seen from the ant."""
         x = places(np.asarray(observation)) / PLACE_SCALE
-        last = 2 * len(self.header.way)
+        last = 2 * len(self.header.way or ())
         for place in range(0, last, 2):
             x = np.maximum(self._dense(f"way.{place}", x), np.float32(0))
         return self._dense(f"way.{last}", x)
@@ -150,7 +150,9 @@ class Policy:
         """
         features = self._features(observation)
         mean = self._dense("mean", features).astype(np.float64)
-        noise = 0.0 if deterministic else self._std(features, mean) * _noise(generators, mean.shape[1])
+        noise = np.zeros_like(mean)
+        if not deterministic:
+            noise = self._std(features, mean) * _noise(generators or (), mean.shape[1])
         if self.header.distribution == "gaussian":
             action = np.clip(mean + noise, -1, 1)
         elif self.header.distribution == "deterministic":
@@ -170,7 +172,8 @@ class RandomPolicy(Policy):
     """Actions uniform in [-1, 1] (level "random"); there is no mean action of these, they are always drawn."""
 
     def __init__(self, action_size: int):
-        self.header, self.weights, self.digest, self._action_size = None, {}, "random", action_size
+        self.header = None  # type: ignore[assignment]  # no file, so no header
+        self.weights, self.digest, self._action_size = {}, "random", action_size
 
     def act(self, observation, generators=None, deterministic=False):
         draws = [rng.random(self._action_size, np.float32) for rng in generators]

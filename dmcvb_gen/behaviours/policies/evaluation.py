@@ -29,6 +29,7 @@ def evaluate(
         threads=threads,
     )
     returns = out.returns
+    lowest, lower, middle, upper, highest = map(float, np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)))
     success, speed = maze_scores(task, out)
     return (
         Evaluation(
@@ -37,7 +38,7 @@ def evaluate(
             episodes=episodes,
             mode="mean" if deterministic else "sampled",
             seed=seed,
-            quartiles=tuple(float(value) for value in np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))),
+            quartiles=(lowest, lower, middle, upper, highest),
             success=success,
             speed=speed,
         ),

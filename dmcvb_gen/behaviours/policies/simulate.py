@@ -75,10 +75,10 @@ def _actions(
       (size, action) float32.
     """
     actions = np.zeros((len(observations), action_size), np.float32)
-    for index in np.unique(assigned):
+    for index in np.unique(assigned).tolist():
         rows = np.flatnonzero(active & (assigned == index))
         if len(rows):
-            streams = [generators[row] for row in rows]
+            streams = [generators[int(row)] for row in rows]
             actions[rows] = policies[index].act(observations[rows], streams, deterministic)
     return actions
 
@@ -125,19 +125,23 @@ def simulate(
       goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
       max_steps: agent steps at which an episode ends, if not the task's time limit.
     """
-    episodes = np.asarray(episodes, int)
-    size, limit = len(episodes), max_steps or task.max_steps
+    chosen = np.asarray(episodes, int)
+    size, limit = len(chosen), max_steps or task.max_steps
     starts, noise = (
-        [episode_stream(seed, names, int(i), name) for i in episodes] for name in ("initial_state", "policy")
+        [episode_stream(seed, names, int(i), name) for i in chosen] for name in ("initial_state", "policy")
     )
-    behaviour = (episodes % len(policies)).astype(np.int16)
-    pair = np.full(size, -1, np.int16) if goal_pairs is None else (episodes // episodes_per_goal).astype(np.int16)
-    out = _empty(task, episodes, limit)
+    behaviour = (chosen % len(policies)).astype(np.int16)
+    pair = np.full(size, -1, np.int16)
+    if goal_pairs is not None:
+        pair[:] = chosen // (episodes_per_goal or 1)
+    out = _empty(task, chosen, limit)
     out.behaviour[:], out.goal_pair[:] = behaviour, pair
-    out.seed[:] = [episode_seed(seed, names, int(i)) for i in episodes]
+    out.seed[:] = [episode_seed(seed, names, int(i)) for i in chosen]
     started = time.perf_counter()
     batch = task.batch(size, threads)
-    state = batch.reset(starts) if goal_pairs is None else batch.reset_fixed(starts, [goal_pairs[k] for k in pair])
+    state = (
+        batch.reset(starts) if goal_pairs is None else batch.reset_fixed(starts, [goal_pairs[k] for k in pair.tolist()])
+    )
     out.seconds["physics"] += time.perf_counter() - started
     active = np.ones(size, bool)
     for step in range(limit + 1):

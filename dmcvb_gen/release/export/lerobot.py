@@ -41,7 +41,8 @@ def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     """
     layout = _Layout(sources, video)
     (folder / "meta").mkdir()
-    files, statistics, rows, index = _Files(folder, layout), _Statistics(), [], 0
+    files, statistics, index = _Files(folder, layout), _Statistics(), 0
+    rows: list[dict[str, Any]] = []
     for source in sources:
         task = layout.tasks.index(_task_text(source))
         for episode in source:
@@ -134,8 +135,13 @@ class _Layout:
         self.features = self._features(first)
 
     def _features(self, source: Source) -> dict[str, Any]:
-        task, scalar = get_task(source.subset.task), {"shape": [1], "names": None}
-        picture = {"dtype": "image", "shape": [self.size, self.size, 3], "names": ["height", "width", "channel"]}
+        task = get_task(source.subset.task)
+        scalar: dict[str, Any] = {"shape": [1], "names": None}
+        picture: dict[str, Any] = {
+            "dtype": "image",
+            "shape": [self.size, self.size, 3],
+            "names": ["height", "width", "channel"],
+        }
         if self.video:
             picture |= {"dtype": "video", "info": self._video_info()}
         state = [f"{field}.{i}" for field, size in task.state_fields.items() for i in range(size)]
@@ -178,7 +184,9 @@ class _Layout:
 
     def schema(self) -> pa.Schema:
         """Of the data tables, with what Hugging Face's `datasets` wants to know."""
-        fields, huggingface = [], {}
+        fields: list[pa.Field] = []
+        huggingface: dict[str, Any] = {}
+        told: dict[str, Any]
         for name, feature in self.features.items():
             if feature["dtype"] == "video":
                 continue
@@ -206,7 +214,7 @@ class _Files:
 
     def __init__(self, folder: Path, layout: _Layout):
         self._folder, self._layout, self._schema = folder, layout, layout.schema()
-        self._table: pq.ParquetWriter | None = None
+        self._table: Any = None
         self._videos: dict[str, Any] = {}
         self._frames = 0
 
@@ -288,7 +296,8 @@ class _Statistics:
 
     def add(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> dict[str, list]:
         """Take an episode up; gives its own statistics as columns "stats/<feature>/<statistic>"."""
-        flat = {}
+        flat: dict[str, list] = {}
+        shape: tuple[int, ...]
         for name, value in (columns | pictures).items():
             if name in pictures:  # a number a channel, in [0, 1]
                 value, shape = value.reshape(-1, 3) / 255.0, (3, 1, 1)

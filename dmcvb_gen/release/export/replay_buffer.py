@@ -36,8 +36,10 @@ def write(source: Source, folder: Path) -> None:
                     dtype=value.dtype,
                     compressors=Blosc(cname="zstd", clevel=5, shuffle=Blosc.BITSHUFFLE),
                 )
-            data[name].resize((before + length, *value.shape[1:]))
-            data[name][before:] = value
+            stored = data[name]
+            assert isinstance(stored, zarr.Array)
+            stored.resize((before + length, *value.shape[1:]))
+            stored[before:] = value
         ends.append(before + length)
-    stored = meta.create_array("episode_ends", shape=(len(ends),), chunks=(max(len(ends), 1),), dtype="int64")
-    stored[:] = np.array(ends)
+    where = meta.create_array("episode_ends", shape=(len(ends),), chunks=(max(len(ends), 1),), dtype="int64")
+    where[:] = np.array(ends)

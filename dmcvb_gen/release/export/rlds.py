@@ -31,17 +31,12 @@ def write(source: Source, folder: Path) -> None:
     target = folder / version
     target.mkdir()
     count = -(-len(source.episodes) // EPISODES_PER_FILE)
-    lengths, size, file = [0] * count, 0, None
+    lengths, size = [0] * count, 0
     for number, episode in enumerate(source):
         shard = number // EPISODES_PER_FILE
-        if number % EPISODES_PER_FILE == 0:
-            if file:
-                file.close()
-            file = (target / f"{name}-train.tfrecord-{shard:05d}-of-{count:05d}").open("wb")
-        size += file.write(record(encode_example(_example(source, episode))))
+        with (target / f"{name}-train.tfrecord-{shard:05d}-of-{count:05d}").open("ab") as file:
+            size += file.write(record(encode_example(_example(source, episode))))
         lengths[shard] += 1
-    if file:
-        file.close()
     info = {
         "name": name,
         "version": version,

@@ -6,6 +6,7 @@ Both align as dm_env does: row t holds observation t and the action, reward and 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +64,8 @@ def write_npz(source: Source, folder: Path) -> None:
     `state` float32, `is_first`, `is_last`, `is_terminal` bool."""
     for episode in source:
         rows = episode.length + 1
-        np.savez_compressed(folder / f"{episode.index:06d}-{rows}.npz", **_flags(episode), **_arrays(episode))
+        arrays: dict[str, Any] = _flags(episode) | _arrays(episode)
+        np.savez_compressed(folder / f"{episode.index:06d}-{rows}.npz", **arrays)
 
 
 def _arrays(episode: ExportEpisode) -> dict[str, np.ndarray]:

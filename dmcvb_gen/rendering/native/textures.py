@@ -25,7 +25,8 @@ def level_sizes(width: int, height: int) -> list[tuple[int, int]]:
     """(width, height) of every level, down to one texel."""
     sizes = [(width, height)]
     while max(sizes[-1]) > 1:
-        sizes.append(tuple(max(1, side // 2) for side in sizes[-1]))
+        width, height = max(1, width // 2), max(1, height // 2)
+        sizes.append((width, height))
     return sizes
 
 
@@ -61,7 +62,8 @@ _LINEAR_OF = _linear_light(np.arange(256, dtype=np.float32)).astype(np.float32)
 
 def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) -> list[np.ndarray]:
     """(h, w, 3) uint8 -> its mip levels, each uint8; sRGB ones as linear light in [0, 255]."""
-    out, current = [], picture
+    out: list[np.ndarray] = []
+    current = picture
     for width, height in level_sizes(picture.shape[1], picture.shape[0])[:count]:
         if out:
             source = _LINEAR_OF[current] if srgb else current.astype(np.float32)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import re
 
-from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.tasks.ant_maze.distance import REWARDS
 from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, load_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import AntMaze
+from dmcvb_gen.tasks.base import Task
 
 PREFIX = "ant-maze-"
 ANT_MAZE_TASKS = tuple(PREFIX + name for name in LAYOUTS)
@@ -34,6 +35,17 @@ def ant_maze_task(task_id: str) -> AntMaze:
     return AntMaze(layout, reward, task_id)
 
 
+def as_maze(task: Task) -> AntMaze:
+    """A task that must be a maze, with its layout and its reward.
+
+    Raises:
+      DmcvbError: it is none.
+    """
+    if not isinstance(task, AntMaze):
+        raise DmcvbError(f"{task.id} is no maze; give one of {', '.join(ANT_MAZE_TASKS)} or a layout of your own")
+    return task
+
+
 def layout_task_id(path) -> str:
     """The task id that carries the layout of a text file.
 
@@ -49,6 +61,7 @@ __all__ = [
     "LAYOUTS",
     "AntMaze",
     "ant_maze_task",
+    "as_maze",
     "fixed_pairs",
     "layout_task_id",
 ]

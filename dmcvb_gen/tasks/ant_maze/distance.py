@@ -83,7 +83,7 @@ def saturated_field(layout: Layout, goal_cell: tuple[int, int]) -> DistanceField
 def geodesic_field(layout: Layout, goal: np.ndarray) -> DistanceField:
     """The shortest path's length, meters, from the goal's position (x, y)."""
     floor, _, _ = _floor(layout)
-    centers = (np.stack(np.indices(floor.shape), axis=-1) + 0.5) / PIXELS - 0.5
+    centers = (np.moveaxis(np.indices(floor.shape), 0, -1) + 0.5) / PIXELS - 0.5
     away = np.linalg.norm(layout.world(centers) - np.asarray(goal)[:2], axis=-1)
     start = 2 * CELL / PIXELS  # straight lines this near: a wave from a single pixel would be square
     times = skfmm.travel_time(np.ma.MaskedArray(away - start, ~floor), np.ones_like(away), dx=CELL / PIXELS)
@@ -97,7 +97,8 @@ def make_field(reward: str, layout: Layout, goal: np.ndarray) -> DistanceField:
       UnknownNameError: no such measure.
       LayoutError: the goal is in a wall.
     """
-    cell = tuple(int(index) for index in np.rint(layout.grid(np.asarray(goal)[:2])))
+    row, column = np.rint(layout.grid(np.asarray(goal)[:2])).astype(int).tolist()
+    cell = row, column
     if reward == "saturated":
         return saturated_field(layout, cell)
     if reward == "geodesic":

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from dmcvb_gen.errors import LayoutError
@@ -56,12 +57,12 @@ class Layout:
     @functools.cached_property
     def free(self) -> tuple[tuple[int, int], ...]:
         """(row, column) of every floor cell, in reading order."""
-        return tuple(map(tuple, np.argwhere(~self.walls).tolist()))
+        return tuple((row, column) for row, column in np.argwhere(~self.walls).tolist())
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows, columns."""
-        return self.walls.shape
+        return len(self.rows), len(self.rows[0])
 
     @property
     def entity_layer(self) -> str:
@@ -73,10 +74,11 @@ class Layout:
         """Rows joined by "/"."""
         return "/".join(self.rows)
 
-    def world(self, cells: np.ndarray) -> np.ndarray:
+    def world(self, cells: ArrayLike) -> np.ndarray:
         """(..., row and column) -> (..., x and y) of the cells' centers, meters."""
-        cells, (rows, columns) = np.asarray(cells, float), self.shape
-        return np.stack([(cells[..., 1] - (columns - 1) / 2) * CELL, ((rows - 1) / 2 - cells[..., 0]) * CELL], axis=-1)
+        (rows, columns), places = self.shape, np.asarray(cells, float)
+        x, y = (places[..., 1] - (columns - 1) / 2) * CELL, ((rows - 1) / 2 - places[..., 0]) * CELL
+        return np.stack([x, y], axis=-1)
 
     def grid(self, positions: np.ndarray) -> np.ndarray:
         """(..., x and y) meters -> (..., row and column), whole numbers at the cells' centers."""

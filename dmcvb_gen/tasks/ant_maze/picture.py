@@ -48,7 +48,7 @@ def save_paths_picture(layout: Layout, panels: dict[str, list[tuple[np.ndarray, 
             color = colormaps["tab10"](number % 10)
             axis.plot(*path.T, color=color, linewidth=1.2)
             axis.plot(*path[0], "o", color=color)
-            axis.add_patch(Circle(goal, GOAL_RADIUS, color=color, fill=False, linewidth=2))
+            axis.add_patch(Circle(tuple(goal), GOAL_RADIUS, color=color, fill=False, linewidth=2))
         axis.set_title(title)
         axis.set_xlabel("x (m)")
     axes[0].set_ylabel("y (m)")

@@ -79,6 +79,8 @@ What is left out follows from the joints, or is noise (the accelerometer).
 
 
 class AntMazeBatch(EpisodeBatch):
+    task: AntMaze
+
     def __init__(self, task: AntMaze, size: int, threads: int = 1):
         super().__init__(task, size, threads)
         bind, model = self.sims.bind, task.model
@@ -103,7 +105,7 @@ class AntMazeBatch(EpisodeBatch):
         shape = tuple(10 * cells for cells in task.layout.shape)
         self._fields, self._largest = np.zeros((size, *shape)), np.ones(size)
         self._touched = np.zeros(size, bool)
-        self._paths = None
+        self._paths: np.ndarray | None = None
 
     # -- starting -----------------------------------------------------------------------------
 
@@ -116,7 +118,10 @@ class AntMazeBatch(EpisodeBatch):
         self._refresh(ids)
 
     def reset_fixed(
-        self, generators: Sequence[np.random.Generator], pairs: Sequence[tuple], ids: np.ndarray | None = None
+        self,
+        generators: Sequence[np.random.Generator],
+        pairs: Sequence[tuple],
+        ids: np.ndarray | Sequence[int] | None = None,
     ) -> np.ndarray:
         """Start episodes at given (start, goal) cells; offsets and yaw are drawn as ever.
 
@@ -213,6 +218,7 @@ class AntMazeBatch(EpisodeBatch):
     def path_length(self) -> np.ndarray:
         """(size,): length of the shortest path to the goal's center, meters; 0 once it is touched."""
         position = self._xpos[:, self._torso, :2]
+        assert self._paths is not None  # `track_paths` came first
         return np.where(self._touched, 0.0, look_up("geodesic", self.task.layout, self._paths, position))
 
     def state(self):
@@ -292,7 +298,7 @@ class AntMaze(Task):
         return build_arena(self.layout).model
 
     @functools.cached_property
-    def goal_geoms(self):
+    def goal_geoms(self) -> tuple[int, ...]:  # type: ignore[override]
         return (build_arena(self.layout).goal_geom,)
 
     def styles(self, split):
