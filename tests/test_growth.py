@@ -9,7 +9,8 @@ import pytest
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.card import write_card
-from dmcvb_gen.release.publish import fetch, publish
+from dmcvb_gen.release.fetch import fetch
+from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.store import open_release

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -151,10 +152,11 @@ def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
 
 def test_painted_episodes_are_kept_while_there_is_room(made):
     subset = next(iter(dmcvb_gen.open(str(made / "light"), paint=True).subsets.values()))
-    assert subset.painted(0) is subset.painted(0)
+    name = subset.picture_names[0]
+    assert subset.painted(0, [name])[name] is subset.painted(0)[name]
     subset.painting.__dict__["cache_bytes"] = 1
-    first = subset.painted(1)
-    assert subset.painted(2) is not None and subset.painted(1) is not first
+    first = subset.painted(1, [name])[name]
+    assert subset.painted(2) and subset.painted(1, [name])[name] is not first
 
 
 def test_a_torch_loader_with_workers_paints(made):
@@ -186,3 +188,132 @@ def test_a_release_travels_without_pictures_and_is_painted_where_it_arrives(made
     part = run("fetch", url, "--episodes", "0:1", "--paint", "--out", tmp_path / "part")
     assert part.exit_code == 0, part.output
     assert all(list(s.episodes) == [0, 1] and s.pixel_arrays for s in open_release(tmp_path / "part").subsets.values())
+
+
+@pytest.fixture(scope="module")
+def published(made):
+    """The URL of the painted release without its pictures, whose digests are known."""
+    url = f"file:{made / 'there'}"
+    assert run("publish", made / "painted", url, "--no-pixels").exit_code == 0
+    return url
+
+
+def test_a_light_release_is_validated_as_the_painted_one(made, tmp_path):
+    curves = {}
+    for which in ("light", "painted"):
+        out = tmp_path / which
+        result = run("validate", made / which, "--agents", "bc", "--threads", 1, "--out", out, "--json")
+        assert result.exit_code == 0, result.output
+        facts = json.loads((out / "report.json").read_text())
+        curves[which] = [(cell["id"], cell["curve"][0]["loss"], cell["score"]["returns"]) for cell in facts["results"]]
+    assert curves["light"] == curves["painted"] and curves["light"]
+
+
+def test_other_sizes_views_and_goals_make_an_honest_other_release(made, published, tmp_path):
+    maze = "maze" in str(made)
+    choice = ["--views", "egocentric,top", "--goal", "hidden"] if maze else []
+    assert run("fetch", published, "--episodes", "0:1", "--out", tmp_path / "small").exit_code == 0
+    result = run("paint", tmp_path / "small", "--size", 48, *choice, "--json")
+    assert result.exit_code == 0 and json.loads(result.stdout)["known"] == 0, result.output
+    again = run("fetch", published, "--paint", "--size", 48, *choice, "--out", tmp_path / "small", "--json")
+    assert again.exit_code == 0 and json.loads(again.stdout)["shards"] == 2, again.output
+    release, whole = open_release(tmp_path / "small"), open_release(made / "painted")
+    manifest = release.manifest
+    assert manifest.complete and manifest.name == whole.manifest.name + "-repainted"
+    assert [entry["kind"] for entry in manifest.lineage] == ["repaint"]
+    assert manifest.lineage[0]["from"].startswith(whole.manifest.name) and manifest.lineage[0]["size"] == 48
+    assert run("verify", tmp_path / "small").exit_code == 0
+    name = next(iter(release.subsets))
+    assert run("regenerate", tmp_path / "small", "--check", "--only", name, "--episodes", "0:1").exit_code == 0
+    fresh = dmcvb_gen.open(str(made / "painted"), paint=True, size=48)
+    names = {"pixels_hidden_goal/egocentric", "pixels_hidden_goal/top"} if maze else {"pixels"}
+    for name, subset in dmcvb_gen.open(str(tmp_path / "small")).subsets.items():
+        assert set(subset.pixel_arrays) == names
+        assert all(np.array_equal(subset.read(array), fresh[name].read(array)) for array in names)
+        assert next(iter(subset.batches(2)))["pixels"].shape[-2:] == (48, 48)
+    other = run("paint", tmp_path / "small", "--size", 40)
+    assert other.exit_code == 2 and "48 pixels a side" in other.output
+
+
+def test_views_alone_keep_the_digests_that_are_known(made, published, tmp_path):
+    choice = ["--views", "top"] if "maze" in str(made) else ["--views", "pixels"]
+    result = run("fetch", published, "--paint", *choice, "--out", tmp_path / "r", "--json")
+    told = json.loads(result.stdout)
+    assert result.exit_code == 0 and told["known"] == told["shards"] == 4, result.output
+    assert run("paint", tmp_path / "r", "--views", "nowhere").exit_code == 2
+    if "maze" not in str(made):
+        refused = run("paint", tmp_path / "r", "--goal", "hidden")
+        assert refused.exit_code == 2 and "ant-maze" in refused.output
+
+
+def test_what_was_painted_stays_when_more_is_fetched(made, published, tmp_path):
+    def of_shard(root, shard):
+        found = {path: path.stat().st_mtime_ns for path in root.rglob("*") if f"/c/{shard}" in str(path)}
+        return {path: time for path, time in found.items() if path.is_file()}
+
+    assert run("fetch", published, "--episodes", "0:1", "--paint", "--out", tmp_path / "r").exit_code == 0
+    before = of_shard(tmp_path / "r", 0)
+    more = run("fetch", published, "--out", tmp_path / "r")
+    assert more.exit_code == 0 and before == of_shard(tmp_path / "r", 0), more.output
+    subset = next(iter(open_release(tmp_path / "r").subsets.values()))
+    assert subset.unpainted.tolist() == [False, False, True]
+    done = paint_release(tmp_path / "r")
+    assert (done.shards, done.known) == (2, 2)
+    assert done.manifest.digest == open_release(made / "painted").manifest.digest
+    assert run("verify", tmp_path / "r").exit_code == 0
+
+
+def test_shards_are_painted_while_others_come_and_a_cut_loses_nothing(made, published, tmp_path, monkeypatch):
+    from dmcvb_gen.release import fetch as fetching
+    from dmcvb_gen.release import paint as painting
+
+    painted, real = [], fetching.download
+    plain = painting.paint_shard
+
+    def paint_shard(work, tick):
+        painted.append((work.subset.name, work.shard))
+        return plain(work, tick)
+
+    def download(filesystem, place, remote, local, record):
+        if "/c/1" in record.path and len(painted) < 1:
+            for _ in range(600):  # the rest comes only once something was painted
+                if painted or arrival_ended():
+                    break
+                threading.Event().wait(0.05)
+            raise StoreError("the line went dead")
+        return real(filesystem, place, remote, local, record)
+
+    def arrival_ended():
+        return not any(thread.name == "fetch" for thread in threading.enumerate())
+
+    monkeypatch.setattr(fetching, "download", download)
+    monkeypatch.setattr(painting, "paint_shard", paint_shard)
+    with pytest.raises(StoreError, match="line went dead"):
+        fetching.fetch_and_paint(published, tmp_path / "r", painter=painting.Painter())
+    assert painted and open_release(tmp_path / "r").subsets
+    monkeypatch.undo()
+    count = sum(c.painted for s in open_release(tmp_path / "r").subsets.values() for c in s.commits.values())
+    assert count == len(painted)
+    result = run("fetch", published, "--paint", "--out", tmp_path / "r", "--json")
+    assert result.exit_code == 0 and json.loads(result.stdout)["shards"] == 4 - count, result.output
+    assert open_release(tmp_path / "r").manifest.digest == open_release(made / "painted").manifest.digest
+
+
+def test_another_painter_is_said_before_and_after(made, tmp_path):
+    without_pictures(made / "painted", tmp_path / "light")
+    path = tmp_path / "light" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for environment in manifest["environments"]:
+        environment["numba"] = "0.0.1"
+    for subset in manifest["subsets"]:
+        subset["renderer"]["glass"] = "thick"
+    write_json(path, manifest)
+    subset = next(iter(open_release(tmp_path / "light").subsets.values()))
+    commit = subset.commits[0]
+    other = tuple(file.model_copy(update={"sha256": "0" * 64}) for file in commit.pictures)
+    write_json(tmp_path / "light" / commit_path(subset.name, 0), commit.model_copy(update={"pictures": other}))
+    result = run("paint", tmp_path / "light", "--episodes", "0:1", "--only", subset.name)
+    assert result.exit_code == 1 and "1 of 1 differ" in result.stdout
+    notes = result.stderr.splitlines()
+    assert any("0.0.1 where the release was made" in note for note in notes)
+    assert any("glass is nothing here, thick in the manifest" in note for note in notes)

@@ -19,7 +19,8 @@ from click.testing import CliRunner
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.release.publish import CLAIM, fetch, publish
+from dmcvb_gen.release.fetch import fetch
+from dmcvb_gen.release.publish import CLAIM, publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release, transfer

@@ -16,9 +16,12 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
+from dmcvb_gen.readers.painted import PaintedSubset
 from dmcvb_gen.release.contents import is_imported
 from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.release.paint import drift
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.tasks import get_task
 
@@ -28,6 +31,8 @@ PAPER_SHARE = 0.15
 """How far it may lie from the paper's, as a share of the paper's expert, before a warning."""
 PICTURE_EPISODES = 100
 """Episodes of a subset whose every frame is looked at."""
+PAINTED_EPISODES = 8
+"""The same, where its pictures are painted to be looked at."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +140,8 @@ def _label_problems(kind: str, own: np.ndarray, video: np.ndarray, frame: np.nda
 
 def check_pictures(subset: Subset) -> Iterator[Finding]:
     """No frame is black or of one color, and no episode shows the same frame throughout."""
-    chosen = subset.episodes[:: max(1, -(-len(subset.episodes) // PICTURE_EPISODES))]
+    most = PAINTED_EPISODES if isinstance(subset, PaintedSubset) else PICTURE_EPISODES
+    chosen = subset.episodes[:: max(1, -(-len(subset.episodes) // most))]
     for episode in map(int, chosen):
         for name, frames in subset.episode(episode, subset.pixel_arrays).items():
             flat = frames.reshape(len(frames), -1)
@@ -145,6 +151,13 @@ def check_pictures(subset: Subset) -> Iterator[Finding]:
                     yield Finding("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax()))
             if len(frames) > 1 and (flat == flat[:1]).all() and high[0] > 0:
                 yield Finding("pictures", subset.name, f"{name} shows the same frame throughout", episode)
+
+
+def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str, ...]:
+    """What is another version here than where the pictures that are painted on reading belong."""
+    painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
+    sources = {record.name: background_source(release.path, record, backgrounds) for record in painted}
+    return drift(release.manifest, painted, sources)
 
 
 def check_structure(
@@ -173,4 +186,6 @@ def check_structure(
         findings += check_labels(subset)
         findings += check_pictures(subset)
         warnings += check_paper_returns(subset)
+    for text in painter_drift(release, backgrounds):
+        warnings.append(Finding("painter", "pictures painted on reading", text))
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)

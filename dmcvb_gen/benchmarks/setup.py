@@ -25,7 +25,8 @@ from dmcvb_gen.benchmarks.evaluate import protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.tables import Cell, Part, slug
-from dmcvb_gen.store import Release
+from dmcvb_gen.readers.painted import DEFAULT_CACHE, Painting, painted_release
+from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.writer import subset_digest
 
 RESULT_VERSION = 2
@@ -60,6 +61,16 @@ class Setup:
     @property
     def encoders(self) -> Path:
         return Path(self.out) / "encoders"
+
+
+def open_data(setup: Setup) -> Release:
+    """The release of a run; pictures that it travelled without are painted when they are read.
+
+    Raises:
+      StoreError: there is no release, or it is damaged.
+    """
+    room = DEFAULT_CACHE if setup.memory is None else min(setup.memory, DEFAULT_CACHE)
+    return painted_release(open_release(setup.root), Painting(backgrounds=setup.backgrounds, cache_bytes=room), True)
 
 
 @dataclass(frozen=True)

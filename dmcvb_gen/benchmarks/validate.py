@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -12,12 +13,12 @@ from typing import Any
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
-from dmcvb_gen.benchmarks.setup import Setup
+from dmcvb_gen.benchmarks.setup import Setup, open_data
 from dmcvb_gen.benchmarks.tables import Cell, Missing, plan_benchmark
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import select
 from dmcvb_gen.release.finding import Finding
-from dmcvb_gen.store import Release, open_release
+from dmcvb_gen.store import Release
 
 STATE_BC_SHARE = 0.9
 """Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
@@ -114,7 +115,7 @@ def validate(
         the report's folder cannot be written.
     """
     started, progress = time.perf_counter(), progress or Progress()
-    release = open_release(path)
+    release = open_data(dataclasses.replace(setup, root=str(path)))
     chosen = only(release, patterns)
     if not chosen.subsets:
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from dmcvb_gen.readers.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.rollout.jobs import background_source, stream_names
 from dmcvb_gen.rollout.painting import exogenous_of, paint, renderer_for
-from dmcvb_gen.store import open_release
+from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.store.pictures import picture_arrays, picture_of
 from dmcvb_gen.store.remote import is_url
@@ -70,12 +70,12 @@ class PaintedArray:
         first, *rest = selection if isinstance(selection, tuple) else (selection,)
         episodes = np.arange(self.shape[0])[first]
         if np.ndim(episodes) == 0:
-            return self._subset.painted(int(episodes))[self.name][tuple(rest)]
+            return self._subset.painted(int(episodes), [self.name])[self.name][tuple(rest)]
         return self.rows(np.asarray(episodes))[(slice(None), *rest)]
 
     def rows(self, episodes: np.ndarray) -> np.ndarray:
         """(episode, row, height, width, 3) uint8, rows past an episode's end zero."""
-        return np.stack([self._subset.painted(int(episode))[self.name] for episode in episodes])
+        return np.stack([self._subset.painted(int(episode), [self.name])[self.name] for episode in episodes])
 
 
 class PaintedSubset(SubsetReader):
@@ -98,11 +98,12 @@ class PaintedSubset(SubsetReader):
         shown = {"size": painting.size or record.size, "pixels": True}
         super().__init__(root, record.model_copy(update=shown), commits, storage_options)
         self.painting, self.epoch = painting, 0
-        self._seed, self._names = int(manifest.recipe.get("seed", 0)), stream_names(manifest, record)
+        self._seed = int(manifest.recipe_of(record.name).get("seed", 0))
+        self._names = stream_names(manifest, record)
         self._start()
 
     def _start(self) -> None:
-        self._kept: OrderedDict[tuple[int, int], dict[str, np.ndarray]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, int, str], np.ndarray] = OrderedDict()
         self._painter: tuple[Renderer, Any] | None = None
         self._bytes, self._lock = 0, threading.Lock()
 
@@ -131,27 +132,42 @@ class PaintedSubset(SubsetReader):
     def array(self, name: str) -> Any:
         return PaintedArray(self, name) if picture_of(name) is not None else super().array(name)
 
-    def painted(self, episode: int) -> dict[str, np.ndarray]:
+    def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """See `Subset.episode`; all of its pictures are painted at once."""
+        names = self.arrays if arrays is None else tuple(arrays)
+        pictures = self.painted(int(index), [name for name in names if picture_of(name) is not None])
+        used = int(self.read("length", [index])[0]) + 1
+        values = super().episode(index, [name for name in names if name not in pictures])
+        values |= {name: value[:used] for name, value in pictures.items()}
+        return {name: values[name] for name in names}
+
+    def painted(self, episode: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Picture arrays of an episode by name, each (row, height, width, 3) uint8.
+
+        Args:
+          arrays: only these, all that can be painted by default.
 
         Raises:
           StoreError: there is no such episode here.
         """
         if episode not in self.episodes:
             raise StoreError(f"{self.name} has no episode {episode}; it has {len(self.episodes)} episodes")
-        key = (episode, self.epoch if self.painting.distractors == RESAMPLED else 0)
+        epoch = self.epoch if self.painting.distractors == RESAMPLED else 0
+        keys = {name: (episode, epoch, name) for name in (self.picture_names if arrays is None else arrays)}
         with self._lock:
-            if key in self._kept:
+            found = {name: self._kept[key] for name, key in keys.items() if key in self._kept}
+            missing = [name for name in keys if name not in found]
+            if missing:
+                found |= self._paint(episode, missing)
+            for name, key in keys.items():
+                self._bytes += 0 if key in self._kept else found[name].nbytes
+                self._kept[key] = found[name]
                 self._kept.move_to_end(key)
-                return self._kept[key]
-            pictures = self._paint(episode)
-            self._kept[key] = pictures
-            self._bytes += _size(pictures)
             while self._bytes > self.painting.cache_bytes and len(self._kept) > 1:
-                self._bytes -= _size(self._kept.popitem(last=False)[1])
-            return pictures
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+            return found
 
-    def _paint(self, episode: int) -> dict[str, np.ndarray]:
+    def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
         if self._painter is None:
             self._painter = renderer_for(self.record, self._videos())
         renderer, videos = self._painter
@@ -165,7 +181,8 @@ class PaintedSubset(SubsetReader):
         else:
             labels = Exogenous(**{name: self.read(f"exogenous/{name}", index)[:, :used] for name in EXOGENOUS_NAMES})
         task, rows = get_task(self.task), self.record.max_steps + 1
-        return {name: value[0].copy() for name, value in paint(task, renderer, physics, labels, length, rows)}
+        pictures = paint(task, renderer, physics, labels, length, rows, arrays=arrays)
+        return {name: value[0].copy() for name, value in pictures}
 
     def _videos(self) -> str:
         given = self.painting.backgrounds
@@ -176,16 +193,22 @@ class PaintedSubset(SubsetReader):
         return background_source(Path(self.root), self.record, given)
 
 
-def _size(pictures: dict[str, np.ndarray]) -> int:
-    return sum(value.nbytes for value in pictures.values())
-
-
 def open_painted(path: str, storage_options: dict | None = None, **painting: Any) -> ReleaseReader:
     """A release whose pictures are painted when they are read; see `dmcvb_gen.open` and `Painting`."""
-    asked, release = Painting(**painting), open_release(path, storage_options)
+    return painted_release(open_release(path, storage_options), Painting(**painting))
+
+
+def painted_release(release: Release, painting: Painting, missing: bool = False) -> ReleaseReader:
+    """An open release whose pictures are painted when they are read.
+
+    Args:
+      missing: only those of subsets that lack some of them; the others are read as they are stored.
+    """
     subsets = {
-        name: PaintedSubset(
-            subset.root, subset.record, subset.commits, subset._storage_options, release.manifest, asked
+        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
+        if missing and subset.record.pixels and not subset.unpainted.any()
+        else PaintedSubset(
+            subset.root, subset.record, subset.commits, subset._storage_options, release.manifest, painting
         )
         for name, subset in release.subsets.items()
     }

@@ -18,7 +18,7 @@ from dmcvb_gen.rollout.jobs import video_source
 from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.store import Subset
 from dmcvb_gen.store.pictures import picture_of
-from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
@@ -60,7 +60,7 @@ def check_values(subset: Subset) -> Iterator[Finding]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
     episodes = subset.episodes
-    specs = array_specs(EpisodeShape.of(task), subset.record.size, pixels=subset.record.pixels)
+    specs = subset_specs(EpisodeShape.of(task), subset.record)
     for spec in imported_specs(subset.record) if is_imported(subset) else specs:
         if spec.name not in subset.arrays:
             yield Finding("shapes", subset.name, f"array {spec.name} is missing")

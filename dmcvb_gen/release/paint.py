@@ -3,26 +3,33 @@
 A picture is a function of the stored physics state, the labels, the renderer, the size and the view. So a release
 may leave its pictures behind (`without_pictures`), or be made without any, and be painted where it arrives. Where the
 digests of its pictures are known they are compared: painting gave the same bytes, or it says which shards differ.
+
+Painted otherwise than the manifest says (`Look`: another size, some views, one kind of goal), it becomes another
+release, and says so: its manifest has the new facts, another name, and the old manifest's digest in its lineage.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import queue
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import copy_file, write_json
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.files import copy_file, sha256_file, write_json
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.pool import Tick, ignore, run_all
-from dmcvb_gen.release.shards import damage
+from dmcvb_gen.pool import Tick, Workers, ignore, open_pool
+from dmcvb_gen.release.regenerate import environment_difference
+from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.rollout.painting import paint, renderers
 from dmcvb_gen.rollout.plan import painting_facts, subset_attributes
-from dmcvb_gen.store import open_release
+from dmcvb_gen.rollout.recipe import check_size
+from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.manifest import (
     MANIFEST,
@@ -32,16 +39,75 @@ from dmcvb_gen.store.manifest import (
     environment,
     write_json_atomically,
 )
-from dmcvb_gen.store.pictures import picture_of
+from dmcvb_gen.store.pictures import Pictures, picture_of, stored_pictures
 from dmcvb_gen.store.reader import Subset
 from dmcvb_gen.store.remote import storage_errors
-from dmcvb_gen.store.schema import EpisodeShape, array_specs
-from dmcvb_gen.store.shards import chosen_shards
+from dmcvb_gen.store.schema import EpisodeShape, subset_specs
+from dmcvb_gen.store.shards import ShardKey, chosen_shards
 from dmcvb_gen.store.writer import add_arrays, finish_release, only_writer, write_pictures
 from dmcvb_gen.tasks import get_task
 
-_ABOUT_THE_PLACE = ("device",)
+ABOUT_THE_PLACE = ("device",)
 """What a painter says of itself that decides no pixel on a CPU."""
+GOALS = ("visible", "hidden")
+REPAINTED = "-repainted"
+"""What the name of a release ends in that is painted otherwise than it was published."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How pictures are to be, where not as the manifest says.
+
+    Attributes:
+      size: pixels a side.
+      views: of mazes, only these.
+      goal: of mazes, only the pictures with it ("visible") or without it ("hidden"), and no others.
+    """
+
+    size: int | None = None
+    views: tuple[str, ...] | None = None
+    goal: str | None = None
+
+    def __post_init__(self):
+        if self.size is not None:
+            check_size(self.size)
+        if self.goal not in (None, *GOALS):
+            raise DmcvbError(f"goal {self.goal!r} is unknown; give one of {', '.join(GOALS)}")
+
+    def of(self, record: SubsetRecord) -> SubsetRecord:
+        """The record of a subset that looks so.
+
+        Raises:
+          UnknownNameError: it has no such view.
+        """
+        facts: dict[str, Any] = {"size": self.size or record.size}
+        if self.views is not None:
+            asked = Pictures(record.views).select(self.views).views
+            facts["views"] = tuple(view for view in record.views if view in asked)
+        if self.goal is not None and get_task(record.task).goal_geoms:
+            facts |= {"hidden_goal": self.goal == "hidden", "only_shown": True}
+        return record.model_copy(update=facts)
+
+
+@dataclass(frozen=True)
+class Painter:
+    """Who paints, and how.
+
+    Attributes:
+      look: of the pictures.
+      workers: processes, or a Ray cluster that sees the same folder.
+      device: "cpu" or "cuda".
+      backgrounds: where the videos are now, where the release has no copies.
+      tick: told how many frames were painted since the last call.
+      tell: told what is other here than where the release was made, before anything is painted.
+    """
+
+    look: Look = Look()
+    workers: Workers = 1
+    device: str = "cpu"
+    backgrounds: str | None = None
+    tick: Tick = ignore
+    tell: Callable[[str], None] = field(default=ignore)
 
 
 @dataclass(frozen=True)
@@ -53,12 +119,14 @@ class PaintShard:
       shard: index.
       backgrounds: "builtin" or the folder of its videos.
       device: where pictures are painted.
+      known: whether its pictures should have the digests that its record knows.
     """
 
     subset: Subset
     shard: int
     backgrounds: str
     device: str = "cpu"
+    known: bool = True
 
 
 @dataclass(frozen=True)
@@ -70,7 +138,7 @@ class Painted:
       shards: how many were painted.
       known: of these, how many had known digests.
       differing: "<subset> shard <n>" of those whose pictures are not the known ones.
-      drift: what about the painter differs from what the manifest says, in words.
+      drift: what here differs from where the release was made, in words.
     """
 
     manifest: Manifest
@@ -84,10 +152,7 @@ def paint_release(
     root: str | Path,
     only: Sequence[str] = (),
     episodes: tuple[int, int] | None = None,
-    workers: int = 1,
-    device: str = "cpu",
-    backgrounds: str | None = None,
-    tick: Tick = ignore,
+    painter: Painter | None = None,
 ) -> Painted:
     """Fill in the pictures of a release; what is painted already is left alone, so run again it goes on.
 
@@ -95,70 +160,210 @@ def paint_release(
       root: the release's folder.
       only: subset patterns, all by default.
       episodes: (first, last + 1) of each subset; the shards that hold any of them are painted.
-      workers: processes.
-      device: "cpu" or "cuda".
-      backgrounds: where the videos are now, where the release has no copies.
-      tick: told how many frames were painted since the last call.
+      painter: who paints, and how.
 
     Raises:
-      DmcvbError: nothing fits, a shard is damaged, the videos are not those of the manifest, or the disk is full.
+      DmcvbError: nothing fits, a shard is damaged, the videos are not those of the manifest, pictures of another look
+        are there already, or the disk is full.
     """
-    root = Path(root)
+    root, painter = Path(root), painter or Painter()
     release = open_release(root)
-    if any(entry.get("kind") == "import" for entry in release.manifest.lineage):
-        raise StoreError(f"{root} was imported and has no physics states to paint from")
-    todo = [
-        (record, shard)
-        for (name, shard), record in chosen_shards(release.manifest, only, episodes).items()
-        if name in release.subsets and shard in (commits := release[name].commits) and not commits[shard].painted
-    ]
-    records = {record.name: record for record, _ in todo}
-    sources = {name: background_source(root, record, backgrounds) for name, record in records.items()}
-    drift = tuple(dict.fromkeys(text for name, r in records.items() for text in _drift(r, sources[name], device)))
-    manifest = _make_room(root, release.manifest, set(records)) if todo else release.manifest
-    release = open_release(root)
-    work = [PaintShard(release[r.name], shard, sources[r.name], device) for r, shard in todo]
-    known, differing = 0, []
-    for _, (name, had, same) in run_all(paint_shard, work, workers, tick=tick):
-        known += had
-        if had and not same:
-            differing.append(name)
-    if todo:
-        manifest = finish_release(root, manifest)
-    return Painted(manifest, len(todo), known, tuple(sorted(differing)), drift)
+    shards = [key for key in chosen_shards(release.manifest, only, episodes) if key[0] in release.subsets]
+    todo = [key for key in shards if (c := release[key[0]].commits.get(key[1])) and not c.painted]
+    with storage_errors(root, "write to"), only_writer(root, wait=60):
+        studio = Studio.open(release, {name for name, _ in shards}, painter, needed={name for name, _ in todo})
+    waiting: queue.SimpleQueue = queue.SimpleQueue()
+    for key in [*todo, None]:
+        waiting.put(key)
+    found = tuple(studio.paint(waiting))
+    manifest = finish_release(root, studio.manifest) if todo else studio.manifest
+    return studio.report(manifest, found)
 
 
-def _drift(record: SubsetRecord, backgrounds: str, device: str) -> Iterator[str]:
-    """What the painter here says of itself that is not what the manifest says of it."""
-    here = painting_facts(record, backgrounds, device)["renderer"]
-    for name in sorted(set(here) | set(record.renderer)):
-        if name not in _ABOUT_THE_PLACE and here.get(name) != record.renderer.get(name):
+@dataclass(frozen=True)
+class Studio:
+    """A release's folder that is ready to be painted in: its manifest says which pictures, and its arrays are there.
+
+    Attributes:
+      root, manifest: of the release.
+      backgrounds: of each subset to paint, "builtin" or the folder of its videos.
+      known: subsets whose pictures should have the digests that are known.
+      drift: see `Painted`.
+    """
+
+    root: Path
+    manifest: Manifest
+    painter: Painter
+    backgrounds: Mapping[str, str]
+    known: frozenset[str]
+    drift: tuple[str, ...]
+
+    @classmethod
+    def open(
+        cls, release: Release, names: set[str], painter: Painter, needed: set[str], painted: set[str] | None = None
+    ) -> Studio:
+        """Make a release ready; its folder must be locked.
+
+        Args:
+          names: subsets that are asked for.
+          needed: of these, the ones that have (or will have) shards to paint.
+          painted: of these, the ones that have (or will have) shards with pictures; by default those here that have.
+
+        Raises:
+          DmcvbError: see `paint_release`.
+        """
+        root, manifest, look = release.path, release.manifest, painter.look
+        if any(entry.get("kind") == "import" for entry in manifest.lineage):
+            raise StoreError(f"{root} was imported and has no physics states to paint from")
+        old = {record.name: record for record in manifest.subsets}
+        asked = [record for name, record in old.items() if name in names]
+        if look.goal and not any(get_task(record.task).goal_geoms for record in asked):
+            raise DmcvbError("--goal is for ant-maze tasks, and none of them is asked for; leave it away")
+        new = {record.name: look.of(record) for record in asked}
+        changed = {name for name, record in new.items() if record != old[name]}
+        if painted is None:
+            painted = {n for n, s in release.subsets.items() if any(c.painted for c in s.commits.values())}
+        for name in sorted(changed & painted):
+            raise _has_others(old[name])
+        sources = {name: background_source(root, new[name], painter.backgrounds) for name in sorted(needed)}
+        told = drift(manifest, [new[name] for name in sorted(needed)], sources, painter.device)
+        for text in told:
+            painter.tell(text)
+        known = frozenset(name for name, record in new.items() if record.size == old[name].size) - _resized(manifest)
+        if needed:
+            manifest = _make_room(root, manifest, {name: new[name] for name in changed | needed}, changed, look)
+        return cls(root, manifest, painter, sources, known, told)
+
+    def paint(self, arriving: queue.SimpleQueue) -> Iterator[tuple[str, bool, bool]]:
+        """Paint shards as they come; what `paint_shard` gives of each.
+
+        Args:
+          arriving: (subset, shard) of committed shards, an exception to raise, or None at the end.
+        """
+
+        with open_pool(self.painter.workers, tick=self.painter.tick) as pool:
+            ended, at_work, results = False, 0, iter(())
+            while True:
+                while not ended:
+                    try:
+                        key = arriving.get(block=not at_work)  # there is nothing else to wait for
+                    except queue.Empty:
+                        break
+                    if isinstance(key, BaseException):
+                        raise key
+                    ended = key is None
+                    if not ended:
+                        pool.submit(key, paint_shard, self._work(key))
+                        at_work += 1
+                if ended and not at_work:
+                    return
+                done = next(results, None)
+                if done is None:
+                    results = pool.results()
+                    continue
+                at_work -= 1
+                yield done[1]
+
+    def _work(self, key: ShardKey) -> PaintShard:
+        name, shard = key
+        record = next(record for record in self.manifest.subsets if record.name == name)
+        commit = read_commit(self.root, record, shard)
+        if commit is None:
+            raise StoreError(f"{name} shard {shard} has no commit record; run `dmcvb-gen regenerate {self.root}`")
+        subset = Subset(str(self.root), record, {shard: commit}, {})
+        return PaintShard(subset, shard, self.backgrounds[name], self.painter.device, name in self.known)
+
+    def report(self, manifest: Manifest, found: Iterable[tuple[str, bool, bool]]) -> Painted:
+        """What came of it."""
+        found = list(found)
+        differing = tuple(sorted(name for name, had, same in found if had and not same))
+        return Painted(manifest, len(found), sum(had for _, had, _ in found), differing, self.drift)
+
+
+def _resized(manifest: Manifest) -> frozenset[str]:
+    """Subsets whose pictures have another size than those whose digests are known."""
+    return frozenset(name for entry in manifest.lineage for name in entry.get("resized", ()))
+
+
+def _has_others(record: SubsetRecord) -> StoreError:
+    """The error where a subset has pictures of another look than is asked for."""
+    views = "" if record.views == ("pixels",) else f", views {', '.join(record.views)}"
+    return StoreError(
+        f"{record.name} has pictures already, and others than asked for: {record.size} pixels a side{views}; leave "
+        "--size, --views and --goal away to go on with those, or paint others beside with `dmcvb-gen repaint`"
+    )
+
+
+def drift(
+    manifest: Manifest, records: Iterable[SubsetRecord], backgrounds: Mapping[str, str], device: str = "cpu"
+) -> tuple[str, ...]:
+    """What here may paint other bits than where a release was made, in words: versions, processor, the painter.
+
+    Args:
+      records: of the subsets to paint.
+      backgrounds: of each, by name.
+    """
+    found: dict[str, None] = {}
+    records = list(records)
+    for record in records:
+        here = painting_facts(record, backgrounds[record.name], device)["renderer"]
+        for name in sorted(set(here) | set(record.renderer)):
             was, now = record.renderer.get(name, "nothing"), here.get(name, "nothing")
-            yield f"{record.renderer['name']}'s {name} is {now} here, {was} in the manifest"
+            if name not in ABOUT_THE_PLACE and was != now:
+                found[f"{record.renderer['name']}'s {name} is {now} here, {was} in the manifest"] = None
+    for name, (there, now) in environment_difference(manifest).items() if records else ():
+        if name not in ABOUT_THE_PLACE:
+            found[f"{name} is {now} here, {there} where the release was made"] = None
+    return tuple(found)
 
 
-def _make_room(root: Path, manifest: Manifest, names: set[str]) -> Manifest:
-    """Say that subsets have pictures, and give them the (empty) arrays for them."""
+def _make_room(
+    root: Path, manifest: Manifest, new: Mapping[str, SubsetRecord], changed: set[str], look: Look
+) -> Manifest:
+    """Say that subsets have pictures, and which, and give them the (empty) arrays for them."""
     subsets = tuple(
-        record.model_copy(update={"pixels": True, "digest": None}) if record.name in names else record
+        new[record.name].model_copy(update={"pixels": True, "digest": None}) if record.name in new else record
         for record in manifest.subsets
     )
-    manifest = manifest.model_copy(update={"subsets": subsets, "digest": None})
-    with only_writer(root, wait=60), storage_errors(root, "write to"):
+    facts: dict[str, Any] = {"subsets": subsets, "digest": None}
+    if changed:
+        facts |= _derived(root, manifest, subsets, changed, look)
+    manifest = manifest.model_copy(update=facts)
+    with storage_errors(root, "write to"):
         (root / INDEX).unlink(missing_ok=True)  # written again at the end
         for record in subsets:
-            if record.name in names:
-                specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
+            if record.name in new:
+                specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
                 add_arrays(root, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
         write_json_atomically(root / MANIFEST, manifest)
     return manifest
+
+
+def _derived(
+    root: Path, old: Manifest, subsets: Sequence[SubsetRecord], changed: set[str], look: Look
+) -> dict[str, Any]:
+    """Name and lineage of a release that is painted otherwise than it was."""
+    sizes = {record.name: record.size for record in old.subsets}
+    published = [entry["manifest_sha256"] for entry in old.lineage if entry.get("kind") == "fetch"]
+    entry = {
+        "kind": "repaint",
+        "from": f"{old.name} {old.version}",
+        "manifest_sha256": published[0] if published else sha256_file(root / MANIFEST),
+        "subsets": {name: name for name in sorted(changed)},
+        "resized": sorted(record.name for record in subsets if record.size != sizes[record.name]),
+        "size": look.size,
+        "views": None if look.views is None else list(look.views),
+        "goal": look.goal,
+    }
+    name = old.name if old.name.endswith(REPAINTED) else f"{old.name[:80]}{REPAINTED}"
+    return {"name": name, "lineage": (*old.lineage, entry)}
 
 
 def paint_shard(work: PaintShard, tick: Tick = ignore) -> tuple[str, bool, bool]:
     """Paint one shard in place.
 
     Returns:
-      Its name; whether the digests of its pictures were known; whether they have them.
+      Its name; whether digests of its pictures were known; whether they have them.
 
     Raises:
       StoreError: the shard is damaged, or cannot be written.
@@ -171,8 +376,10 @@ def paint_shard(work: PaintShard, tick: Tick = ignore) -> tuple[str, bool, bool]
     pictures = shard_pictures(subset, np.arange(*commit.episodes), work.backgrounds, work.device, tick)
     painted = write_pictures(root, record, commit, pictures, environment(work.device))
     stored = {file.path: file for file in painted.files}
-    same = all(stored.get(file.path) == file for file in commit.pictures)
-    return f"{subset.name} shard {work.shard}", bool(commit.pictures), same
+    folders = {f"{subset.name}.zarr/{subset.paths[name]}" for name in _stored(record)}
+    known = [file for file in commit.pictures if work.known and file.path.split("/c/")[0] in folders]
+    same = all(stored.get(file.path) == file for file in known)
+    return f"{subset.name} shard {work.shard}", bool(known), same
 
 
 def shard_pictures(
@@ -185,7 +392,11 @@ def shard_pictures(
     physics = subset.read("physics", episodes)[:, :used]
     exogenous = Exogenous(**{name: subset.read(f"exogenous/{name}", episodes)[:, :used] for name in EXOGENOUS_NAMES})
     renderer, _ = renderers.get(record, backgrounds, device)
-    yield from paint(task, renderer, physics, exogenous, length, record.max_steps + 1, tick)
+    yield from paint(task, renderer, physics, exogenous, length, record.max_steps + 1, tick, _stored(record))
+
+
+def _stored(record: SubsetRecord) -> tuple[str, ...]:
+    return stored_pictures(record, bool(get_task(record.task).goal_geoms))
 
 
 # -- leaving them behind --------------------------------------------------------------------------
@@ -214,7 +425,7 @@ def without_pictures(root: str | Path, out: str | Path) -> Manifest:
     manifest = release.manifest.model_copy(update={"subsets": bare, "digest": None})
     for record in bare:
         if record.name in release.subsets:
-            specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size, pixels=False)
+            specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
             add_arrays(out, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
     write_json_atomically(out / MANIFEST, manifest)
     return finish_release(out, manifest)

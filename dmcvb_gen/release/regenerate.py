@@ -28,7 +28,7 @@ from dmcvb_gen.store.index import restore_index, restored_commit
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import load_manifest
 from dmcvb_gen.store.remote import storage_errors
-from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import (
     commit_path,
@@ -129,7 +129,7 @@ def compare_shards(one: Path, other: Path, record: SubsetRecord, shard: int) -> 
             zarr.open_group(str(root / subset_path(record.name)), mode="r", use_consolidated=False)
             for root in (one, other)
         ]
-        for spec in array_specs(EpisodeShape.of(get_task(record.task)), record.size, record.pixels):
+        for spec in subset_specs(EpisodeShape.of(get_task(record.task)), record):
             a, b = (np.asarray(find_array(group, spec.name)[0][first:last]) for group in groups)
             if np.array_equal(a, b, equal_nan=a.dtype.kind == "f"):
                 continue

@@ -28,8 +28,9 @@ from dmcvb_gen.rollout.site import FolderSite, leave
 from dmcvb_gen.rollout.worker import make_shard
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment
+from dmcvb_gen.store.pictures import stored_pictures
 from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
+from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
 from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -132,7 +133,7 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
     todo: dict[tuple[str, int], SubsetRecord] = {}
     for pair in pairs.values():
         record, shape = pair.record, EpisodeShape.of(get_task(pair.record.task))
-        specs = array_specs(shape, record.size) + label_specs(get_task(record.task), record.size, request.labels)
+        specs = subset_specs(shape, record) + label_specs(get_task(record.task), record.size, request.labels)
         create_subset(out, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
         missing = sorted(set(pair.source.commits) - set(read_commits(out, record)))
         todo |= {(record.name, shard): record for shard in missing}
@@ -183,6 +184,7 @@ def _pair(release: Release, subset: Subset, request: Repainting) -> Pair:
             "split": request.split or old.split,
             "renderer": {"name": backend, "samples": samples},
             "backgrounds": None,
+            "pixels": True,
             "digest": None,
         }
     )
@@ -296,7 +298,8 @@ def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tup
         else:
             exogenous = exogenous_of(record, job.seed, job.names, episodes, values["physics"], length, videos)
         physics = values["physics"][:, : len_rows(exogenous)]
-        yield from paint(task, renderer, physics, exogenous, length, rows, tick)
+        stored = stored_pictures(record, bool(task.goal_geoms))
+        yield from paint(task, renderer, physics, exogenous, length, rows, tick, stored)
         yield from label_arrays(exogenous, length, rows)
         yield from values.items()
         for label in labels:

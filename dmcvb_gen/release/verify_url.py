@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.fetch import Source
 from dmcvb_gen.release.finding import Finding
-from dmcvb_gen.release.publish import Source
 from dmcvb_gen.release.verify import Verification, subset_of
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import INDEX, root_digest

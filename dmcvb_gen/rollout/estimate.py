@@ -22,7 +22,8 @@ from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, pai
 from dmcvb_gen.rollout.plan import Plan
 from dmcvb_gen.rollout.worker import inputs_of, simulate_job
 from dmcvb_gen.store.manifest import SubsetRecord
-from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, array_specs, create_arrays, picture_layout_for
+from dmcvb_gen.store.pictures import stored_pictures
+from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, create_arrays, picture_layout_for, subset_specs
 from dmcvb_gen.store.writer import find_array
 from dmcvb_gen.tasks import get_task
 
@@ -96,13 +97,14 @@ def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, f
     length = np.full(len(runs), chunk - 1)
     paint_once = list(paint(task, renderer, physics[:1, :2], labels[:1, :2], length[:1] * 0 + 1, 2))
     del paint_once  # kernels are compiled and buffers made
-    specs, layout = array_specs(EpisodeShape.of(task), record.size, record.pixels), picture_layout_for(record.setting)
+    specs, layout = subset_specs(EpisodeShape.of(task), record), picture_layout_for(record.setting)
     with tempfile.TemporaryDirectory() as folder:
         group = zarr.create_group(folder)
         create_arrays(group, specs, len(runs), chunk, len(runs), layout)
         started = time.perf_counter()
-        pictures = paint(task, renderer, physics[:, : len_rows(labels)], labels, length, chunk)
-        for name, value in pictures if record.pixels else ():
+        stored = stored_pictures(record, bool(task.goal_geoms))
+        pictures = paint(task, renderer, physics[:, : len_rows(labels)], labels, length, chunk, arrays=stored)
+        for name, value in pictures:
             find_array(group, name)[0][:] = value
         for name, value in label_arrays(labels, length, chunk):
             find_array(group, name)[0][:] = value
@@ -164,7 +166,7 @@ def raw_bytes(plan: Plan) -> float:
     total = 0.0
     for job in plan.jobs:
         for record in job.subsets:
-            specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size, record.pixels)
+            specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
             pictures = sum(spec.picture for spec in specs)
             total += len(job.episodes) * record.max_steps * pictures * record.size**2 * 3
     return float(np.ceil(total * 0.5))

@@ -5,7 +5,7 @@ What a rollout, a repaint, a check and a reader that paints on read have in comm
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -129,8 +129,12 @@ def paint(
     length: np.ndarray,
     rows: int,
     tick: Tick = ignore,
+    arrays: Collection[str] | None = None,
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Pictures of episodes, one array at a time.
+
+    Args:
+      arrays: only these, by name; all of the task's views, with the goal and without it, by default.
 
     Yields:
       (name, (episode, rows, size, size, 3) uint8); rows past an episode's end stay zero.
@@ -139,13 +143,16 @@ def paint(
     size, total = renderer.size, len(episode)
     names = zip(picture_arrays(task.views), picture_arrays(task.views, hide_goal=True), strict=True)
     for view, (name, hidden_name) in zip(task.views, names, strict=True):
+        if arrays is not None and name not in arrays and hidden_name not in arrays:
+            continue
         picture = np.zeros((len(physics), rows, size, size, 3), np.uint8)
         for first in range(0, total, PAINT_FRAMES):
             e, r = episode[first : first + PAINT_FRAMES], row[first : first + PAINT_FRAMES]
             picture[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view])[:, 0]
             tick(len(e))
-        yield name, picture
-        if not task.goal_geoms:
+        if arrays is None or name in arrays:
+            yield name, picture
+        if not task.goal_geoms or not (arrays is None or hidden_name in arrays):
             continue
         seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
         seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)

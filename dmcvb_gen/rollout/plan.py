@@ -23,7 +23,7 @@ from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment
-from dmcvb_gen.store.schema import EpisodeShape, array_specs
+from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
 from dmcvb_gen.store.writer import create_subset, finish_release, start_release
@@ -340,7 +340,7 @@ def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord
       StoreError: the folder cannot be written.
     """
     for record in records:
-        specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size, record.pixels)
+        specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
         create_subset(root, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
 
 

@@ -16,6 +16,7 @@ from dmcvb_gen.rollout.jobs import Inputs, Job
 from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.rollout.site import Site, stage_of
 from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, commit_path, environment
+from dmcvb_gen.store.pictures import stored_pictures
 from dmcvb_gen.store.writer import write_shard
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
@@ -140,7 +141,8 @@ def painted_arrays(
     exogenous = exogenous_of(record, job.seed, job.names, episodes, physics, length, videos)
     if record.pixels:
         physics = physics[:, : len_rows(exogenous)]
-        yield from paint(task, renderer, physics, exogenous, length, rows, tick)
+        arrays = stored_pictures(record, bool(task.goal_geoms))
+        yield from paint(task, renderer, physics, exogenous, length, rows, tick, arrays)
     else:
         tick(int((length + 1).sum()))
     yield from label_arrays(exogenous, length, rows)

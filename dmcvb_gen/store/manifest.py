@@ -99,6 +99,8 @@ class SubsetRecord(_Model):
         is at hand may be fewer. None where both are drawn for each episode.
       split: the videos and styles that it was painted with, "train" or "val".
       pixels: whether pictures are stored; without them, they can be painted from physics states and labels.
+      only_shown: whether only the pictures that the subset is about are stored; else, where the task has a goal, those
+        with it and those without it. Left out of the JSON where it is false, as it is in older releases.
     """
 
     name: RelativePath
@@ -121,6 +123,14 @@ class SubsetRecord(_Model):
     split: str = "train"
     pixels: bool = True
     digest: Digest | None = None
+    only_shown: bool = False
+
+    @pydantic.model_serializer(mode="wrap")
+    def _bare(self, dump: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data = dump(self)
+        if not self.only_shown:
+            data.pop("only_shown", None)
+        return data
 
 
 class Addition(_Model):

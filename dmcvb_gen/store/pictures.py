@@ -74,6 +74,19 @@ def picture_arrays(views: Sequence[str], hide_goal: bool = False) -> tuple[str, 
     return tuple(f"{folder}/{view}" for view in views)
 
 
+def stored_pictures(record: SubsetRecord, goal: bool) -> tuple[str, ...]:
+    """Names of the picture arrays that a subset stores (once they are painted); none of a subset without pictures.
+
+    Args:
+      goal: whether its task has a goal that can be left out of pictures.
+    """
+    if not record.pixels:
+        return ()
+    if record.only_shown:
+        return picture_arrays(record.views, record.hidden_goal)
+    return picture_arrays(record.views) + (picture_arrays(record.views, hide_goal=True) if goal else ())
+
+
 def picture_of(array: str) -> tuple[str, bool] | None:
     """(view, goal hidden) of a picture array's name; None for the name of another array."""
     folder, _, view = array.partition("/")

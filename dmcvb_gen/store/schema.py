@@ -29,14 +29,17 @@ Rows past L are never written: a missing chunk costs no storage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zarr
 from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
-from dmcvb_gen.store.pictures import picture_arrays
+from dmcvb_gen.store.pictures import picture_arrays, stored_pictures
+
+if TYPE_CHECKING:
+    from dmcvb_gen.store.manifest import SubsetRecord
 
 SCHEMA_VERSION = 2
 """Version of the layout and the manifest; a reader refuses a newer one, and reads all older ones."""
@@ -120,12 +123,22 @@ def picture_spec(name: str, size: int) -> ArraySpec:
     return ArraySpec(name, "uint8", (size, size, 3), ("height", "width", "channel"), picture=True)
 
 
-def array_specs(shape: EpisodeShape, size: int, pixels: bool = True) -> tuple[ArraySpec, ...]:
-    """All arrays of a subset with episodes of `shape` and pictures of `size` (none with pixels=False)."""
-    names = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
+def subset_specs(shape: EpisodeShape, record: SubsetRecord) -> tuple[ArraySpec, ...]:
+    """All arrays of the subset of a record, with the pictures that it stores."""
+    return array_specs(shape, record.size, stored_pictures(record, shape.goal))
+
+
+def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None = None) -> tuple[ArraySpec, ...]:
+    """All arrays of a subset with episodes of `shape` and pictures of `size`.
+
+    Args:
+      pictures: names of its picture arrays; those of all views by default, with the goal and without it.
+    """
+    both = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
+    names = both if pictures is None else pictures
     fields = {name: list(part) for name, part in shape.state_fields.items()}
     views = len(shape.views)
-    specs = [picture_spec(name, size) for name in names] if pixels else []
+    specs = [picture_spec(name, size) for name in names]
     specs += [
         ArraySpec("state", "float32", (shape.state_size,), ("state_dim",), attributes={"fields": fields}),
         ArraySpec("action", "float32", (shape.action_size,), ("action_dim",)),

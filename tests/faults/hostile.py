@@ -415,7 +415,7 @@ def take_backgrounds(folder: Path) -> None:
 
 
 def take_published(folder: Path) -> None:
-    from dmcvb_gen.release.publish import fetch
+    from dmcvb_gen.release.fetch import fetch
 
     fetch(f"file://{folder}/there", folder / "deep/down/here", workers=1)
     _read_all(str(folder / "deep/down/here"))
@@ -425,8 +425,8 @@ def take_names(folder: Path) -> None:
     """A URL, a subset's name and a pattern out of names.json, each given to whoever takes such."""
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.release.export import export
+    from dmcvb_gen.release.fetch import fetch
     from dmcvb_gen.release.hub import parse_hub_url
-    from dmcvb_gen.release.publish import fetch
     from dmcvb_gen.store.manifest import check_relative_path
     from dmcvb_gen.store.remote import file_system
 

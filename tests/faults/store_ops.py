@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.release.publish import fetch as bring
+from dmcvb_gen.release.fetch import fetch as bring
 from dmcvb_gen.release.publish import publish as put
 from dmcvb_gen.release.verify import check_files
 from dmcvb_gen.store import open_release

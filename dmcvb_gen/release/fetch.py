@@ -1,0 +1,438 @@
+"""A published release to a folder: `fetch` brings it, or the shards that hold some episodes; run again, it adds.
+
+Shards come one after the other, each with its commit record last, so what is here at any moment is a release: a part of
+one, which says so in its lineage, until everything is here. What was painted here stays painted. With a painter, a
+shard is painted while the next ones come.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen import files
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.hub import on_the_hub
+from dmcvb_gen.store import open_release
+from dmcvb_gen.store.index import CARD_FILES, CARD_FOLDER, INDEX, Index, is_card, parse_index, write_release
+from dmcvb_gen.store.manifest import (
+    MANIFEST,
+    CommitRecord,
+    FileRecord,
+    Manifest,
+    SubsetRecord,
+    checked_commit,
+    commit_path,
+    parse_manifest,
+    shard_count,
+    subset_path,
+)
+from dmcvb_gen.store.remote import file_system, local_path, public, storage_errors
+from dmcvb_gen.store.shards import ShardKey, chosen_shards
+from dmcvb_gen.store.transfer import download, in_parallel, read_object, retry
+from dmcvb_gen.store.writer import LOCK, finish_release, mark_created, only_writer, read_commits
+
+Tick = Callable[[int], None]
+AHEAD = 64
+"""Shards of a Hugging Face repository that are asked for at once."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a publish or fetch did: files and bytes of the release's part, and how many of the files were moved now."""
+
+    files: int
+    bytes: int
+    moved: int
+
+
+def fetch(
+    url: str,
+    out: str | Path,
+    only: Sequence[str] = (),
+    episodes: tuple[int, int] | None = None,
+    *,
+    options: dict[str, Any] | None = None,
+    workers: int = 8,
+    tick: Tick = lambda count: None,
+) -> Moved:
+    """Bring a published release, or the shards of it that hold some episodes; run again, it goes on or adds.
+
+    Args:
+      out: its folder here.
+      only, episodes: subset patterns and (first, last + 1); all by default.
+      options: of fsspec.
+      tick: told the bytes of each file.
+
+    Raises:
+      StoreError: no release is there; a file has other bytes than its digest says; `out` holds something else;
+        there is no room; access is refused.
+    """
+    folder, source = local_path(out), Source.find(url, options)
+    with Arrival.at(folder, source, only, episodes, workers, tick) as arrival:
+        moved = arrival.bring()
+        arrival.finish()
+    return moved
+
+
+def fetch_and_paint(
+    url: str,
+    out: str | Path,
+    only: Sequence[str] = (),
+    episodes: tuple[int, int] | None = None,
+    *,
+    painter: Any,
+    options: dict[str, Any] | None = None,
+    workers: int = 8,
+    tick: Tick = lambda count: None,
+) -> tuple[Moved, Any]:
+    """`fetch`, and paint the pictures that travelled without; a shard is painted while the next ones come.
+
+    Args:
+      painter: a `release.paint.Painter`.
+
+    Returns:
+      What was moved, and a `release.paint.Painted`.
+
+    Raises:
+      DmcvbError: as `fetch` and `release.paint.paint_release` do; what has come and was painted stays.
+    """
+    from dmcvb_gen.release.paint import Studio  # who only fetches has no simulator
+
+    folder, source = local_path(out), Source.find(url, options)
+    with Arrival.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
+        names, painted = {name for name, _ in arrival.shards}, arrival.painted
+        studio = Studio.open(open_release(folder), names, painter, arrival.unpainted, painted)
+        arrived: queue.SimpleQueue = queue.SimpleQueue()
+        bringing = threading.Thread(target=_bring, args=(arrival, arrived), name="fetch")
+        bringing.start()
+        try:
+            found = list(studio.paint(arrived))
+        finally:
+            arrival.stop.set()
+            bringing.join()
+        manifest = arrival.finish()
+    return arrival.moved, studio.report(manifest, found)
+
+
+def _bring(arrival: Arrival, arrived: queue.SimpleQueue) -> None:
+    """Tell of each shard that has come without pictures, then of the end, or of what went wrong."""
+    try:
+        arrival.bring(arrived.put)
+        arrived.put(None)
+    except BaseException as error:
+        arrived.put(error)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A published release: where it lies, and what it says of itself."""
+
+    url: str
+    filesystem: Any
+    base: str
+    place: str
+    manifest_text: bytes
+    index_text: bytes
+    manifest: Manifest
+    index: Index
+
+    @classmethod
+    def find(cls, url: str, options: dict[str, Any] | None) -> Source:
+        """Read manifest and index at a URL.
+
+        Raises:
+          StoreError: no release is there, or its manifest and index do not belong together.
+        """
+        place = public(url)
+        filesystem, base = file_system(url, options)
+        text = read_object(filesystem, place, f"{base}/{MANIFEST}")
+        if text is None:
+            raise StoreError(f"{place} holds no release (no {MANIFEST}); check the URL, or it is still being published")
+        manifest = parse_manifest(text, f"{place}/{MANIFEST}")
+        listing = read_object(filesystem, place, f"{base}/{INDEX}")
+        if listing is None:
+            raise StoreError(
+                f"{place} has no {INDEX}; it was not put there by `dmcvb-gen publish`, copy the folder whole"
+            )
+        index = parse_index(listing, f"{place}/{INDEX}")
+        if index.manifest_sha256 != files.sha256_bytes(text):
+            raise StoreError(f"{place}: {MANIFEST} does not have the digest that {INDEX} says; publish it again")
+        return cls(url, filesystem, base, place, text, listing, manifest, index)
+
+    def listed(self, path: str) -> FileRecord:
+        """What the index says of a file."""
+        for file in self.index.files:
+            if file.path == path:
+                return file
+        raise StoreError(f"{self.place}/{INDEX} does not list {path}; publish the release again")
+
+    def metadata(self, records: Iterable[SubsetRecord]) -> list[FileRecord]:
+        """Zarr metadata and policies of subsets, and the card: what comes whole with any part of the release.
+
+        Zarr finds the arrays in one consolidated file and beside them, so all metadata of a subset comes.
+        """
+        records = list({record.name: record for record in records}.values())
+        folders = tuple(f"{subset_path(record.name)}/" for record in records)
+        policies = {policy.path for record in records for policy in record.policies}
+        videos = tuple(f"{(record.backgrounds or {}).get('source')}/" for record in records)
+        return [
+            file
+            for file in self.index.files
+            if (file.path.startswith(folders) and file.path.endswith("/zarr.json"))
+            or file.path in policies
+            or file.path.startswith(videos)
+            or is_card(file.path)
+        ]
+
+
+class Arrival:
+    """Shards of a published release on their way to a folder.
+
+    Attributes:
+      out: the folder, which is locked.
+      shards: what is asked for.
+      commits: (bytes, record) of each shard, as published.
+      moved: what was asked for and moved, once it is here.
+      stop: set to have no more files asked for.
+    """
+
+    def __init__(self, out: Path, source: Source, shards: dict[ShardKey, SubsetRecord], workers: int, tick: Tick):
+        self.out, self.source, self.shards, self._workers, self._tick = out, source, shards, workers, tick
+        self.stop, self.moved = threading.Event(), Moved(0, 0, 0)
+        listed = [source.listed(commit_path(*key)) for key in shards]
+        self.local = taken_up(out, source)
+        self.commits = _fetch_commits(source, listed, shards, workers)
+        self._metadata = source.metadata(shards.values())
+        self._kept: dict[ShardKey, CommitRecord] = {}
+        self._brought: set[str] = set()
+
+    @classmethod
+    @contextlib.contextmanager
+    def at(
+        cls,
+        out: Path,
+        source: Source,
+        only: Sequence[str],
+        episodes: tuple[int, int] | None,
+        workers: int,
+        tick: Tick,
+        with_pictures: bool = False,
+    ) -> Iterator[Arrival]:
+        """An arrival whose folder is locked and has the metadata and a manifest that says that it is a part.
+
+        Args:
+          with_pictures: room will be needed for pictures, too.
+
+        Raises:
+          StoreError: see `fetch`.
+        """
+        shards = chosen_shards(source.manifest, only, episodes)
+        arrival = cls(out, source, shards, workers, tick)
+        with storage_errors(out, "write to"):
+            out.mkdir(parents=True, exist_ok=True)
+            with only_writer(out):
+                arrival._keep_painted()
+                arrival._check_room(with_pictures)
+                arrival._download([(None, file) for file in arrival._metadata], lambda key: None)
+                _write_part(out, source, arrival.local, only, episodes)
+                yield arrival
+
+    @property
+    def unpainted(self) -> set[str]:
+        """Subsets of which shards come without pictures."""
+        return {key[0] for key, (_, commit) in self.commits.items() if not commit.painted and key not in self._kept}
+
+    @property
+    def painted(self) -> set[str]:
+        """Subsets of which shards have pictures, here or there."""
+        return {key[0] for key, (_, commit) in self.commits.items() if commit.painted or key in self._kept}
+
+    def _keep_painted(self) -> None:
+        """See which subsets were painted here: their metadata and the records of painted shards stay."""
+        records = {record.name: record for record in self.source.manifest.subsets}
+        here = {r.name: r for r in (self.local.subsets if self.local else ()) if _bare(r) != _bare(records[r.name])}
+        folders = tuple(f"{subset_path(name)}/" for name in here)
+        self._metadata = [
+            file for file in self._metadata if not (file.path.startswith(folders) and file.path.endswith("/zarr.json"))
+        ]
+        for name, record in here.items():
+            for shard, commit in read_commits(self.out, record).items():
+                published = self.commits.get((name, shard))
+                if published and commit.painted and set(published[1].files) <= set(commit.files):
+                    self._kept[name, shard] = commit
+
+    def _check_room(self, with_pictures: bool) -> None:
+        wanted = [file for _, commit in self.commits.values() for file in commit.files] + self._metadata
+        if with_pictures:
+            wanted += [f for key, (_, c) in self.commits.items() if key not in self._kept for f in c.pictures]
+        needed = sum(file.bytes for file in wanted if not (self.out / file.path).exists())
+        free = os.statvfs(self.out)
+        if needed > free.f_bavail * free.f_frsize:
+            raise StoreError(
+                f"{needed / 1e9:.1f} GB are needed and {free.f_bavail * free.f_frsize / 1e9:.1f} GB are free at "
+                f"{self.out}; make room, choose another --out, or fetch less with --only and --episodes"
+            )
+
+    def bring(self, arrived: Callable[[ShardKey], None] = lambda key: None) -> Moved:
+        """Bring the shards, in their order; each is there once its commit record is, and that is after its files.
+
+        Args:
+          arrived: told each shard that is here and has no pictures.
+
+        Raises:
+          StoreError: see `fetch`.
+        """
+        keys = list(self.shards)
+        ahead = AHEAD if on_the_hub(self.source.url) else len(keys)
+        for first in range(0, len(keys), ahead):
+            part = keys[first : first + ahead]
+            if on_the_hub(self.source.url):
+                self._prefetch(part)
+            self._download([(key, file) for key in part for file in self.commits[key][1].files], arrived)
+        return self.moved
+
+    def _prefetch(self, keys: Sequence[ShardKey]) -> None:
+        """Have the Hub's own client bring files; what it did not bring, or not whole, is fetched one by one."""
+        from dmcvb_gen.release.hub import snapshot
+
+        missing = {
+            key: [file for file in self.commits[key][1].files if not (self.out / file.path).is_file()] for key in keys
+        }
+        wanted = [file for found in missing.values() for file in found]
+        self._brought |= snapshot(self.source.url, self.out, wanted, [key for key, found in missing.items() if found])
+
+    def _download(self, items: Sequence[tuple[ShardKey | None, FileRecord]], arrived) -> None:
+        left = collections.Counter(key for key, _ in items)
+
+        def work(item: tuple[ShardKey | None, FileRecord]) -> tuple[ShardKey | None, int, int]:
+            key, file = item
+            if self.stop.is_set():
+                raise StoreError("stopped; what was moved stays, run the same command again")
+            remote = f"{self.source.base}/{file.path}"
+            moved = download(self.source.filesystem, self.source.place, remote, self.out / file.path, file)
+            return key, moved or file.path in self._brought, file.bytes
+
+        def done(result: tuple[ShardKey | None, int, int]) -> None:
+            key, moved, size = result
+            self.moved = Moved(self.moved.files + 1, self.moved.bytes + size, self.moved.moved + bool(moved))
+            self._tick(size)
+            left[key] -= 1
+            if key is None or left[key] or key in self._kept:
+                return
+            text, commit = self.commits[key]
+            files.write_bytes(self.out / commit_path(*key), text)
+            if not commit.painted:
+                arrived(key)
+
+        in_parallel(work, items, self._workers, done)
+
+    def finish(self) -> Manifest:
+        """The release's own manifest and index where everything is here, as it was published; else digests."""
+        out, source = self.out, self.source
+        manifest = parse_manifest((out / MANIFEST).read_bytes(), str(out / MANIFEST))
+        commits = {record.name: read_commits(out, record) for record in source.manifest.subsets}
+        whole = all(len(commits[record.name]) == shard_count(record) for record in source.manifest.subsets)
+        if whole and [*map(_bare, manifest.subsets)] == [*map(_bare, source.manifest.subsets)]:
+            files.write_bytes(out / INDEX, source.index_text)
+            files.write_bytes(out / MANIFEST, source.manifest_text)
+            return source.manifest
+        if whole:
+            lineage = tuple(entry for entry in manifest.lineage if entry["kind"] != "fetch")
+            return finish_release(out, manifest.model_copy(update={"lineage": lineage}))
+        return write_release(out, manifest, commits)
+
+
+def _fetch_commits(
+    source: Source, listed: list[FileRecord], shards: dict[ShardKey, SubsetRecord], workers: int
+) -> dict[ShardKey, tuple[bytes, CommitRecord]]:
+    """The commit records of shards, as bytes and checked: digests, and that their files lie in the subset's folder."""
+
+    def one(item):
+        key, file = item
+
+        def attempt():
+            data = source.filesystem.cat_file(f"{source.base}/{file.path}")
+            if files.sha256_bytes(data) != file.sha256:
+                raise OSError(f"{file.path} does not have its digest")
+            return data
+
+        text = retry(source.place, file.path, attempt)
+        return text, checked_commit(text, f"{source.place}/{file.path}", shards[key], key[1])
+
+    found = in_parallel(one, list(zip(shards, listed, strict=True)), workers, lambda _: 0)
+    return dict(zip(shards, found, strict=True))
+
+
+def _bare(record: SubsetRecord) -> SubsetRecord:
+    return record.model_copy(update={"digest": None})
+
+
+def taken_up(out: Path, source: Source) -> Manifest | None:
+    """The manifest of the part that is in a folder already; None where the folder is empty or new.
+
+    Raises:
+      StoreError: `out` holds anything but a part of this release, painted or not.
+    """
+    if (out / MANIFEST).is_file():
+        old = parse_manifest((out / MANIFEST).read_bytes(), str(out / MANIFEST))
+        if not _same_release(old, source):
+            raise StoreError(
+                f"{out} holds {old.name} {old.version} and not the {source.manifest.name} {source.manifest.version} of "
+                "the URL; choose another --out"
+            )
+        return old
+    if out.exists() and (not out.is_dir() or any(p.suffix != files.PARTIAL for p in _strangers(out, source.manifest))):
+        raise StoreError(f"{out} is not empty and holds no release; choose an empty or new folder for --out")
+    return None
+
+
+def _same_release(old: Manifest, source: Source) -> bool:
+    """Whether a manifest is the published one's, or that of a part of it, or of what was painted from it."""
+    new = source.manifest
+    if {record.name for record in old.subsets} != {record.name for record in new.subsets}:
+        return False
+    if any(entry.get("manifest_sha256") == source.index.manifest_sha256 for entry in old.lineage):
+        return True
+    now = [_bare(record).model_copy(update={"pixels": True}) for record in new.subsets]
+    before = [_bare(record).model_copy(update={"pixels": True}) for record in old.subsets]
+    return (old.name, old.version, old.recipe, before) == (new.name, new.version, new.recipe, now)
+
+
+def _strangers(out: Path, manifest: Manifest) -> Iterable[Path]:
+    """What lies in a folder and is no part of an interrupted fetch."""
+    ours = {record.name.split("/")[0] for record in manifest.subsets} | {
+        "policies",
+        "commits",
+        "backgrounds",
+        CARD_FOLDER,
+        LOCK,
+    }
+    return (path for path in out.iterdir() if path.name not in ours | set(CARD_FILES))
+
+
+def _write_part(out: Path, source: Source, local: Manifest | None, only, episodes) -> None:
+    """A manifest that says that this is a part, and which: what is here while files come, and until all are."""
+    base = local or source.manifest
+    entry = {
+        "kind": "fetch",
+        "from": source.place,
+        "manifest_sha256": source.index.manifest_sha256,
+        "digest": source.manifest.digest,
+        "only": list(only),
+        "episodes": list(episodes) if episodes else None,
+    }
+    lineage = base.lineage if entry in base.lineage else (*base.lineage, entry)
+    (out / INDEX).unlink(missing_ok=True)
+    facts = {"lineage": lineage, "complete": False, "digest": None}
+    files.write_json(out / MANIFEST, base.model_copy(update=facts))
+    for record in base.subsets:
+        if (out / subset_path(record.name)).is_dir():
+            mark_created(out, record)
