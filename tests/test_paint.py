@@ -306,7 +306,7 @@ def test_another_painter_is_said_before_and_after(made, tmp_path):
     for environment in manifest["environments"]:
         environment["numba"] = "0.0.1"
     for subset in manifest["subsets"]:
-        subset["renderer"]["glass"] = "thick"
+        subset["renderer"]["version"] = "thick"
     write_json(path, manifest)
     subset = next(iter(open_release(tmp_path / "light").subsets.values()))
     commit = subset.commits[0]
@@ -316,4 +316,4 @@ def test_another_painter_is_said_before_and_after(made, tmp_path):
     assert result.exit_code == 1 and "1 of 1 differ" in result.stdout
     notes = result.stderr.splitlines()
     assert any("0.0.1 where the release was made" in note for note in notes)
-    assert any("glass is nothing here, thick in the manifest" in note for note in notes)
+    assert any("native's version is" in note and "thick in the manifest" in note for note in notes)

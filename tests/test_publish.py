@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import pathlib
 import re
 import resource
 import shutil
 import signal
+import tempfile
 import threading
 import types
 
@@ -25,6 +27,7 @@ from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release, transfer
 from dmcvb_gen.store.index import INDEX
+from dmcvb_gen.store.manifest import commit_path
 from dmcvb_gen.store.remote import public, reason
 from dmcvb_gen.store.writer import finish_release
 from tests.conftest import roll_out, small_recipe
@@ -201,7 +204,7 @@ def test_wrong_bytes_at_the_source_are_refused(s3, tiny, tmp_path):
     s3.direct.pipe_file(f"bucket/x/{pixels}", data[:-1] + bytes([data[-1] ^ 1]))
     with pytest.raises(StoreError, match="does not have its digest"):
         fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
-    assert not (tmp_path / "r" / pixels).exists() and not list((tmp_path / "r").rglob("commits/**/*.json"))
+    assert not (tmp_path / "r" / pixels).exists() and not (tmp_path / "r" / commit_path(NAME, 0)).exists()
     s3.direct.pipe_file(f"bucket/x/{pixels}", data)
     fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
     assert verify(tmp_path / "r").sound
@@ -404,7 +407,7 @@ class FakeHub:
     """The calls of huggingface_hub.HfApi that publishing makes, with a repository in memory."""
 
     def __init__(self):
-        self.files, self.commits, self.fail = {}, [], None
+        self.files, self.commits, self.tags, self.fail = {}, [], {}, None
 
     def create_repo(self, repo_id, repo_type, exist_ok):
         assert repo_type == "dataset" and exist_ok
@@ -418,6 +421,15 @@ class FakeHub:
                 data = self.files[path]
                 blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
                 yield types.SimpleNamespace(path=path, blob_id=blob, lfs=None)
+
+    def hf_hub_download(self, repo_id, filename, repo_type):
+        path = pathlib.Path(tempfile.mkdtemp(prefix="hub-")) / "file"
+        path.write_bytes(self.files[filename])
+        return str(path)
+
+    def create_tag(self, repo_id, tag, tag_message, revision, repo_type, exist_ok):
+        assert exist_ok and revision == str(len(self.commits))
+        self.tags.setdefault(tag, revision)
 
     def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit=None):
         if self.fail is not None and len(self.commits) == self.fail:
@@ -452,9 +464,64 @@ def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(ti
         (tmp_path / "there" / path).write_bytes(data)
     assert verify(tmp_path / "there").sound
     assert hub.publish_to_hub(tiny, manifest, index, url, api=api) == 0
-    new_version(copy)
+    assert api.tags == {"v1.0.0": "4"} and max(map(len, api.commits)) < 100
+    finish_release(copy, open_release(copy).manifest.model_copy(update={"version": "0.9.0"}))
     changed = open_release(copy).manifest
     with pytest.raises(StoreError, match="never changes"):
         hub.publish_to_hub(copy, changed, index_of(copy, changed), url, api=api)
     with pytest.raises(StoreError, match="hf://datasets/OWNER/NAME"):
         hub.publish_to_hub(tiny, manifest, index, "hf://models/x", api=api)
+    with pytest.raises(StoreError, match="newest"):
+        hub.publish_to_hub(tiny, manifest, index, "hf://datasets/me/x@v1", api=api)
+
+
+def hub_of(folder, monkeypatch):
+    """The Hub's client and its file system, with a published release in the folder "data" of a repository."""
+    import huggingface_hub
+    from fsspec.implementations.dirfs import DirFileSystem
+    from huggingface_hub.utils import filter_repo_objects
+
+    from dmcvb_gen.release import fetch as fetching
+
+    asked = []
+
+    def snapshot_download(repo_id, *, repo_type, revision, allow_patterns, local_dir):
+        assert (repo_id, repo_type, revision) == ("me/tiny", "dataset", "v1.0.0")
+        there = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+        for path in filter_repo_objects(there, allow_patterns=allow_patterns):
+            asked.append(path)
+            (pathlib.Path(local_dir) / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(folder / path, pathlib.Path(local_dir) / path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setattr(fetching, "file_system", lambda url, options: (DirFileSystem(str(folder)), "data"))
+    return asked
+
+
+def test_shards_come_from_the_hub_through_its_own_client(tiny, tmp_path, monkeypatch):
+    shutil.copytree(tiny, tmp_path / "hub" / "data")
+    asked = hub_of(tmp_path / "hub", monkeypatch)
+    url, files = "hf://datasets/me/tiny@v1.0.0/data", open_release(tiny)[NAME].commits
+    moved = fetch(url, tmp_path / "r", episodes=(1, 2))
+    assert sorted(asked) == [f"data/{file.path}" for file in files[1].files]  # of that shard, all and no others
+    assert moved.moved == moved.files and not list((tmp_path / "r").glob(".hub*"))
+    asked.clear()
+    fetch(url, tmp_path / "r")
+    assert sorted(asked) == [f"data/{file.path}" for file in files[0].files]
+    assert open_release(tmp_path / "r").manifest == open_release(tiny).manifest and verify(tmp_path / "r").sound
+
+
+def test_a_grown_release_adds_to_its_repository(tmp_path):
+    from dmcvb_gen.release import hub
+    from dmcvb_gen.release.publish import index_of
+
+    pattern = {"tasks": "walker-walk", "levels": "random", "episodes": 1, "max_steps": 3}
+    api, versions = FakeHub(), []
+    for settings in (["none"], ["none", "static"]):
+        roll_out(small_recipe(name="grows", subsets=[pattern | {"settings": settings}]), tmp_path / "r")
+        manifest = open_release(tmp_path / "r").manifest
+        hub.publish_to_hub(tmp_path / "r", manifest, index_of(tmp_path / "r", manifest), "hf://datasets/me/g", api=api)
+        versions.append(manifest.version)
+    assert versions == ["1.0.0", "1.1.0"] and list(api.tags) == ["v1.0.0", "v1.1.0"]
+    assert not any("none.zarr" in path for commit in api.commits[2:] for path in commit)
+    assert api.files["manifest.json"] == (tmp_path / "r/manifest.json").read_bytes()

@@ -18,7 +18,7 @@ from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, sha256_file
 from dmcvb_gen.store.growth import is_grown_from
-from dmcvb_gen.store.index import INDEX, is_card
+from dmcvb_gen.store.index import INDEX, Index, is_replaced, keeps, parse_index
 from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest, parse_manifest, subset_path
 from dmcvb_gen.store.remote import is_refusal, reason, refused
 from dmcvb_gen.store.shards import ShardKey
@@ -54,12 +54,12 @@ def tag_of(manifest: Manifest, folder: str) -> str:
 
 
 def publish_to_hub(
-    root: Path, manifest: Manifest, index, url: str, tick: Callable[[int], None] = lambda count: None, api=None
+    root: Path, manifest: Manifest, index: Index, url: str, tick: Callable[[int], None] = lambda count: None, api=None
 ) -> int:
     """Put a release into a data set repository (made if it is not there), and tag it; gives how many files were moved.
 
     Args:
-      index: the release's `store.index.Index`.
+      index: the release's.
       api: a `huggingface_hub.HfApi`, for tests; by default one with the environment's token.
 
     Raises:
@@ -81,7 +81,7 @@ def publish_to_hub(
         there = _blobs(api, where, [folder + file.path for file in index.files] + [folder + MANIFEST])
         found, mine = there.get(folder + MANIFEST, set()), _digests(root / MANIFEST)
         if found and not found & mine:
-            _check_grown(api, where, url, folder, manifest)
+            _check_grown(api, where, url, folder, manifest, index)
         todo = [] if found & mine else list(_to_send(root, index.files, there, folder))
         for first in range(0, len(todo), BATCH):
             part = todo[first : first + BATCH]
@@ -114,11 +114,15 @@ def _client_errors(url: str, doing: str = "publish to") -> Iterator[None]:
         raise StoreError(f"cannot {doing} {url} ({reason(error)}); run the same command again") from None
 
 
-def _check_grown(api, where, url: str, folder: str, manifest: Manifest) -> None:
+def _check_grown(api, where, url: str, folder: str, manifest: Manifest, index: Index) -> None:
     """Raises StoreError where the release that is there is not one that this has grown from."""
-    text = Path(api.hf_hub_download(**where, filename=folder + MANIFEST)).read_bytes()
+
+    def there(name: str) -> bytes:
+        return Path(api.hf_hub_download(**where, filename=folder + name)).read_bytes()
+
     try:
-        grown = is_grown_from(manifest, parse_manifest(text, f"{url}/{MANIFEST}"))
+        grown = is_grown_from(manifest, parse_manifest(there(MANIFEST), f"{url}/{MANIFEST}"))
+        grown = grown and keeps(index, parse_index(there(INDEX), f"{url}/{INDEX}").files)
     except StoreError:
         grown = False
     if not grown:
@@ -130,7 +134,7 @@ def _check_grown(api, where, url: str, folder: str, manifest: Manifest) -> None:
 
 def _to_send(root: Path, listed: Sequence[FileRecord], there: dict[str, set[str]], folder: str) -> Iterator[FileRecord]:
     """Files that are not there yet: new ones first, then those that take the place of an older version's."""
-    late = [file for file in listed if file.path.endswith("/zarr.json") or is_card(file.path)]
+    late = [file for file in listed if is_replaced(file.path)]
     for file in [*(file for file in listed if file not in set(late)), *late]:
         _check_local(root, file)
         if not there.get(folder + file.path, set()) & _digests(root / file.path):

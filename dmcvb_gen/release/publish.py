@@ -21,7 +21,8 @@ from dmcvb_gen.store.index import (
     Index,
     card_files,
     data_files,
-    is_card,
+    is_replaced,
+    keeps,
     parse_index,
     read_index,
 )
@@ -102,7 +103,7 @@ def publish(
         return Moved(len(index.files), total, publish_to_hub(root, manifest, index, url, tick))
     filesystem, base = file_system(url, options)
     place = public(url)
-    before = _published(filesystem, place, base, index.manifest_sha256, manifest)
+    before = _published(filesystem, place, base, index, manifest)
     if before == ():
         return Moved(len(index.files), total, 0)
     fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
@@ -124,18 +125,18 @@ def publish(
         try:
             create_object(filesystem, f"{base}/{MANIFEST}", text)
         except FileExistsError:
-            _published(filesystem, place, base, index.manifest_sha256, manifest)  # another one's raises
+            _published(filesystem, place, base, index, manifest)  # another one's raises
     retry(place, CLAIM, lambda: filesystem.rm_file(f"{base}/{CLAIM}"))
     return Moved(len(index.files), total, sum(results))
 
 
 def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     """Files in the order in which they go up: new ones first, then those that take the place of an older version's."""
-    late = [file for file in todo if file.path.endswith("/zarr.json") or is_card(file.path)]
+    late = [file for file in todo if is_replaced(file.path)]
     return [part for part in ([file for file in todo if file not in set(late)], late) if part]
 
 
-def _published(filesystem, place, base, digest: str, manifest: Manifest) -> tuple[FileRecord, ...] | None:
+def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tuple[FileRecord, ...] | None:
     """The files of an older version that this one has grown from; () for this very one, None where none is.
 
     Raises:
@@ -144,14 +145,16 @@ def _published(filesystem, place, base, digest: str, manifest: Manifest) -> tupl
     found = read_object(filesystem, place, f"{base}/{MANIFEST}")
     if found is None:
         return None
-    if files.sha256_bytes(found) == digest:
+    if files.sha256_bytes(found) == index.manifest_sha256:
         return ()
     what = "something else"
     try:
         other = parse_manifest(found, f"{place}/{MANIFEST}")
         what = f"{other.name} {other.version}"
         if is_grown_from(manifest, other):
-            return parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
+            before = parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
+            if keeps(index, before):
+                return before
     except StoreError:
         pass
     raise StoreError(

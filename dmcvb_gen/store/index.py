@@ -73,6 +73,17 @@ def is_card(path: str) -> bool:
     return path in CARD_FILES or path.startswith(f"{CARD_FOLDER}/")
 
 
+def is_replaced(path: str) -> bool:
+    """Whether a file of a release may be another one in its next version: metadata of arrays that grow, and the card."""
+    return path.endswith("/zarr.json") or is_card(path)
+
+
+def keeps(index: Index, before: Iterable[FileRecord]) -> bool:
+    """Whether a release has all files of an older version, byte for byte, but for those that growing replaces."""
+    now = set(index.files)
+    return all(file in now or is_replaced(file.path) for file in before)
+
+
 def parse_index(text: bytes, where: str = INDEX) -> Index:
     """An index from JSON.
 
