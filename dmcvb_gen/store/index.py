@@ -74,7 +74,7 @@ def is_card(path: str) -> bool:
 
 
 def is_replaced(path: str) -> bool:
-    """Whether a file of a release may be another one in its next version: metadata of arrays that grow, and the card."""
+    """Whether a file may be another one in a release's next version: metadata of arrays that grow, and the card."""
     return path.endswith("/zarr.json") or is_card(path)
 
 
