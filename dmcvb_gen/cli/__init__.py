@@ -28,7 +28,7 @@ COMMANDS = {
     "diff": ("release:diff_command", "Which subsets, episodes and digests differ between two releases."),
     "card": ("release:card", "Write a release's card: README.md, croissant.json, pictures."),
     "publish": ("release:publish", "Put a release at a URL: s3://, gs://, hf://, file: or any other of fsspec."),
-    "fetch": ("release:fetch", "Bring a published release, or a part of it."),
+    "fetch": ("fetch:fetch", "Bring a published release, or a part of it."),
     "export": ("release:export", "Write subsets in another format: HDF5, npz, Minari, LeRobot, RLDS, Zarr 2."),
     "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
     "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),

@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json, remote_option
-from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
 
 
 def parse_folder(context, parameter, text):
@@ -234,51 +233,31 @@ def _left_behind(path):
 @click.argument("url")
 @only_option
 @episodes_option
-@click.option("--paint", "painting", is_flag=True, help="Fill in pictures that travelled without, a shard as it comes.")
-@look_options
+@click.option("--paint", is_flag=True, help="Then fill in the pictures that travelled without; see `paint`.")
 @click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the release here.")
 @remote_option
 @transfers_option
 @json_option
-@click.pass_context
-def fetch(context, url, only, episodes, painting, size, views, goal, out, options, workers, as_json):
+def fetch(url, only, episodes, out, options, workers, paint, as_json):
     """Bring a published release, or only the shards that hold some episodes; run again, it goes on or adds.
-
-    With --paint, a shard is painted while the next ones come; exit code 1 where pictures are not the published ones.
 
     \b
     dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
-    dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
     """
-    from dmcvb_gen.release.fetch import fetch as run
+    from dmcvb_gen.release.publish import fetch as run
 
-    given = dict(options=options, workers=workers)
-    if not painting:
-        if size or views or goal:
-            raise click.UsageError("--size, --views and --goal say what to --paint.")
-        with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
-            moved, done = run(url, out, only, episodes, tick=bar.update, **given), None
-    else:
-        moved, done = _fetch_painted(url, out, only, episodes, look_of(size, views, goal), given, as_json)
+    with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
+        moved = run(url, out, only, episodes, options=options, workers=workers, tick=bar.update)
+    if paint:
+        from dmcvb_gen.release.paint import paint_release
+
+        with frames_bar(as_json) as bar:
+            done = paint_release(out, workers=min(workers, os.cpu_count() or 1), tick=bar.update)
+        for name in done.differing:
+            click.echo(f"note: pictures of {name} are not those that were published", err=True)
     if as_json:
-        print_json(dataclasses.asdict(moved) | (painted_facts(done) if done else {}))
-    else:
-        click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
-        if done:
-            show_painted(out, done)
-    context.exit(1 if done and done.differing else 0)
-
-
-def _fetch_painted(url, out, only, episodes, look, given, as_json):
-    from dmcvb_gen.release.fetch import fetch_and_paint
-    from dmcvb_gen.release.paint import Painter
-
-    with (
-        tqdm(unit="B", unit_scale=True, desc="fetched", disable=as_json or None) as bytes_bar,
-        tqdm(unit=" frames", unit_scale=True, desc="painted", disable=as_json or None) as frames,
-    ):
-        painter = Painter(look=look, workers=os.cpu_count() or 1, tick=frames.update, tell=tell)
-        return fetch_and_paint(url, out, only, episodes, painter=painter, tick=bytes_bar.update, **given)
+        return print_json(dataclasses.asdict(moved) | ({"painted": done.shards} if paint else {}))
+    click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
 
 
 @click.command()

@@ -1,0 +1,64 @@
+"""fetch."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import click
+from tqdm import tqdm
+
+from dmcvb_gen.cli.common import format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
+from dmcvb_gen.cli.release import episodes_option, only_option, parse_folder, transfers_option
+
+
+@click.command()
+@click.argument("url")
+@only_option
+@episodes_option
+@click.option("--paint", "painting", is_flag=True, help="Fill in pictures that travelled without, a shard as it comes.")
+@look_options
+@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the release here.")
+@remote_option
+@transfers_option
+@json_option
+@click.pass_context
+def fetch(context, url, only, episodes, painting, size, views, goal, out, options, workers, as_json):
+    """Bring a published release, or only the shards that hold some episodes; run again, it goes on or adds.
+
+    With --paint, a shard is painted while the next ones come; exit code 1 where pictures are not the published ones.
+
+    \b
+    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
+    dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
+    """
+    from dmcvb_gen.release.fetch import fetch as run
+
+    given = dict(options=options, workers=workers)
+    if not painting:
+        if size or views or goal:
+            raise click.UsageError("--size, --views and --goal say what to --paint.")
+        with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
+            moved, done = run(url, out, only, episodes, tick=bar.update, **given), None
+    else:
+        moved, done = _fetch_painted(url, out, only, episodes, look_of(size, views, goal), given, as_json)
+    if as_json:
+        print_json(dataclasses.asdict(moved) | (painted_facts(done) if done else {}))
+    else:
+        click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
+        if done:
+            show_painted(out, done)
+    context.exit(1 if done and done.differing else 0)
+
+
+def _fetch_painted(url, out, only, episodes, look, given, as_json):
+    from dmcvb_gen.release.fetch import fetch_and_paint
+    from dmcvb_gen.release.paint import Painter
+
+    with (
+        tqdm(unit="B", unit_scale=True, desc="fetched", disable=as_json or None) as bytes_bar,
+        tqdm(unit=" frames", unit_scale=True, desc="painted", disable=as_json or None) as frames,
+    ):
+        painter = Painter(look=look, workers=os.cpu_count() or 1, tick=frames.update, tell=tell)
+        return fetch_and_paint(url, out, only, episodes, painter=painter, tick=bytes_bar.update, **given)
