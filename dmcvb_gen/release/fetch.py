@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import os
 import queue
+import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -274,11 +274,11 @@ class Arrival:
         if with_pictures:
             wanted += [f for key, (_, c) in self.commits.items() if key not in self._kept for f in c.pictures]
         needed = sum(file.bytes for file in wanted if not (self.out / file.path).exists())
-        free = os.statvfs(self.out)
-        if needed > free.f_bavail * free.f_frsize:
+        free = shutil.disk_usage(self.out).free
+        if needed > free:
             raise StoreError(
-                f"{needed / 1e9:.1f} GB are needed and {free.f_bavail * free.f_frsize / 1e9:.1f} GB are free at "
-                f"{self.out}; make room, choose another --out, or fetch less with --only and --episodes"
+                f"{needed / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free at {self.out}; make "
+                "room, choose another --out, or fetch less with --only and --episodes"
             )
 
     def bring(self, arrived: Callable[[ShardKey], None] = lambda key: None) -> Moved:
