@@ -20,7 +20,7 @@ from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
-from tests.conftest import small_recipe
+from tests.conftest import roll_out, small_recipe
 
 NAME = "walker-walk/random/dynamic"
 
@@ -185,3 +185,33 @@ def test_a_policy_that_is_nowhere_is_named(copy):
     (copy / "manifest.json").write_text(json.dumps(data))
     with pytest.raises(StoreError, match="policies/mine.safetensors"):
         Regeneration(copy).check()
+
+
+def test_a_manifest_alone_is_enough(tmp_path):
+    patterns = [LOCOMOTION | {"settings": "dynamic", "levels": "expert"}, MAZE | {"settings": ["hidden", "fixed"]}]
+    short = [pattern | {"max_steps": 5, "episodes": 2} for pattern in patterns]
+    made = roll_out(small_recipe(subsets=short), tmp_path / "r")
+    (tmp_path / "card").mkdir()
+    shutil.copy(tmp_path / "r/manifest.json", tmp_path / "card/kept.json")
+    shutil.rmtree(tmp_path / "r")
+
+    command = ["regenerate", "--manifest", str(tmp_path / "card/kept.json"), "--out", str(tmp_path / "again")]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    assert "made again with the same digest" in result.output and "no digest" not in result.output
+    again = open_release(tmp_path / "again").manifest
+    assert {s.name: s.digest for s in again.subsets} == {s.name: s.digest for s in made.subsets} and len(
+        again.subsets
+    ) == 3
+    assert [path.name for path in (tmp_path / "card").iterdir()] == ["kept.json"]
+
+    wrong = made.model_copy(update={"subsets": tuple(s.model_copy(update={"digest": "0" * 64}) for s in made.subsets)})
+    write_json_atomically(tmp_path / "card/wrong.json", json.loads(wrong.model_dump_json()))
+    part = ["--manifest", str(tmp_path / "card/wrong.json"), "--only", "*/*/hidden", "--out", str(tmp_path / "part")]
+    result = CliRunner().invoke(main, ["regenerate", *part])
+    assert result.exit_code == 1 and "other bytes" in result.output
+
+
+@pytest.mark.parametrize("arguments", [[], ["r", "--manifest", __file__], ["--manifest", __file__]])
+def test_a_manifest_and_a_release_are_not_mixed_up(arguments):
+    assert CliRunner().invoke(main, ["regenerate", *arguments]).exit_code == 2

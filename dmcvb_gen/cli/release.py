@@ -94,7 +94,12 @@ def frames_bar(as_json):
 
 
 @click.command()
-@click.argument("path", metavar="RELEASE")
+@click.argument("path", metavar="[RELEASE]", required=False)
+@click.option(
+    "--manifest",
+    type=click.Path(exists=True, dir_okay=False),
+    help="A manifest alone, instead of a release.",
+)
 @only_option
 @episodes_option
 @click.option("--check", is_flag=True, help="Only compare digests; change nothing.")
@@ -106,7 +111,9 @@ def frames_bar(as_json):
 @ray_option
 @json_option
 @click.pass_context
-def regenerate(context, path, only, episodes, check, out, backgrounds, device, workers, executor, ray_address, as_json):
+def regenerate(
+    context, path, manifest, only, episodes, check, out, backgrounds, device, workers, executor, ray_address, as_json
+):
     """Make a release's shards again from its manifest alone, bit for bit.
 
     Repairs damaged and missing shards in place, unless --check or --out is given. Exit code 1 when a shard comes
@@ -115,9 +122,15 @@ def regenerate(context, path, only, episodes, check, out, backgrounds, device, w
     \b
     dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
     dmcvb-gen regenerate releases/mini
+    dmcvb-gen regenerate --manifest dataset_cards/dmcvb-mini/manifest.json --only 'cheetah-run/*/none' --out part
     """
     from dmcvb_gen.release.regenerate import Regeneration
 
+    if (path is None) == (manifest is None):
+        raise click.UsageError("Give a RELEASE, or the file of a manifest with --manifest.")
+    if manifest and not out:
+        raise click.UsageError("A manifest alone has no shards to repair; say with --out where to make them.")
+    path = path or manifest
     if check and out:
         raise click.UsageError("Give --check or --out, not both.")
     work = Regeneration(path, only, episodes, backgrounds, device, crew(workers, executor, ray_address))

@@ -327,10 +327,15 @@ def open_release(path: str | Path, storage_options: dict | None = None, skip: Co
 def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
     """A local release's folder and manifest.
 
+    Args:
+      root: the folder, or a manifest's file, whose folder may hold nothing else.
+
     Raises:
       StoreError: there is none.
     """
     root = Path(root)
+    if root.is_file():
+        return root.parent, parse_manifest(root.read_bytes(), str(root))
     if not (root / MANIFEST).is_file():
         raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
     return root, parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))

@@ -37,6 +37,11 @@ GUIDE = "ant-maze-empty7x7"
 """The task whose bundled expert walks where --init-from names none."""
 
 
+EVALUATION_STEPS = 40.0
+"""Agent steps simulated in evaluations for each one trained, at most: runs take minutes, and medium is picked from
+checkpoints a few hundred steps apart."""
+
+
 @dataclass(frozen=True)
 class GuidedSettings:
     """Settings of `GuidedRun`.
@@ -59,7 +64,7 @@ class GuidedSettings:
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    ramp: Natural = 10_000
+    ramp: Natural = 20_000
     half_life: Positive = 20_000
     layers: Count = 3
     width: Count = 256
@@ -94,6 +99,9 @@ class GuidedRun(Run):
 
     def warmup(self) -> int:
         return 0
+
+    def evaluation_steps(self) -> float:
+        return EVALUATION_STEPS
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
         settings, config = self.settings, self.config

@@ -187,6 +187,10 @@ class Run(abc.ABC):
     def warmup(self) -> int:
         """Agent steps before anything is learned."""
 
+    def evaluation_steps(self) -> float:
+        """Agent steps simulated in evaluations for each one trained, at most."""
+        return EVALUATION_STEPS[self.task.family]
+
     def problem(self) -> str | None:
         """Why a run with these settings would come to nothing, and the cure; None where nothing is wrong."""
         return None
@@ -251,7 +255,7 @@ class Run(abc.ABC):
     def evaluation_episodes(self) -> int:
         """Episodes of the evaluation after the steps trained since the one before, so that all keep to their share."""
         since = self.step - max((step for step in self._log.curve if step < self.step), default=0)
-        affordable = EVALUATION_STEPS[self.task.family] * since / self.task.max_steps
+        affordable = self.evaluation_steps() * since / self.task.max_steps
         return int(np.clip(affordable, 1, EVALUATION_EPISODES))
 
     def next_evaluation(self, evaluation: Evaluation, planned: int) -> int:
