@@ -58,9 +58,10 @@ class Structure:
 def check_policy_returns(subset: Subset) -> Iterator[Finding]:
     """Each policy's episodes return what its file says it returned when it was evaluated.
 
-    That was over random starts and goals: episodes of fixed ones return what those are worth.
+    That was over random starts and goals and the task's own time limit: episodes of fixed ones, or of other length,
+    return what those are worth.
     """
-    if subset.setting == FIXED:
+    if not _comparable(subset):
         return
     behaviour = subset.read("behaviour")
     for index, policy in enumerate(subset.record.policies):
@@ -82,10 +83,15 @@ def check_policy_returns(subset: Subset) -> Iterator[Finding]:
             )
 
 
+def _comparable(subset: Subset) -> bool:
+    """Whether returns are of episodes as policies were evaluated on, and as the paper's tables are of."""
+    return subset.setting != FIXED and subset.record.max_steps == get_task(subset.task).max_steps
+
+
 def check_paper_returns(subset: Subset) -> Iterator[Finding]:
     """Warns where the mean return is not near the paper's table."""
     paper, expert = paper_returns(subset.task, subset.level), paper_returns(subset.task, "expert")
-    if not paper or not len(subset.returns) or subset.setting == FIXED:  # the paper's are over random goals, too
+    if not paper or not len(subset.returns) or not _comparable(subset):
         return
     if get_task(subset.task).family == ANT_MAZE:
         scale = abs(paper_returns(subset.task, "medium")["mean"] - expert["mean"])

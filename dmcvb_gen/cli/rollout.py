@@ -262,7 +262,9 @@ def _recipe_from_options(tasks, options):
     if families == {ANT_MAZE}:
         if options["settings"]:
             raise click.UsageError("Mazes vary in style, not by --distractor; use --goal visible|hidden.")
-        settings = (FIXED,) if options["fixed_goals"] else options["goals"] or None
+        settings = (*options["goals"], *([FIXED] if options["fixed_goals"] else [])) or None
+        if settings == (FIXED,) and (options["episodes"] or options["steps"]):
+            raise click.UsageError("Of fixed goals there are --episodes-per-goal; --episodes, --steps are for --goal.")
     else:
         if options["goals"] or options["fixed_goals"]:
             raise click.UsageError("--goal and --fixed-goals are for ant-maze tasks.")
