@@ -15,7 +15,9 @@ from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.paint import without_pictures
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.pictures import training_pictures
 from dmcvb_gen.store.writer import sha256_file
 
 
@@ -64,12 +66,60 @@ def test_pictures_are_there_and_named(carded):
 def test_croissants_validator_accepts_the_metadata_and_reads_its_records(carded):
     mlc = pytest.importorskip("mlcroissant")
     dataset = mlc.Dataset(carded / "croissant.json")
-    assert not dataset.metadata.issues.errors
+    assert not dataset.metadata.issues.errors and not dataset.metadata.issues.warnings
     rows = list(dataset.records("subsets"))
     assert len(rows) == 3 and {row["subsets/steps"] for row in rows} == {1500}
+    episodes = list(dataset.records("episodes"))
+    lengths = [row["episodes/length"] for row in episodes]
+    assert lengths == [500] * 9 and episodes[0]["episodes/first_frame"].size == (16, 16)
     data = json.loads((carded / "croissant.json").read_text())
     for file in data["distribution"]:
-        assert file["sha256"] == sha256_file(carded / file["contentUrl"])
+        if file["@type"] == "cr:FileObject":
+            assert file["sha256"] == sha256_file(carded / file["contentUrl"])
+    assert data["conformsTo"][0].endswith("croissant/1.1") and data["prov:wasGeneratedBy"]["prov:used"]
+    loaded = dataset.metadata
+    assert loaded.data_limitations and loaded.data_biases and loaded.data_use_cases and loaded.data_collection
+    assert loaded.date_published.isoformat()[:10] == data["datePublished"] and data["rai:hasSyntheticData"] is True
+
+
+def rows_of(folder):
+    datasets = pytest.importorskip("datasets")
+    datasets.disable_progress_bars()
+    return datasets.load_dataset(str(folder), cache_dir=str(folder.parent / "cache"))["train"]
+
+
+@pytest.mark.parametrize("light", [False, True])
+def test_the_hubs_loader_reads_the_episodes_with_their_first_frames(small_release, small_mazes, tmp_path, light):
+    for source in (small_release, small_mazes):
+        folder = tmp_path / source.name
+        shutil.copytree(source, folder) if not light else without_pictures(source, folder)
+        write_card(folder)
+        fields = yaml.safe_load((folder / "README.md").read_text().split("---\n")[1])
+        rows, release = rows_of(folder), open_release(source)
+        assert fields["configs"][0]["data_files"] == [{"split": "train", "path": "card/episodes.parquet"}]
+        assert fields["dataset_info"]["splits"][0]["num_examples"] == len(rows)
+        assert {f["name"]: f["dtype"] for f in fields["dataset_info"]["features"]}["first_frame"] == "image"
+        for row in rows:
+            subset, episode = release[row["subset"]], row["episode"]
+            name = training_pictures(subset).arrays[0]
+            assert np.array_equal(np.asarray(row["first_frame"]), subset.array(name)[episode, 0])
+            assert row["return"] == subset.read("return", [episode])[0] and row["policy"] == "random"
+            assert row["seed"] == subset.read("seed", [episode])[0]
+        assert len(rows) == sum(len(subset.episodes) for subset in release.subsets.values())
+        assert check_card(folder) == []
+
+
+def test_the_place_and_day_of_publication_are_kept(copy):
+    result = CliRunner().invoke(main, ["card", str(copy), "--url", "hf://datasets/me/small"])
+    assert result.exit_code == 0, result.output
+    path = copy / "croissant.json"
+    data = json.loads(path.read_text())
+    assert data["url"] == "https://huggingface.co/datasets/me/small"
+    path.write_text(path.read_text().replace(data["datePublished"], "2001-02-03"))
+    assert check_card(copy) == []
+    write_card(copy)
+    again = json.loads(path.read_text())
+    assert (again["url"], again["datePublished"]) == (data["url"], "2001-02-03")
 
 
 def test_a_fitting_card_passes_and_a_lying_one_is_found(copy):
@@ -83,6 +133,8 @@ def test_a_fitting_card_passes_and_a_lying_one_is_found(copy):
     (copy / "manifest.json").write_text(json.dumps(data))
     assert len(check_card(copy)) == 3  # README, croissant.json, and a changelog that does not know the version
     (copy / "card/contact_sheet.png").unlink()
+    (copy / "card/episodes.parquet").write_bytes(b"no table")
+    assert any("episodes.parquet cannot be read" in finding for finding in check_card(copy))
     result = CliRunner().invoke(main, ["card", str(copy), "--check"])
     assert result.exit_code == 1 and "CHANGELOG.md does not speak of version 1.0.1" in result.output
     assert "picture" in result.output

@@ -1,16 +1,18 @@
-"""A release's card: README.md, croissant.json and pictures at its root, all filled from the manifest and the data.
+"""A release's card: README.md, croissant.json, pictures, a table of episodes; filled from the manifest and the data.
 
 `check_card` fills them again and compares, so a card cannot come to disagree with its data unnoticed.
 """
 
 from __future__ import annotations
 
+import datetime
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from PIL import Image
 
 from dmcvb_gen.behaviours.policies.header import origin_of
@@ -19,7 +21,9 @@ from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.names import ANT_MAZE, distractor_of
-from dmcvb_gen.release.croissant import croissant
+from dmcvb_gen.readers.painted import Painting, painted_release
+from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
+from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
 from dmcvb_gen.rollout.info import describe_release
 from dmcvb_gen.rollout.preview import contact_sheet
 from dmcvb_gen.store import Release, open_release
@@ -42,23 +46,26 @@ CITATION = """@inproceedings{ortiz2024dmcvb,
 }"""
 
 
-def write_card(root: str | Path, out: str | Path | None = None) -> list[Path]:
-    """Write README.md, croissant.json, the pictures, and a CHANGELOG.md if there is none.
+def write_card(root: str | Path, out: str | Path | None = None, url: str | None = None) -> list[Path]:
+    """Write README.md, croissant.json, pictures, the table of episodes, and a CHANGELOG.md if there is none.
 
     Args:
       out: another folder for them, instead of the release.
+      url: where the release is (or will be) published; by default what the card that is there says.
 
     Raises:
       StoreError: there is no release, it has no episodes, or the folder cannot be written.
     """
     release = _open(root)
     folder = Path(out) if out else release.path
-    texts = _texts(release)
-    if not (folder / CHANGELOG).exists():
-        manifest = release.manifest
-        texts[CHANGELOG] = f"# Changelog of {manifest.name}\n\n## {manifest.version}\n\n- First release.\n"
+    told = _told(folder, release.manifest)
+    published = Publication(page_of(url) if url else told.url, told.date)
     try:
-        (folder / CARD_FOLDER).mkdir(parents=True, exist_ok=True)
+        write_table(release, folder / TABLE)
+        texts = _texts(release, folder / TABLE, published)
+        if not (folder / CHANGELOG).exists():
+            manifest = release.manifest
+            texts[CHANGELOG] = f"# Changelog of {manifest.name}\n\n## {manifest.version}\n\n- First release.\n"
         for name, text in texts.items():
             (folder / name).write_text(text)
         plot_returns(release, folder / PLOT)
@@ -67,7 +74,20 @@ def write_card(root: str | Path, out: str | Path | None = None) -> list[Path]:
         raise StoreError(f"cannot write the card to {folder}: {error.strerror or error}; give --out") from None
     if folder.resolve() == release.path.resolve():
         take_in_card(folder)
-    return [folder / name for name in (*texts, PLOT, SHEET)]
+    return [folder / name for name in (*texts, PLOT, SHEET, TABLE)]
+
+
+def _told(folder: Path, manifest: Manifest) -> Publication:
+    """Where and when this version was published, as the card that is there says; today and nowhere if none is."""
+    try:
+        known = json.loads((folder / CROISSANT).read_text())
+    except (OSError, ValueError):
+        known = None
+    if not isinstance(known, dict) or known.get("version") != manifest.version:
+        known = {}
+    date = str(known.get("datePublished") or datetime.date.today().isoformat())
+    url = known.get("url")
+    return Publication(None if url in (None, HOME) else str(url), date)
 
 
 def check_card(root: str | Path) -> list[str]:
@@ -77,12 +97,17 @@ def check_card(root: str | Path) -> list[str]:
       StoreError: there is no release, or it has no episodes.
     """
     release, findings = _open(root), []
-    for name, text in _texts(release).items():
+    table = release.path / TABLE
+    problem = table_problem(release, table)
+    if problem:
+        findings.append(f"{TABLE} {problem}")
+    texts = {} if problem else _texts(release, table, _told(release.path, release.manifest))
+    for name in (README, CROISSANT):
         path = release.path / name
         if not path.is_file():
             findings.append(f"{name} is missing")
-        elif path.read_bytes() != text.encode():
-            line = _first_difference(path.read_text(errors="replace"), text)
+        elif name in texts and path.read_bytes() != texts[name].encode():
+            line = _first_difference(path.read_text(errors="replace"), texts[name])
             findings.append(f"{name} does not fit the release at line {line}")
     sheet = release.path / SHEET
     if not sheet.is_file() or not (release.path / PLOT).is_file():
@@ -117,15 +142,19 @@ def _open(root) -> Release:
     return release
 
 
-def _texts(release: Release) -> dict[str, str]:
+def _texts(release: Release, table: Path, published: Publication) -> dict[str, str]:
     facts = describe_release(release.path)
     summary = _summary(release.manifest, facts)
-    metadata = croissant(release, facts, summary, CITATION)
-    return {README: card_text(release, facts, summary), CROISSANT: json.dumps(metadata, indent=1) + "\n"}
+    limits = _limits(release)
+    metadata = croissant(release, facts, summary, CITATION, limits, table, published)
+    text = card_text(release, facts, summary, limits, header_facts(table))
+    return {README: text, CROISSANT: json.dumps(metadata, indent=1) + "\n"}
 
 
 def _sheet(release: Release) -> np.ndarray:
-    return contact_sheet([s for s in release.subsets.values() if s.pixel_arrays], episodes=1, scale=1)
+    """A strip of the first episode of each subset, painted where it has no pictures."""
+    chosen = painted_release(release, Painting(cache_bytes=0), missing=True)
+    return contact_sheet([s for s in chosen.subsets.values() if s.pixel_arrays], episodes=1, scale=1)
 
 
 # -- text -----------------------------------------------------------------------------------------
@@ -146,26 +175,35 @@ def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
     return text.strip()
 
 
-def header(manifest: Manifest, steps: int) -> str:
-    """The YAML header that the Hugging Face Hub reads."""
+def header(manifest: Manifest, steps: int, table: dict[str, Any]) -> str:
+    """The YAML header that the Hugging Face Hub reads.
+
+    Args:
+      table: what it says of the table of episodes, see `episode_table.header_facts`.
+    """
     category = next((name for limit, name in SIZES if steps < limit), "n>10M")
-    tags = ["offline-rl", "visual-distractors", "mujoco", "dm-control", "zarr", "croissant"]
-    lines = ["---", f"pretty_name: {manifest.name} {manifest.version}", f"license: {manifest.license.lower()}"]
-    lines += ["task_categories:", "- reinforcement-learning", "- robotics", "tags:"] + [f"- {tag}" for tag in tags]
-    lines += ["size_categories:", f"- {category}", "---"]
-    return "\n".join(lines)
+    facts = {
+        "pretty_name": f"{manifest.name} {manifest.version}",
+        "license": manifest.license.lower(),
+        "task_categories": ["reinforcement-learning", "robotics"],
+        "tags": ["offline-rl", "visual-distractors", "mujoco", "dm-control", "zarr", "croissant", "synthetic"],
+        "size_categories": [category],
+    }
+    return f"---\n{yaml.safe_dump(facts | table, sort_keys=False, allow_unicode=True)}---"
 
 
-def card_text(release: Release, facts: dict[str, Any], summary: str) -> str:
+def card_text(
+    release: Release, facts: dict[str, Any], summary: str, limits: Sequence[str], table: dict[str, Any]
+) -> str:
     """The text of README.md."""
     manifest = release.manifest
     first = next(iter(release.subsets.values()))
-    lines = [header(manifest, facts["steps"]), "", f"# {manifest.name} {manifest.version}", "", summary, ""]
+    lines = [header(manifest, facts["steps"], table), "", f"# {manifest.name} {manifest.version}", "", summary, ""]
     lines += [f"![First episode of every subset]({SHEET})", "", "## Composition", "", *_composition(facts), ""]
     lines += ["## Arrays", "", *_arrays(release), ""]
     lines += ["## Returns", "", *_returns(facts), ""]
     lines += ["## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
-    lines += ["## Known limits", "", *(f"- {limit}" for limit in _limits(release)), ""]
+    lines += ["## Known limits", "", *(f"- {limit}" for limit in limits), ""]
     lines += ["## Load it", "", *_loading(manifest, first.name), ""]
     lines += ["## Check it, make it again", "", "```bash", f"dmcvb-gen verify {manifest.name}"]
     lines += [f"# digest {manifest.digest or 'not finished'}"]
@@ -240,6 +278,8 @@ def _loading(manifest: Manifest, name: str) -> list[str]:
         'stacks = subset.torch("steps", stack=3)        # torch Dataset of 3-frame stacks',
         "for batch in subset.batches(256): ...          # shuffled numpy batches",
         "```",
+        "",
+        f"`{TABLE}` has a row an episode: return, length, seed, policy, first frame; `datasets.load_dataset` reads it.",
         "",
         f'or with plain zarr or xarray: `xarray.open_zarr("{manifest.name}/{name}.zarr")` (Zarr format 3, '
         "consolidated metadata).",

@@ -1,0 +1,161 @@
+"""A table of a release's episodes for whoever browses it: a release in, one Parquet file out, a row an episode.
+
+The viewer of the Hugging Face Hub shows it and `datasets.load_dataset` reads it: its schema says that the first frames
+are pictures, and the card's header says the same (`header_facts`).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
+from dmcvb_gen.release.contents import is_imported
+from dmcvb_gen.rollout.jobs import background_source
+from dmcvb_gen.rollout.painting import renderer_for
+from dmcvb_gen.store import Release, Subset
+from dmcvb_gen.store.index import CARD_FOLDER
+from dmcvb_gen.store.pictures import training_pictures
+
+TABLE = f"{CARD_FOLDER}/episodes.parquet"
+CONFIG = "episodes"
+FRAME = 64
+"""Pixels a side of a first frame, at most."""
+ROWS = 500
+"""Episodes that are held at a time, and in one group of the file."""
+PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+"""How `datasets` stores a picture."""
+COLUMNS = {
+    "subset": (pa.string(), "task/level/distractor, the subset's folder without .zarr"),
+    "episode": (pa.int64(), "index in the subset"),
+    "return": (pa.float64(), "sum of the episode's rewards"),
+    "length": (pa.int32(), "steps"),
+    "seed": (pa.uint64(), "of the episode's random streams"),
+    "policy": (pa.string(), "the behaviour policy"),
+    "terminated": (pa.bool_(), "whether the task ended it, and not the time limit"),
+    "first_frame": (PICTURE, "the first observation's first view"),
+}
+"""Column -> (type, what it is)."""
+
+
+def write_table(release: Release, path: Path) -> None:
+    """Write the table; the first frames of episodes without pictures are painted.
+
+    Raises:
+      StoreError: something cannot be read or written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with pq.ParquetWriter(path, _schema(), compression="zstd") as writer:
+        for subset in release.subsets.values():
+            for first in range(0, len(subset.episodes), ROWS):
+                few = subset.episodes[first : first + ROWS]
+                writer.write_table(pa.Table.from_pydict(_facts(subset, few) | _frames(subset, few), _schema()))
+
+
+def table_problem(release: Release, path: Path) -> str | None:
+    """What of a table does not fit its release, pictures aside; None when all is well."""
+    if not path.is_file():
+        return "is missing"
+    names = [name for name in COLUMNS if name != "first_frame"]
+    try:
+        stored = pq.read_table(path, columns=names)
+    except (pa.ArrowInvalid, OSError, KeyError):
+        return "cannot be read"
+    plain = pa.schema([(name, COLUMNS[name][0]) for name in names])
+    parts = [pa.Table.from_pydict(_facts(subset, subset.episodes), plain) for subset in release.subsets.values()]
+    fits = stored.cast(plain).equals(pa.concat_tables(parts)) if stored.schema.names == names else False
+    return None if fits else "does not fit the release's episodes"
+
+
+def header_facts(path: Path) -> dict[str, Any]:
+    """`configs` and `dataset_info` of the card's header, for the table at `path`."""
+    data = pq.read_metadata(path)
+    size = sum(data.row_group(group).total_byte_size for group in range(data.num_row_groups))
+    return {
+        "configs": [
+            {"config_name": CONFIG, "default": True, "data_files": [{"split": "train", "path": TABLE}]},
+        ],
+        "dataset_info": {
+            "config_name": CONFIG,
+            "features": [{"name": name, "dtype": _dtype(kind)} for name, (kind, _) in COLUMNS.items()],
+            "splits": [{"name": "train", "num_bytes": size, "num_examples": data.num_rows}],
+            "download_size": path.stat().st_size,
+            "dataset_size": size,
+        },
+    }
+
+
+def _dtype(kind: pa.DataType) -> str:
+    """A type as `datasets` names it."""
+    return "image" if kind == PICTURE else {"double": "float64"}.get(str(kind), str(kind))
+
+
+def _schema() -> pa.Schema:
+    features: dict[str, Any] = {
+        name: {"_type": "Image"} if kind == PICTURE else {"dtype": _dtype(kind), "_type": "Value"}
+        for name, (kind, _) in COLUMNS.items()
+    }
+    metadata = {"huggingface": json.dumps({"info": {"features": features}})}
+    return pa.schema([(name, kind) for name, (kind, _) in COLUMNS.items()], metadata=metadata)
+
+
+def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
+    """Every column but the pictures."""
+    policies = [policy.name for policy in subset.record.policies] or ["random"]
+    values = {name: subset.read(name, episodes) for name in ("return", "length", "terminated")}
+    if is_imported(subset):
+        seeds, behaviour = np.zeros(len(episodes), np.uint64), np.full(len(episodes), -1)
+    else:
+        seeds, behaviour = subset.read("seed", episodes), subset.read("behaviour", episodes)
+    return values | {
+        "subset": [subset.name] * len(episodes),
+        "episode": np.asarray(episodes, np.int64),
+        "seed": seeds,
+        "policy": [policies[index] if 0 <= index < len(policies) else "unknown" for index in behaviour],
+    }
+
+
+def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
+    """The column of the pictures."""
+    name = training_pictures(subset).arrays[0]
+    without = subset.unpainted[episodes]
+    frames: dict[int, np.ndarray] = {}
+    for episode in episodes[~without] if name in subset.arrays else ():
+        frames[int(episode)] = subset.array(name)[int(episode), 0]
+    lacking = np.array([episode for episode in episodes if int(episode) not in frames], int)
+    if len(lacking) and not is_imported(subset):
+        frames |= dict(zip(lacking.tolist(), _painted(subset, lacking), strict=True))
+    return {"first_frame": [_picture(frames.get(int(episode))) for episode in episodes]}
+
+
+def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
+    """First frames, painted from the stored physics states and labels."""
+    pictures = training_pictures(subset)
+    renderer, _ = renderer_for(subset.record, background_source(Path(subset.root), subset.record))
+    try:
+        physics = subset.read("physics", episodes)[:, 0]
+        labels = Exogenous(**{name: subset.read(f"exogenous/{name}", episodes)[:, 0] for name in EXOGENOUS_NAMES})
+        yield from renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]
+    finally:
+        renderer.close()
+
+
+def _picture(frame: np.ndarray | None) -> dict[str, Any] | None:
+    if frame is None:
+        return None
+    if frame.ndim != 3 or frame.shape[-1] != 3:
+        raise StoreError(f"a first frame has shape {frame.shape}, which is no picture")
+    picture, buffer = Image.fromarray(frame), io.BytesIO()
+    if max(picture.size) > FRAME:
+        picture = picture.resize((FRAME, FRAME), Image.Resampling.BOX)
+    picture.save(buffer, "PNG")
+    return {"bytes": buffer.getvalue(), "path": None}
