@@ -11,6 +11,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
+from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.plan import make_plan
 from dmcvb_gen.store import open_release
@@ -139,3 +140,13 @@ def test_the_card_lists_the_arrays_of_every_kind_of_subset(grown, tmp_path):
     assert "`walker-walk/random/none`, `walker-walk/random/static`:" in arrays
     assert "| `pixels` | uint8 |" in arrays and "| `pixels_hidden_goal_top` | uint8 |" in arrays
     assert arrays.count("| `physics` | float64 |") == 2
+
+
+def test_repainting_keeps_to_the_recipe_that_added_each_subset(grown, tmp_path):
+    name = "ant-maze-tiny/random/hidden"
+    manifest = repaint(Repainting(grown, tmp_path / "new", split="val"))
+    assert manifest.recipe_of(name)["seed"] == 8 and manifest.recipe["seed"] == 3
+    maze = {"tasks": TINY_MAZE, "levels": "random", "settings": "hidden", "episodes": 1}
+    whole = roll_out(small_recipe(seed=8, split="val", subsets=[maze]), tmp_path / "whole")
+    digests = {record.name: record.digest for record in manifest.subsets}
+    assert digests[name] == whole.subsets[0].digest and len(digests) == 3

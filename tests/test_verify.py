@@ -197,3 +197,16 @@ def test_a_manifest_that_names_another_digest_is_found(copy):
     data["subsets"][0]["digest"] = "0" * 64
     (copy / "manifest.json").write_text(json.dumps(data))
     assert {check for check, _ in checks(copy)} == {"files"}
+
+
+def test_files_that_no_digest_speaks_of_are_named(copy):
+    (copy / "preview").mkdir()
+    (copy / "preview" / "sheet.png").write_bytes(b"")  # where `preview` writes
+    assert verify(copy).sound
+    extra = {f"{NAME}.zarr/pixels/c/9/0/0/0/0": NAME, "policies/other.safetensors": "policies/other.safetensors"}
+    for path in extra:
+        (copy / path).parent.mkdir(parents=True, exist_ok=True)
+        (copy / path).write_bytes(b"stray")
+    found = verify(copy).findings
+    assert {(finding.check, finding.subset) for finding in found} == {("files", place) for place in extra.values()}
+    assert all("listed nowhere" in finding.message for finding in found)

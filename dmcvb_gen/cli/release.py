@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import tempfile
 from pathlib import Path
 
@@ -243,44 +242,16 @@ def _left_behind(path):
 
 
 @click.command()
-@click.argument("url")
-@only_option
-@episodes_option
-@click.option("--paint", is_flag=True, help="Then fill in the pictures that travelled without; see `paint`.")
-@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the release here.")
-@remote_option
-@transfers_option
-@json_option
-def fetch(url, only, episodes, out, options, workers, paint, as_json):
-    """Bring a published release, or only the shards that hold some episodes; run again, it goes on or adds.
-
-    \b
-    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
-    """
-    from dmcvb_gen.release.publish import fetch as run
-
-    with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
-        moved = run(url, out, only, episodes, options=options, workers=workers, tick=bar.update)
-    if paint:
-        from dmcvb_gen.release.paint import paint_release
-
-        with frames_bar(as_json) as bar:
-            done = paint_release(out, workers=min(workers, os.cpu_count() or 1), tick=bar.update)
-        for name in done.differing:
-            click.echo(f"note: pictures of {name} are not those that were published", err=True)
-    if as_json:
-        return print_json(dataclasses.asdict(moved) | ({"painted": done.shards} if paint else {}))
-    click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
-
-
-@click.command()
 @click.argument("path", metavar="RELEASE")
 @click.option("--check", is_flag=True, help="Only compare the card with the release; write nothing.")
 @click.option("--out", metavar="FOLDER", callback=parse_folder, help="Folder of the card.  [default: the release]")
+@click.option("--url", help="Where the release is (or will be) published.  [default: as the card there says]")
 @json_option
 @click.pass_context
-def card(context, path, check, out, as_json):
-    """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, CHANGELOG.md.
+def card(context, path, check, out, url, as_json):
+    """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, CHANGELOG.md, a table.
+
+    The table, card/episodes.parquet, has a row an episode with its first frame; `datasets.load_dataset` reads it.
 
     With --check, exit code 1 when the card does not fit the data.
 
@@ -298,7 +269,7 @@ def card(context, path, check, out, as_json):
         else:
             click.echo("\n".join(findings) or f"{path}: the card fits the release")
         context.exit(1 if findings else 0)
-    files = write_card(path, out)
+    files = write_card(path, out, url)
     if as_json:
         return print_json([str(file) for file in files])
     click.echo("\n".join(str(file) for file in files))

@@ -318,7 +318,8 @@ def _distractors(manifest: Manifest) -> list[str]:
 
 def _making(manifest: Manifest) -> list[str]:
     records = manifest.subsets
-    lines = [f"Made by {manifest.generator} from the recipe in `manifest.json` (seed {manifest.recipe.get('seed')})."]
+    seeds = sorted({str(manifest.recipe_of(record.name).get("seed")) for record in records})
+    lines = [f"Made by {manifest.generator} from the recipe in `manifest.json` (seed {', '.join(seeds)})."]
     renderers = sorted({f"{r.renderer.get('name')} ({r.renderer.get('samples')} samples a pixel)" for r in records})
     lines.append(f"Renderer: {', '.join(renderers)}.")
     videos = sorted({f"`{r.backgrounds['digest'][:12]}` ({r.backgrounds['split']})" for r in records if r.backgrounds})

@@ -180,7 +180,7 @@ def _files(release: Release, table: Path) -> list[dict[str, Any]]:
         path = f"{subset_path(name)}/zarr.json"
         text = f"Zarr group of {name}: arrays, dimensions, state fields."
         files.append(_file(root / path, path, "application/json", text))
-    files.append(_file(table, TABLE, "application/vnd.apache.parquet", "A row an episode, with its first frame."))
+    files.append(_file(table, TABLE, "application/x-parquet", "A row an episode, with its first frame."))
     shards = {
         "@type": "cr:FileSet",
         "@id": "shards",

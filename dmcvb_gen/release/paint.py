@@ -242,7 +242,8 @@ class Studio:
         """
 
         with open_pool(self.painter.workers, tick=self.painter.tick) as pool:
-            ended, at_work, results = False, 0, iter(())
+            ended, at_work = False, 0
+            results: Iterator[tuple[Any, Any]] = iter(())
             while True:
                 while not ended:
                     try:

@@ -23,11 +23,11 @@ from dmcvb_gen.release.shards import damage
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
 from dmcvb_gen.rollout.painting import check_renderer, exogenous_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.rollout.plan import copy_inputs, painting_facts, subset_attributes
-from dmcvb_gen.rollout.recipe import check_size, make_recipe
+from dmcvb_gen.rollout.recipe import Recipe, check_size, make_recipe
 from dmcvb_gen.rollout.site import FolderSite, leave
 from dmcvb_gen.rollout.worker import make_shard
 from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, environment
+from dmcvb_gen.store.manifest import MANIFEST, Addition, CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.pictures import stored_pictures
 from dmcvb_gen.store.reader import Subset
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
@@ -195,7 +195,7 @@ def _pair(release: Release, subset: Subset, request: Repainting) -> Pair:
 
 def _old_backgrounds(release: Release, old: SubsetRecord) -> str:
     """Where the videos of a release are: the subset's own, or those of its recipe."""
-    recipe = {"source": release.manifest.recipe.get("backgrounds", BUILTIN)}
+    recipe = {"source": release.manifest.recipe_of(old.name).get("backgrounds", BUILTIN)}
     return video_source(release.path, old.model_copy(update={"backgrounds": old.backgrounds or recipe}))
 
 
@@ -210,11 +210,52 @@ def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None)
 
 
 def _new_manifest(release: Release, pairs: Mapping[str, Pair], request: Repainting) -> Manifest:
-    old, recipe = release.manifest, recipe_of(release.manifest)
-    records = [pair.record for pair in pairs.values()]
+    """The manifest of the new release; subsets that another recipe added there are additions here, too."""
+    old = release.manifest
+    groups: list[tuple[Recipe, list[SubsetRecord]]] = []
+    for pair in pairs.values():
+        recipe = recipe_of(old, pair.source.name)
+        group = next((records for known, records in groups if known == recipe), None)
+        if group is None:
+            groups.append((recipe, group := []))
+        group.append(pair.record)
+    first, *others = [(_new_recipe(old, recipe, records, request), records) for recipe, records in groups]
+    lineage = {
+        "kind": "repaint",
+        "from": f"{old.name} {old.version}",
+        "manifest_sha256": sha256_file(release.path / MANIFEST),
+        "subsets": {name: pair.source.name for name, pair in pairs.items()},
+        "streams": {name: list(stream_names(old, pair.source.record)) for name, pair in pairs.items()},
+        "new_labels": [name for name, pair in pairs.items() if not pair.keep_labels],
+        "labels": list(request.labels),
+    }
+    manifest = Manifest(
+        name=first[0].name,
+        version=first[0].version,
+        license=old.license,
+        authors=old.authors,
+        recipe=first[0].model_dump(mode="json"),
+        subsets=tuple(pair.record for pair in pairs.values()),
+        environments=(environment(request.device),),
+        lineage=(*old.lineage, lineage),
+    )
+    additions = tuple(
+        Addition(
+            version=manifest.version,
+            recipe=recipe.model_dump(mode="json"),
+            generator=manifest.generator,
+            subsets={record.name: (0, record.episodes) for record in records},
+        )
+        for recipe, records in others
+    )
+    return manifest.model_copy(update={"additions": additions})
+
+
+def _new_recipe(old: Manifest, recipe: Recipe, records: Sequence[SubsetRecord], request: Repainting) -> Recipe:
+    """The recipe that asks for repainted subsets of one recipe."""
     first, splits = records[0], {record.split for record in records}
     shown = {record.backgrounds["source"] for record in records if record.backgrounds}
-    made = make_recipe(
+    return make_recipe(
         recipe.model_dump(mode="json")
         | {
             "name": request.name or f"{old.name[:80]}-repainted",
@@ -226,25 +267,6 @@ def _new_manifest(release: Release, pairs: Mapping[str, Pair], request: Repainti
             "subsets": [_pattern(record) for record in records],
         },
         "the repainted release's recipe",
-    )
-    lineage = {
-        "kind": "repaint",
-        "from": f"{old.name} {old.version}",
-        "manifest_sha256": sha256_file(release.path / MANIFEST),
-        "subsets": {name: pair.source.name for name, pair in pairs.items()},
-        "streams": {name: list(stream_names(old, pair.source.record)) for name, pair in pairs.items()},
-        "new_labels": [name for name, pair in pairs.items() if not pair.keep_labels],
-        "labels": list(request.labels),
-    }
-    return Manifest(
-        name=made.name,
-        version=made.version,
-        license=old.license,
-        authors=old.authors,
-        recipe=made.model_dump(mode="json"),
-        subsets=tuple(records),
-        environments=(environment(request.device),),
-        lineage=(*old.lineage, lineage),
     )
 
 
@@ -298,8 +320,8 @@ def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tup
         else:
             exogenous = exogenous_of(record, job.seed, job.names, episodes, values["physics"], length, videos)
         physics = values["physics"][:, : len_rows(exogenous)]
-        stored = stored_pictures(record, bool(task.goal_geoms))
-        yield from paint(task, renderer, physics, exogenous, length, rows, tick, stored)
+        names = stored_pictures(record, bool(task.goal_geoms))
+        yield from paint(task, renderer, physics, exogenous, length, rows, tick, names)
         yield from label_arrays(exogenous, length, rows)
         yield from values.items()
         for label in labels:

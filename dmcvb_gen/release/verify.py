@@ -30,6 +30,9 @@ from dmcvb_gen.store.manifest import (
 from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.writer import subset_digest
 
+PREVIEWS = "preview/"
+"""Folder that `dmcvb-gen preview` writes to; no part of a release."""
+
 log = logging.getLogger(__name__)
 
 
@@ -83,6 +86,8 @@ def check_files(root: Path) -> Iterator[Finding]:
         yield from _check_shards(root, manifest, record, checked)
     if index is not None:
         yield from _check_index(root, manifest, index, checked)
+        if manifest.complete:
+            yield from _check_extra(root, manifest, index)
 
 
 def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]) -> Iterator[Finding]:
@@ -93,6 +98,18 @@ def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]
         yield Finding("files", MANIFEST, f"does not have the digest that {INDEX} says")
     elif manifest.digest is not None and root_digest(index.files, manifest) != manifest.digest:
         yield Finding("files", MANIFEST, f"its root digest is not that of the files in {INDEX}")
+
+
+def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Finding]:
+    """Files of a finished release that no digest speaks of, and that readers may yet take for data."""
+    listed = {file.path for file in index.files} | {MANIFEST, INDEX}
+    with storage_errors(root):
+        for path in sorted(root.rglob("*")):
+            name = path.relative_to(root).as_posix()
+            ours = name.startswith(PREVIEWS) or any(part.startswith(".") for part in name.split("/"))
+            if not ours and name not in listed and path.is_file():
+                text = f"{name} is listed nowhere: no part of the release; move it elsewhere"
+                yield Finding("files", subset_of(manifest, name), text)
 
 
 def subset_of(manifest: Manifest, path: str) -> str:

@@ -179,9 +179,9 @@ def release_inputs(root: Path, records: Iterable[SubsetRecord], backgrounds: str
     }
 
 
-def recipe_of(manifest: Manifest) -> Recipe:
-    """The recipe that a manifest records."""
-    return make_recipe(manifest.recipe, "the manifest's recipe")
+def recipe_of(manifest: Manifest, subset: str) -> Recipe:
+    """The recipe that a subset was made by: the manifest's first, or the one that added it."""
+    return make_recipe(manifest.recipe_of(subset), "the manifest's recipe")
 
 
 def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:

@@ -87,7 +87,10 @@ def _environment(source: Source, split: str) -> EnvSpec:
     if split == "train":
         options["max_steps"] = record.max_steps
     if record.setting == FIXED:
-        options |= {"fixed_goals": record.fixed_goals, "goal_seed": int(source.manifest.recipe.get("seed", 0))}
+        options |= {
+            "fixed_goals": record.fixed_goals,
+            "goal_seed": int(source.manifest.recipe_of(record.name).get("seed", 0)),
+        }
     name = environment_id(record.name.split("/")[0], setting)
     registered = gymnasium.registry.get(name)
     spec = EnvSpec(name, entry_point=registered.entry_point if registered else ENTRY_POINT, kwargs=options)
