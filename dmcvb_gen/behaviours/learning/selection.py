@@ -33,7 +33,7 @@ MEDIUM_TOLERANCE = 0.1
 """How far (as a share of the way) an accepted medium checkpoint may be from 50 %."""
 PAPER_TOLERANCE = 0.2
 """How far (as a share of it) a maze's medium may be from the paper's return."""
-CANDIDATES = 6
+CANDIDATES = 8
 """Checkpoints near a medium's return that are measured on fresh episodes."""
 BASE_EPISODES = 20
 """Episodes of random actions in a maze, of which none finds its goal but by chance."""
@@ -221,8 +221,11 @@ def _expert(
 
 def _medium(curve: Sequence[Point], goal: float, tolerance: float, check: Callable) -> tuple[Pick, ...] | str:
     """The checkpoint whose return is nearest to `goal`, or why there is none within the tolerance."""
-    near = sorted(curve, key=lambda point: abs(point[1] - goal))[:CANDIDATES]
-    near = [point for point in near if abs(point[1] - goal) <= 1.5 * tolerance]
+    # A few episodes may lie about a checkpoint, its neighbors about a steep curve: either may name it.
+    smoothed = smooth([value for _, value, _ in curve])
+    away = [min(abs(value - goal), abs(even - goal)) for (_, value, _), even in zip(curve, smoothed, strict=True)]
+    order = sorted(range(len(curve)), key=away.__getitem__)[:CANDIDATES]
+    near = [curve[index] for index in order if away[index] <= 1.5 * tolerance]
     best, off = None, tolerance
     for step, value, path in near:
         evaluation = check(path)
