@@ -25,7 +25,7 @@ stage() { # NAME COMMAND...: runs it, one line before and after
 }
 
 tenth() { # every tenth subset, begun at a random one, made again
-  local only
+  local only name
   mapfile -t only < <(dmcvb-gen info "$out" --json | TENTH="${TENTH:-0}" python -c '
 import json, os, random, sys
 names = sorted(subset["name"] for subset in json.load(sys.stdin)["subsets"])
