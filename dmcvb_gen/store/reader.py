@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import zarr
@@ -46,23 +46,23 @@ class StoredArray:
         self._array, self._place, self.name = array, place, name
         self._unpainted, self._cure = unpainted, cure
         self.shape, self.dtype, self.ndim = array.shape, array.dtype, array.ndim
-        self.dimensions = tuple(map(str, array.metadata.dimension_names or ()))
+        self.dimensions = tuple(map(str, getattr(array.metadata, "dimension_names", None) or ()))
 
     def __repr__(self) -> str:
         return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
 
-    def __getitem__(self, selection) -> np.ndarray:
+    def __getitem__(self, selection: Any) -> np.ndarray:
         self._check_painted(selection[0] if isinstance(selection, tuple) else selection)
         with storage_errors(self._place, decoding=True):
-            return self._array[selection]
+            return cast(np.ndarray, self._array[selection])
 
     def rows(self, episodes: np.ndarray) -> np.ndarray:
         """(episode, ...) values of episodes in any order."""
         self._check_painted(episodes)
         with storage_errors(self._place, decoding=True):
-            return self._array.oindex[episodes]
+            return cast(np.ndarray, self._array.oindex[episodes])
 
-    def _check_painted(self, selection) -> None:
+    def _check_painted(self, selection: Any) -> None:
         """Raises StoreError for an episode without pictures, which would read as black."""
         if self._unpainted is None or not self._unpainted.any():
             return
@@ -83,15 +83,26 @@ class Subset:
         self.root, self.record, self.commits = root, record, dict(commits)
         self._storage_options = storage_options
 
-    name = property(lambda self: self.record.name)
-    task = property(lambda self: self.record.task)
-    level = property(lambda self: self.record.level)
-    setting = property(lambda self: self.record.setting)
+    @property
+    def name(self) -> str:
+        return self.record.name
+
+    @property
+    def task(self) -> str:
+        return self.record.task
+
+    @property
+    def level(self) -> str:
+        return self.record.level
+
+    @property
+    def setting(self) -> str:
+        return self.record.setting
 
     def __repr__(self) -> str:
         return f"<Subset {self.name}: {len(self.episodes)} of {self.record.episodes} episodes>"
 
-    def __getstate__(self):  # zarr handles are opened again where the subset lands
+    def __getstate__(self) -> dict[str, Any]:  # zarr handles are opened again where the subset lands
         return {
             key: value for key, value in self.__dict__.items() if key not in ("group", "lengths", "returns", "paths")
         }
@@ -99,9 +110,9 @@ class Subset:
     @functools.cached_property
     def group(self) -> zarr.Group:
         """The Zarr group, read-only."""
-        options = {"storage_options": self._storage_options} if is_url(self.root) else {}
+        options = self._storage_options if is_url(self.root) else None
         with storage_errors(self.path, decoding=True):
-            return zarr.open_group(self.path, mode="r", **options)
+            return zarr.open_group(self.path, mode="r", storage_options=options)
 
     @property
     def path(self) -> str:
@@ -138,6 +149,7 @@ class Subset:
         unpainted = self.unpainted if picture else None
         with storage_errors(self.path, decoding=True):
             array = self.group[self.paths[name]]
+            assert isinstance(array, zarr.Array)  # `paths` names arrays alone
             self._check_shape(array, name)
             return StoredArray(array, name, f"{self.path}/{self.paths[name]}", unpainted, self._without_pictures)
 
@@ -253,7 +265,7 @@ def _ranges(indices: np.ndarray) -> str:
 class Release:
     """A release, read-only: `manifest` and `subsets` (name -> Subset)."""
 
-    def __init__(self, root: str, manifest: Manifest, subsets: dict[str, Subset]):
+    def __init__(self, root: str, manifest: Manifest, subsets: Mapping[str, Subset]):
         self.root, self.manifest, self.subsets = root, manifest, subsets
 
     def __repr__(self) -> str:
@@ -341,7 +353,7 @@ def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
     return root, parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
 
 
-def _remote_commits(filesystem, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:
+def _remote_commits(filesystem: Any, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:
     """The committed shards of a subset at a URL, shard -> record."""
     paths = {f"{base}/{commit_path(subset.name, shard)}": shard for shard in range(shard_count(subset))}
     found = filesystem.cat(list(paths), on_error="omit")
