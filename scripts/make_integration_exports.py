@@ -39,13 +39,15 @@ def main() -> None:
                 frames = np.stack([values.pop(name) for name in pictures.arrays], axis=1)
                 arrays |= {f"pixels_{index}": frames} | {f"{n}_{index}": v for n, v in values.items()}
             np.savez(work / f"{flat}.npz", **arrays)
-            folders = {}
+            folders = {"release": str(folder)}
             for what in chosen:
                 for to in FORMATS[what]:
                     [folders[to]] = map(str, export(str(folder), to, work / to, [subset.name]))
                 if what == "lerobot":
                     [folders["video"]] = map(str, export(str(folder), to, work / "video", [subset.name], video=True))
             wanted.append({"subset": subset.name, "values": f"{flat}.npz", "hidden": pictures.hide_goal, **folders})
+    if "lerobot" in chosen:
+        export(str(work / "maze"), "lerobot", work / "merged", merge=True)
     (work / "wanted.json").write_text(json.dumps(wanted, indent=1))
 
 

@@ -210,18 +210,27 @@ transfers_option = click.option(
 def publish(path, url, options, take_over, workers, no_pixels, as_json):
     """Put a complete release at a URL: every file checked, the manifest last, a published version never changed.
 
-    Run again after an interruption, it goes on. Credentials come from the environment.
+    Run again after an interruption, it goes on. Credentials come from the environment. Of an export (`export`), the
+    files alone go there; one of LeRobot gets its tag on the Hub.
 
     \b
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
+    from dmcvb_gen.release.export.publishing import export_format, publish_export
     from dmcvb_gen.release.publish import publish as run
+    from dmcvb_gen.store.manifest import MANIFEST
     from dmcvb_gen.store.remote import public
 
+    exported = not (Path(path) / MANIFEST).exists() and export_format(path) is not None
+    if exported and (no_pixels or take_over):
+        raise click.UsageError("--no-pixels and --take-over are for releases; this is an export.")
     with tqdm(unit=" files", disable=as_json or None) as bar, contextlib.ExitStack() as stack:
-        sent = stack.enter_context(_left_behind(path)) if no_pixels else path
-        moved = run(sent, url, options=options, take_over=take_over, workers=workers, tick=bar.update)
+        if exported:
+            moved = publish_export(path, url, options=options, workers=workers, tick=bar.update)
+        else:
+            sent = stack.enter_context(_left_behind(path)) if no_pixels else path
+            moved = run(sent, url, options=options, take_over=take_over, workers=workers, tick=bar.update)
     if as_json:
         return print_json(dataclasses.asdict(moved))
     click.echo(f"{public(url)}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")

@@ -23,6 +23,7 @@ class Format:
 
     Attributes:
       module: where its `write(source, folder)` lives.
+      reader: the program that it is for. mark: pattern of a file that only this format has.
       keeps, drops: what of a subset is in it and what is not, in words.
       packages: what it needs beyond dmcvb-gen's own dependencies.
       options: those of `export` that are for it.
@@ -32,6 +33,7 @@ class Format:
     reader: str
     keeps: str
     drops: str
+    mark: str
     packages: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
 
@@ -42,6 +44,7 @@ FORMATS = {
         "V-D4RL's DrQ+BC loader (`observation`, `action`, `reward`, `discount`, `step_type`)",
         "pixels (channels first), states, actions, rewards, discounts",
         "physics, labels, seeds",
+        "data_*.hdf5",
         ("h5py",),
     ),
     "npz": Format(
@@ -49,18 +52,21 @@ FORMATS = {
         "V-D4RL's DreamerV2 loader (`image`, `action`, `reward`, `discount`, `is_first`, `is_last`, `is_terminal`)",
         "pixels, states, actions, rewards, discounts",
         "physics, labels, seeds",
+        "[0-9]*-[0-9]*.npz",
     ),
     "replay-buffer": Format(
         "replay_buffer:write",
         "diffusion policy's `ReplayBuffer` (Zarr 2: `data/img`, `data/state`, `data/action`, `meta/episode_ends`)",
         "pixels, states, actions, rewards",
         "the last observation of each episode, discounts, physics, labels",
+        "replay_buffer.zarr/.zgroup",
     ),
     "minari": Format(
         "minari_format:write",
         "minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless pictures)",
         "pixels, states, actions, rewards, ends, seeds, the Gymnasium environment",
         "physics, labels",
+        "data/main_data.hdf5",
         ("minari", "h5py"),
     ),
     "lerobot": Format(
@@ -68,6 +74,7 @@ FORMATS = {
         "LeRobot v3 (Parquet with PNG pictures, or mp4), `datasets.load_dataset`",
         "pixels, states, actions, rewards, ends",
         "the last observation of each episode, physics, labels",
+        "meta/info.json",
         ("pyarrow",),
         ("merge", "video"),
     ),
@@ -76,6 +83,7 @@ FORMATS = {
         "TensorFlow Datasets (`tfds.builder_from_directory`): RLDS steps, PNG, state fields also under DMC-VB's names",
         "pixels, states, actions, rewards, discounts, ends",
         "physics, labels",
+        "dataset_info.json",
     ),
 }
 """Name -> format."""

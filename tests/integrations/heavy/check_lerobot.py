@@ -8,7 +8,8 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 work = Path(sys.argv[1])
-for one in json.loads((work / "wanted.json").read_text()):
+wanted = json.loads((work / "wanted.json").read_text())
+for one in wanted:
     stored = np.load(work / one["values"])
     views = [str(view) for view in stored["views"]]
     for kind in ("lerobot", "video"):
@@ -31,4 +32,18 @@ for one in json.loads((work / "wanted.json").read_text()):
                 assert bool(item["next.success"]) == (done and bool(stored[f"terminated_{index}"]))
             start += length
         assert "q99" in dataset.meta.stats["action"], sorted(dataset.meta.stats["action"])
+        assert dataset.meta.names["observation.state"][0].endswith(".0"), dataset.meta.names
         print(f"lerobot: {one['subset']} ({kind}) opens, {len(dataset)} frames", flush=True)
+
+mazes = [one for one in wanted if one["subset"].startswith("ant-maze")]
+dataset, start = LeRobotDataset("local/merged", root=work / "merged"), 0
+assert dataset.num_episodes == 2 * len(mazes) and dataset.meta.total_tasks == 1, dataset.meta.tasks
+for one in mazes:
+    stored = np.load(work / one["values"])
+    for index in range(2):
+        item = dataset[start]
+        assert item["task"] == "ant-maze-tiny:****/*..*/**** (random)", item["task"]
+        np.testing.assert_array_equal(item["action"].numpy(), stored[f"action_{index}"][0])
+        start += len(stored[f"action_{index}"])
+assert start == len(dataset)
+print(f"lerobot: {len(mazes)} subsets in one data set, {len(dataset)} frames", flush=True)

@@ -1,0 +1,102 @@
+"""An export's folder to a URL, every file checked; to the Hub in one commit, with the tag that LeRobot looks for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen import files
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.pool import ignore
+from dmcvb_gen.release.export import FORMATS
+from dmcvb_gen.release.hub import parse_hub_url
+from dmcvb_gen.release.publish import Moved
+from dmcvb_gen.store.manifest import FileRecord
+from dmcvb_gen.store.remote import file_system, is_refusal, public, reason, refused
+from dmcvb_gen.store.transfer import in_parallel, upload
+
+LEROBOT_INFO = "meta/info.json"
+
+
+def export_format(folder: str | Path) -> str | None:
+    """The format of the exports in a folder, by the files that each is known by; None where there is no export."""
+    for name, kind in FORMATS.items():
+        if any(True for _ in Path(folder).rglob(kind.mark)):
+            return name
+    return None
+
+
+def publish_export(
+    folder: str | Path,
+    url: str,
+    *,
+    options: dict[str, Any] | None = None,
+    workers: int = 8,
+    tick: Callable[[int], None] = ignore,
+    api: Any = None,
+) -> Moved:
+    """Put an export at a URL; run again after an interruption, it goes on.
+
+    Args:
+      folder: what `export` wrote: a subset's folder, or (but for LeRobot on the Hub) a folder of several.
+      url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL.
+      options: of fsspec. api: a `huggingface_hub.HfApi`, for tests.
+      tick: told 1 for each file.
+
+    Raises:
+      StoreError: there is no export, access is refused, or a file could not be moved.
+    """
+    folder = Path(folder)
+    kind = export_format(folder)
+    if kind is None:
+        raise StoreError(
+            f"{folder} holds neither a release nor an export; give the folder that `rollout` or `export` made"
+        )
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    records = [
+        FileRecord(path=path.relative_to(folder).as_posix(), bytes=path.stat().st_size, sha256=files.sha256_file(path))
+        for path in paths
+    ]
+    total = sum(record.bytes for record in records)
+    if url.startswith("hf://"):
+        _to_hub(folder, kind, url, api)
+        tick(len(records))
+        return Moved(len(records), total, len(records))
+    filesystem, base = file_system(url, options)
+
+    def send(record: FileRecord) -> bool:
+        return upload(filesystem, public(url), folder / record.path, f"{base}/{record.path}", record)
+
+    return Moved(len(records), total, sum(in_parallel(send, records, workers, lambda _: tick(1))))
+
+
+def _to_hub(folder: Path, kind: str, url: str, api: Any) -> None:
+    """One commit of all files into a data set repository; LeRobot's loader then looks for a tag of its version."""
+    try:
+        from huggingface_hub import HfApi
+    except ImportError:
+        raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
+    repository, inside = parse_hub_url(url)
+    if kind == "lerobot" and (inside or not (folder / LEROBOT_INFO).is_file()):
+        raise StoreError(
+            f"LeRobot finds one data set a repository: publish one folder with {LEROBOT_INFO} to "
+            "hf://datasets/OWNER/NAME, or export the subsets as one data set with --merge"
+        )
+    api = api or HfApi()
+    try:
+        api.create_repo(repo_id=repository, repo_type="dataset", exist_ok=True)
+        message = f"{folder.name}: exported to {kind} by dmcvb-gen"
+        api.upload_folder(
+            repo_id=repository, repo_type="dataset", folder_path=folder, path_in_repo=inside, commit_message=message
+        )
+        if kind == "lerobot":
+            version = json.loads((folder / LEROBOT_INFO).read_text())["codebase_version"]
+            if version in {tag.name for tag in api.list_repo_refs(repo_id=repository, repo_type="dataset").tags}:
+                api.delete_tag(repo_id=repository, repo_type="dataset", tag=version)  # it belongs to what was before
+            api.create_tag(repo_id=repository, repo_type="dataset", tag=version)
+    except Exception as error:  # the client raises many kinds
+        if is_refusal(error) or getattr(getattr(error, "response", None), "status_code", 0) in (401, 403):
+            raise refused(url, error) from None
+        raise StoreError(f"cannot publish to {url} ({reason(error)}); run the same command again") from None

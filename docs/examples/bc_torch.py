@@ -1,0 +1,34 @@
+"""Behavior cloning from pictures in torch: python bc_torch.py releases/demo walker-walk/expert/dynamic"""
+
+import sys
+
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+import dmcvb_gen
+
+STEPS = 200
+source = dmcvb_gen.open(sys.argv[1])[sys.argv[2]].source(stack=3)  # len(source), source[i]: numpy alone
+first = source[0]
+channels, size, _ = first["pixels"].shape
+encoder = nn.Sequential(
+    nn.Conv2d(channels, 32, 3, stride=2, padding=1),
+    nn.ReLU(),
+    nn.Conv2d(32, 32, 3, stride=2, padding=1),
+    nn.ReLU(),
+    nn.Flatten(),
+)
+policy = nn.Sequential(encoder, nn.LazyLinear(256), nn.ReLU(), nn.Linear(256, len(first["action"])), nn.Tanh())
+policy(torch.zeros(1, channels, size, size))  # fixes the size of the lazy layer
+optimizer = torch.optim.Adam(policy.parameters(), lr=3e-4)
+loader, step, losses = DataLoader(source, batch_size=64, shuffle=True), 0, []
+while step < STEPS:
+    for batch in loader:
+        loss = nn.functional.mse_loss(policy(batch["pixels"] / 255 - 0.5), batch["action"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+        step += 1
+print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f} after {step} steps of {len(source)} samples")

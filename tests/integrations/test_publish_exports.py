@@ -1,0 +1,58 @@
+"""Exports go to a URL as they are, and to the Hub with the tag that LeRobot's loader looks for."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.export import FORMATS, export
+from dmcvb_gen.release.export.publishing import export_format, publish_export
+
+SUBSETS = ("walker-walk/random/static", "ant-maze-tiny/random/hidden")
+
+
+def content(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_an_export_arrives_whole_and_a_second_try_moves_nothing(to, stored, tmp_path):
+    name = SUBSETS[list(FORMATS).index(to) % 2]
+    [folder] = export(str(stored[name].folder), to, tmp_path / to, [name])
+    assert export_format(folder) == export_format(tmp_path / to) == to
+    done = CliRunner().invoke(main, ["publish", str(folder), f"file://{tmp_path / 'there'}"])
+    assert done.exit_code == 0, done.output
+    assert content(tmp_path / "there") == content(folder)
+    again = publish_export(folder, f"file://{tmp_path / 'there'}")
+    assert again.moved == 0 and again.files == len(content(folder))
+    refused = CliRunner().invoke(main, ["publish", str(folder), f"file://{tmp_path / 'x'}", "--no-pixels"])
+    assert refused.exit_code == 2 and "are for releases" in refused.output
+
+
+def test_the_hub_gets_one_commit_and_lerobots_tag(stored, tmp_path):
+    from huggingface_hub import HfApi
+
+    for name in SUBSETS:
+        [folder] = export(str(stored[name].folder), "lerobot", tmp_path, [name])
+        api = mock.create_autospec(HfApi, instance=True)  # refuses calls that the real one would
+        api.list_repo_refs.return_value.tags = [mock.Mock()]
+        api.list_repo_refs.return_value.tags[0].name = "v3.0"
+        publish_export(folder, "hf://datasets/me/demo", api=api)
+        called = [call[0] for call in api.method_calls]
+        assert called == ["create_repo", "upload_folder", "list_repo_refs", "delete_tag", "create_tag"]
+        assert api.upload_folder.call_args.kwargs["folder_path"] == folder
+        assert api.create_tag.call_args.kwargs == {"repo_id": "me/demo", "repo_type": "dataset", "tag": "v3.0"}
+    with pytest.raises(StoreError, match="--merge"):
+        publish_export(tmp_path, "hf://datasets/me/demo", api=api)
+
+
+def test_what_is_no_export_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
+    done = CliRunner().invoke(main, ["publish", str(tmp_path), f"file://{tmp_path / 'there'}"])
+    assert done.exit_code == 2 and "holds no release" in done.output
+    with pytest.raises(StoreError, match="neither a release nor an export"):
+        publish_export(tmp_path, f"file://{tmp_path / 'there'}")
