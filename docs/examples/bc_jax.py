@@ -9,7 +9,7 @@ import optax
 
 import dmcvb_gen
 
-STEPS = 200
+STEPS = 100
 source = dmcvb_gen.open(sys.argv[1])[sys.argv[2]].source(stack=3)  # len(source), source[i]: numpy alone
 channels, size, _ = source[0]["pixels"].shape
 shapes = {"first": (32, channels, 3, 3), "second": (32, 32, 3, 3)}  # out, in, height, width

@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 
 import dmcvb_gen
 
-STEPS = 200
+STEPS = 100
 source = dmcvb_gen.open(sys.argv[1])[sys.argv[2]].source(stack=3)  # len(source), source[i]: numpy alone
 first = source[0]
 channels, size, _ = first["pixels"].shape
