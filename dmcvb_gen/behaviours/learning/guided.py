@@ -37,7 +37,7 @@ GUIDE = "ant-maze-empty7x7"
 """The task whose bundled expert walks where --init-from names none."""
 
 
-EVALUATION_STEPS = 40.0
+EVALUATION_STEPS = 20.0
 """Agent steps simulated in evaluations for each one trained, at most: runs take minutes, and medium is picked from
 checkpoints a few hundred steps apart."""
 
@@ -64,8 +64,8 @@ class GuidedSettings:
     simulations: Count = 32
     batch_size: Count = 512
     learning_rate: Positive = 1e-3
-    ramp: Natural = 20_000
-    half_life: Positive = 20_000
+    ramp: Natural = 12_000
+    half_life: Positive = 12_500
     layers: Count = 3
     width: Count = 256
     updates_per_step: Positive = 0.06
