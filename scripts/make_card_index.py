@@ -1,0 +1,63 @@
+"""Writes dataset_cards/README.md, the index of all cards, from the manifests beside them.
+
+python scripts/make_card_index.py
+python scripts/make_card_index.py --check    # exit code 1 where the index is not what the cards say
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from dmcvb_gen.names import family_of
+from dmcvb_gen.store.manifest import MANIFEST, Manifest
+
+CARDS = Path(__file__).parents[1] / "dataset_cards"
+HEAD = """# Data set cards
+
+Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
+description, a contact sheet, and its manifest with the digest of every subset; any part of a release is made from its
+manifest alone, and compared with the digests:
+
+```text
+dmcvb-gen regenerate --manifest dataset_cards/NAME/manifest.json --only 'SUBSET' --out FOLDER
+```
+
+| release | version | subsets | episodes | tasks | root digest |
+|---|---|---|---|---|---|
+"""
+
+
+def row(folder: Path) -> str:
+    """A release's line of the table."""
+    manifest = Manifest.model_validate_json((folder / MANIFEST).read_bytes())
+    episodes = sum(subset.episodes for subset in manifest.subsets)
+    families = sorted({family_of(subset.task) for subset in manifest.subsets})
+    tasks = len({subset.task for subset in manifest.subsets})
+    return (
+        f"| [{manifest.name}]({folder.name}/README.md) | {manifest.version} | {len(manifest.subsets)} | {episodes:,} "
+        f"| {tasks} ({', '.join(families)}) | `{(manifest.digest or '')[:16]}` |\n"
+    )
+
+
+def index(cards: Path = CARDS) -> str:
+    """The page, from every folder that holds a manifest, in order of names."""
+    return HEAD + "".join(row(path.parent) for path in sorted(cards.glob(f"*/{MANIFEST}")))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="only compare")
+    page, text = CARDS / "README.md", index()
+    if parser.parse_args().check:
+        same = page.exists() and page.read_text() == text
+        print(f"{page} {'is up to date' if same else 'is out of date: python scripts/make_card_index.py'}")
+        return 0 if same else 1
+    page.write_text(text)
+    print(f"wrote {page}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
