@@ -3,6 +3,7 @@
 It follows MuJoCo's OpenGL pipeline term by term, as a CPU runs it: four visibility samples a pixel, one shading
 a pixel and surface, light computed at the floor's vertices, textures from the same mip levels.
 
+    lanes.py       how loops touch memory so that they become vector code
     scene.py       a task's model -> arrays of what can be seen, lights, materials by look
     textures.py    pictures -> mip levels in one buffer; videos -> skies
     sampling.py    texture coordinates -> colors

@@ -7,10 +7,24 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from dmcvb_gen.rendering.native.lanes import (
+    BASE_BLUE,
+    BASE_GREEN,
+    BASE_RED,
+    CHUNK,
+    ROWS,
+    distinct,
+    get,
+    leaf,
+    part,
+    put,
+    stage,
+)
 from dmcvb_gen.rendering.native.lighting import aim_shadows, light_vertices
 from dmcvb_gen.rendering.native.records import (
     AXIS,
     BOXED,
+    CLIP,
     CONE,
     EYE,
     GOAL,
@@ -22,22 +36,23 @@ from dmcvb_gen.rendering.native.records import (
     MIRRORED,
     MIRRORED_AXIS,
     MIRRORED_PLACE,
+    MOVING,
     NEAR,
     OPACITY,
     OWN_OPACITY,
     PLACE,
-    QUAD,
+    REFLECTANCE,
     RGB,
     SIZE,
     SKY,
     STEP,
     TURN,
     VIEW,
+    WIDTH,
     WINDOW,
 )
-from dmcvb_gen.rendering.native.sampling import leaf, part
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
-from dmcvb_gen.rendering.native.shading import shade_body, shade_plane, shade_sky
+from dmcvb_gen.rendering.native.shading import aim, cover_body, cover_plane, shade_body, shade_plane, shade_sky
 from dmcvb_gen.rendering.native.visibility import (
     NOTHING,
     box_of_body,
@@ -48,8 +63,13 @@ from dmcvb_gen.rendering.native.visibility import (
     plane_functions,
 )
 
+f4, i4, i8 = np.float32, np.int32, np.int64
 BACK_OF_PLANE = 0.3
 """A plane seen from behind keeps this share of its opacity (MuJoCo)."""
+BAND = 8192
+"""Pixels shaded together, at most, but at least a row: what that takes in memory."""
+ALL, NO_GOAL, NOTHING_MOVING = 0, 1, 2
+"""Which geoms are drawn."""
 
 
 class Frames(NamedTuple):
@@ -71,16 +91,18 @@ class Still(NamedTuple):
     looks: np.ndarray  # (look, geom, column) the first columns of `rec`
     constants: np.ndarray  # the first entries of `k`
     boxes: np.ndarray  # (box, 6) solid boxes behind walls, lowest and highest corner
-    grid: np.ndarray  # (2, line) vertices of the lit plane
-    texels: np.ndarray
-    table: np.ndarray
-    xs: np.ndarray  # see visibility.sample_tables
-    ys: np.ndarray
-    offsets: np.ndarray
+    texels: np.ndarray  # see textures
+    width: int  # of a row of the table of textures
+    rays: np.ndarray  # see visibility.sample_rays
 
 
 class Work(NamedTuple):
-    """Memory of one painter, used again for every frame."""
+    """Memory of one painter, used again for every frame; numba pays for every array that it hands over.
+
+    A job is a surface in a pixel. `jobs` has their rows, columns and numbers of samples (each `room` long), then the
+    lists of the jobs of each geom and of the sky, then those of what is mirrored in them, or seen through, then the
+    lengths of these lists.
+    """
 
     inverse: np.ndarray  # (4 * pixels^2,) float32, inverse depth of each sample
     number: np.ndarray  # uint8, geom of each sample
@@ -88,25 +110,47 @@ class Work(NamedTuple):
     behind_number: np.ndarray
     rec: np.ndarray  # (geom, records.WIDTH)
     k: np.ndarray  # (records.LENGTH,)
-    vertices: np.ndarray  # (vertex, vertex, 3) the lamp's color on the lit plane
-    heaven: np.ndarray  # (pixels^2, 3) the sky's color where `known`
-    known: np.ndarray  # (pixels^2,) bool
+    plane: np.ndarray  # float32, the lit plane's grid (2, line), and the lamp's color at its vertices (x, y, 3)
+    s: np.ndarray  # see lanes
+    jobs: np.ndarray  # int32, see above
+    color: np.ndarray  # float32, (3, room) of each job, then the sky's (3, pixels^2)
+    kept: np.ndarray  # (pixels, pixels, 3) uint8, what does not move
 
 
-def make_work(geoms: int, pixels: int, lines: np.ndarray, width: int) -> Work:
+def make_work(geoms: int, pixels: int, grid: np.ndarray) -> Work:
     """Memory for frames of `pixels` a side."""
-    samples = 4 * pixels * pixels
+    samples, room = 4 * pixels * pixels, room_for.py_func(pixels)
     return Work(
         inverse=np.zeros(samples, np.float32),
         number=np.zeros(samples, np.uint8),
         behind=np.zeros(samples, np.float32),
         behind_number=np.zeros(samples, np.uint8),
-        rec=np.zeros((geoms, width)),
+        rec=np.zeros((geoms, WIDTH)),
         k=np.zeros(LENGTH),
-        vertices=np.zeros((max(int(lines[0]), 1), max(int(lines[1]), 1), 3)),
-        heaven=np.zeros((pixels * pixels, 3)),
-        known=np.zeros(pixels * pixels, np.bool_),
+        plane=np.concatenate([grid.ravel(), np.zeros(3 * grid.shape[1] ** 2)]).astype(np.float32),
+        s=np.zeros(ROWS * CHUNK, np.float32),
+        jobs=np.empty(lists_at.py_func(room, geoms, 2, 0) + 2 * (geoms + 1), np.int32),  # taken as it is written
+        color=np.zeros(3 * room + 3 * pixels * pixels, np.float32),
+        kept=np.zeros((pixels, pixels, 3), np.uint8),
     )
+
+
+@leaf
+def room_for(pixels):
+    """Most jobs at a time: four for each pixel of some rows that are shaded together."""
+    return 4 * pixels * min(max(BAND // pixels, 1), pixels)
+
+
+@leaf
+def lists_at(room, geoms, which, g):
+    """Where in `jobs` the list of geom g (`geoms`: the sky) is: of what is in front (`which` 0) or behind (1)."""
+    return (3 + which * (geoms + 1) + g) * room
+
+
+@leaf
+def length_at(room, geoms, which, g):
+    """Where in `jobs` the length of that list is."""
+    return (3 + 2 * (geoms + 1)) * room + which * (geoms + 1) + g
 
 
 # -- poses -----------------------------------------------------------------------------------------
@@ -139,6 +183,14 @@ def pose_geoms(rec, looks, center, turn, eye, axes, rgb, look, f):
 
 
 @part
+def face_planes(rec):
+    """Fill the planes' FUNCTIONS, and their OPACITY from the side that is seen."""
+    for g in range(rec.shape[0]):
+        if rec[g, KIND] == PLANE:
+            rec[g, OPACITY] = rec[g, OWN_OPACITY] * (1.0 if plane_functions(rec, g) else BACK_OF_PLANE)
+
+
+@part
 def pose_camera(k, eye, axes, lamp, sky, f):
     """Fill a frame's entries of k."""
     for row in range(3):
@@ -148,7 +200,6 @@ def pose_camera(k, eye, axes, lamp, sky, f):
         k[LAMP + 3 + row] = turned(axes, f, row, lamp[f, 3], lamp[f, 4], lamp[f, 5])
     k[EYE], k[EYE + 1], k[EYE + 2] = 0.0, 0.0, -1.0
     k[SKY] = sky[f]
-    k[QUAD] = -1.0
 
 
 @leaf
@@ -188,171 +239,374 @@ def in_a_box(boxes, eye, f):
 # -- visibility ------------------------------------------------------------------------------------
 
 
+@leaf
+def drawn(rec, g, which):
+    """Whether geom g is drawn (ALL, NO_GOAL, NOTHING_MOVING)."""
+    return which == ALL or (rec[g, GOAL] == 0.0 and (which == NO_GOAL or rec[g, MOVING] == 0.0))
+
+
 @part
-def draw_body(inverse, number, xs, ys, offsets, k, rec, g, place, axis):
-    """Draw a body, whose center and axis are in these columns of its record."""
-    capsule = rec[g, KIND] == CAPSULE
-    half = rec[g, SIZE + 1] if capsule else 0.0
-    c0, c1, r0, r1 = box_of_body(rec, g, place, axis, half, ys.size, k[STEP])
+def body_box(k, rec, g, place, axis, pixels):
+    """Pixels in CLIP that a body can touch; its center and axis are in these columns of its record."""
+    half = rec[g, SIZE + 1] if rec[g, KIND] == CAPSULE else 0.0
+    return box_of_body(k, rec, g, place, axis, half, pixels)
+
+
+@part
+def draw_body(inverse, number, rays, k, rec, g, place, axis):
+    """Draw a body; see `body_box`."""
+    c0, c1, r0, r1 = body_box(k, rec, g, place, axis, rays.size // 9)
     if c0 >= c1 or r0 >= r1:
         return
     nearest, geom = 1.0 / k[NEAR], np.uint8(g)
-    if capsule:
-        draw_capsule(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
+    if rec[g, KIND] == CAPSULE:
+        draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
     else:
-        px, py, pz = rec[g, place], rec[g, place + 1], rec[g, place + 2]
-        draw_sphere(inverse, number, xs, ys, offsets, c0, c1, r0, r1, px, py, pz, rec[g, SIZE], nearest, geom)
+        draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
 
 
 @part
-def draw_flat(inverse, number, xs, ys, offsets, k, rec, g):
-    """Draw a plane."""
-    c0, c1, r0, r1 = box_of_plane(rec, g, k[NEAR], ys.size, k[STEP])
-    if c0 < c1 and r0 < r1:
-        draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, k, rec, g, np.uint8(g))
+def draw_bodies(inverse, number, rays, k, rec, which, place, axis):
+    """Draw all bodies (`drawn`)."""
+    for g in range(rec.shape[0]):
+        if rec[g, KIND] != PLANE and drawn(rec, g, which):
+            draw_body(inverse, number, rays, k, rec, g, place, axis)
+
+
+@stage
+def draw_planes(inverse, number, rays, k, rec, opaque):
+    """Draw the planes that are opaque, or the others."""
+    for g in range(rec.shape[0]):
+        if rec[g, KIND] == PLANE and (rec[g, OPACITY] >= OPAQUE) == opaque:
+            c0, c1, r0, r1 = box_of_plane(k, rec, g, k[NEAR], rays.size // 9)
+            if c0 < c1 and r0 < r1:
+                draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
 
 
 @part
-def draw_front(inverse, number, xs, ys, offsets, k, rec, hide_goal, inside):
-    """Fill the buffers with the opaque surfaces. Gives whether there may be others to see through.
+def veils(rec, inside):
+    """Whether there may be planes to see through.
 
     Args:
       inside: the eye is inside a box.
     """
-    inverse[:] = 0.0
-    number[:] = NOTHING
-    veiled = False
     for g in range(rec.shape[0]):
-        if rec[g, KIND] != PLANE:
-            if not (hide_goal and rec[g, GOAL] > 0.0):
-                draw_body(inverse, number, xs, ys, offsets, k, rec, g, PLACE, AXIS)
-            continue
-        facing = plane_functions(rec, g)
-        rec[g, OPACITY] = rec[g, OWN_OPACITY] * (1.0 if facing else BACK_OF_PLANE)
-        if rec[g, OPACITY] >= OPAQUE:
-            draw_flat(inverse, number, xs, ys, offsets, k, rec, g)
-        elif facing or inside or rec[g, BOXED] == 0.0:
-            veiled = True
-    return veiled
+        if rec[g, KIND] == PLANE and rec[g, OPACITY] < OPAQUE:
+            facing = rec[g, OPACITY] == rec[g, OWN_OPACITY]
+            if facing or inside or rec[g, BOXED] == 0.0:
+                return True
+    return False
 
 
 @part
-def draw_behind(inverse, behind, behind_number, xs, ys, offsets, k, rec, hide_goal, veiled):
-    """Fill the second buffers: planes to be seen through (`veiled`), in front of the first ones; or mirror images."""
-    behind_number[:] = NOTHING
+def clear(inverse, number, k, pixels):
+    """Nothing in the samples in CLIP."""
+    distinct()
+    first, past = 4 * int(k[CLIP]), 4 * int(k[CLIP + 1])
+    for row in range(int(k[CLIP + 2]), int(k[CLIP + 3])):
+        at = 4 * row * pixels
+        for i in range(at + first, at + past):
+            put(inverse, i, f4(0))
+            put(number, i, np.uint8(NOTHING))
+
+
+@part
+def copy_depths(inverse, behind, k, pixels):
+    """`behind` as deep as `inverse` in CLIP."""
+    distinct()
+    first, past = 4 * int(k[CLIP]), 4 * int(k[CLIP + 1])
+    for row in range(int(k[CLIP + 2]), int(k[CLIP + 3])):
+        at = 4 * row * pixels
+        for i in range(at + first, at + past):
+            put(behind, i, get(inverse, i))
+
+
+@part
+def drop_hidden_images(inverse, number, behind, behind_number, k, pixels):
+    """Keep mirror images where the mirror is in front and the image beyond it."""
+    distinct()
+    mirror = np.uint8(k[MIRROR])
+    for i in range(4 * pixels * int(k[CLIP + 2]), 4 * pixels * int(k[CLIP + 3])):
+        seen = (get(number, i) == mirror) & (get(behind, i) < get(inverse, i))
+        put(behind_number, i, get(behind_number, i) if seen else np.uint8(NOTHING))
+
+
+@part
+def draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled):
+    """Fill the buffers with the opaque surfaces, and the second ones with the planes to be seen through (`veiled`),
+    in front of them, or else with mirror images."""
+    pixels = rays.size // 9
+    clear(inverse, number, k, pixels)
+    clear(behind, behind_number, k, pixels)
+    draw_bodies(inverse, number, rays, k, rec, which, i8(PLACE), i8(AXIS))
+    draw_planes(inverse, number, rays, k, rec, True)
     if veiled:
-        behind[:] = inverse
-        for g in range(rec.shape[0]):
-            if rec[g, KIND] == PLANE and rec[g, OPACITY] < OPAQUE:
-                draw_flat(behind, behind_number, xs, ys, offsets, k, rec, g)
+        copy_depths(inverse, behind, k, pixels)
+        draw_planes(behind, behind_number, rays, k, rec, False)
     elif k[MIRROR] >= 0.0:
-        behind[:] = 0.0
         reflect(k, rec)
-        for g in range(rec.shape[0]):
-            if rec[g, KIND] != PLANE and not (hide_goal and rec[g, GOAL] > 0.0):
-                draw_body(behind, behind_number, xs, ys, offsets, k, rec, g, MIRRORED_PLACE, MIRRORED_AXIS)
+        draw_bodies(behind, behind_number, rays, k, rec, which, i8(MIRRORED_PLACE), i8(MIRRORED_AXIS))
+        drop_hidden_images(inverse, number, behind, behind_number, k, pixels)
+
+
+# -- jobs ------------------------------------------------------------------------------------------
+
+
+@leaf
+def share_of(number, behind_number, first, sample):
+    """How many of a pixel's samples show what one of them does; 0 if one before it does."""
+    count = 1
+    geom, behind = get(number, sample), get(behind_number, sample)
+    for t in range(first, first + 4):
+        if t != sample and get(number, t) == geom and get(behind_number, t) == behind:
+            if t < sample:
+                return 0
+            count += 1
+    return count
+
+
+@leaf
+def add_job(jobs, color, room, geoms, count, row, column, geom, behind, share):
+    """List a job: `share` of a pixel's samples show `geom` with something behind."""
+    put(jobs, count, i4(row))
+    put(jobs, room + count, i4(column))
+    put(jobs, 2 * room + count, i4(share))
+    for c in range(3):
+        put(color, c * room + count, f4(0))
+    g = geoms if geom == NOTHING else geom
+    length = length_at(room, geoms, 0, g)
+    put(jobs, lists_at(room, geoms, 0, g) + get(jobs, length), i4(count))
+    put(jobs, length, i4(get(jobs, length) + 1))
+    if behind != NOTHING:
+        length = length_at(room, geoms, 1, behind)
+        put(jobs, lists_at(room, geoms, 1, behind) + get(jobs, length), i4(count))
+        put(jobs, length, i4(get(jobs, length) + 1))
+
+
+@part
+def list_jobs(number, behind_number, jobs, color, k, pixels, geoms, first_row, past_row):
+    """List the jobs of some rows, inside CLIP, a pixel's one after the other. Gives how many there are."""
+    distinct()
+    room = room_for(pixels)
+    for i in range(length_at(room, geoms, 0, 0), length_at(room, geoms, 2, 0)):
+        put(jobs, i, i4(0))
+    count = 0
+    for row in range(first_row, past_row):
+        for column in range(int(k[CLIP]), int(k[CLIP + 1])):
+            first = 4 * (row * pixels + column)
+            geom, behind = np.int64(get(number, first)), np.int64(get(behind_number, first))
+            odd = (get(number, first + 1) ^ geom) | (get(number, first + 2) ^ geom) | (get(number, first + 3) ^ geom)
+            odd |= (get(behind_number, first + 1) ^ behind) | (get(behind_number, first + 2) ^ behind)
+            odd |= get(behind_number, first + 3) ^ behind
+            for sample in range(first, first + (1 if odd == 0 else 4)):
+                share = share_of(number, behind_number, first, sample)
+                if share > 0:
+                    geom, behind = np.int64(get(number, sample)), np.int64(get(behind_number, sample))
+                    add_job(jobs, color, room, geoms, count, row, column, geom, behind, share)
+                    count += 1
+    return count
+
+
+@part
+def write_pixels(jobs, color, room, count, out):
+    """Weigh the colors of each pixel's jobs by their samples into a picture (row, column, 3) uint8."""
+    j = 0
+    while j < count:
+        row, column, left = get(jobs, j), get(jobs, room + j), i4(4)
+        red, green, blue = f4(0), f4(0), f4(0)
+        while left > 0:
+            share = get(jobs, 2 * room + j)
+            weight = f4(share)
+            red += weight * get(color, j)
+            green += weight * get(color, room + j)
+            blue += weight * get(color, 2 * room + j)
+            left, j = i4(left - share), j + 1
+        out[row, column, 0] = np.uint8(i4(red * f4(63.75) + f4(0.5)))
+        out[row, column, 1] = np.uint8(i4(green * f4(63.75) + f4(0.5)))
+        out[row, column, 2] = np.uint8(i4(blue * f4(63.75) + f4(0.5)))
 
 
 # -- colors ----------------------------------------------------------------------------------------
 
 
 @part
-def shade_surface(k, rec, texels, table, grid, vertices, heaven, known, geom, behind, veiled, pixels, row, column):
-    """(red, green, blue) in [0, 1] of what samples of a pixel show.
+def take_base(s, n, jobs, color, room, first):
+    """What lies under n jobs into the base colors."""
+    distinct()
+    for i in range(n):
+        job = get(jobs, first + i)
+        put(s, BASE_RED + i, get(color, job))
+        put(s, BASE_GREEN + i, get(color, room + job))
+        put(s, BASE_BLUE + i, get(color, 2 * room + job))
+
+
+@part
+def give_base(s, n, jobs, color, room, first):
+    """The base colors back to their jobs."""
+    for i in range(n):
+        job = get(jobs, first + i)
+        put(color, job, get(s, BASE_RED + i))
+        put(color, room + job, get(s, BASE_GREEN + i))
+        put(color, 2 * room + job, get(s, BASE_BLUE + i))
+
+
+@stage
+def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, mirrored, veil):
+    """Lay geom g over the colors of its jobs.
 
     Args:
-      geom: in front; `behind`: what is mirrored in it or, if `veiled`, what it is seen through.
+      which: of its lists (0: in front); `mirrored`: its mirror image; `veil`: see `shading.cover_plane`.
     """
-    red, green, blue = 0.0, 0.0, 0.0
-    if behind != NOTHING and not veiled:
-        a, b, c, d, e, f = shade_body(k, rec, texels, table, behind, pixels, row, column, True)
-        red, green, blue = min(a + d, 1.0), min(b + e, 1.0), min(c + f, 1.0)
-    if geom == NOTHING:
-        at = row * pixels + column
-        if not known[at]:
-            known[at] = True
-            heaven[at, 0], heaven[at, 1], heaven[at, 2] = shade_sky(k, texels, table, pixels, row, column)
-        red, green, blue = heaven[at, 0], heaven[at, 1], heaven[at, 2]
-    else:
-        if rec[geom, KIND] == PLANE:
-            a, b, c, d, e, f = shade_plane(k, rec, texels, table, grid, vertices, geom, pixels, row, column)
+    geoms, room = rec.shape[0], room_for(pixels)
+    first, total = lists_at(room, geoms, which, g), np.int64(get(jobs, length_at(room, geoms, which, g)))
+    for at in range(first, first + total, CHUNK):
+        n = min(CHUNK, first + total - at)
+        aim(s, n, jobs, room, at, pixels, k[STEP])
+        take_base(s, n, jobs, color, room, at)
+        if rec[g, KIND] == PLANE:
+            shade_plane(s, n, k, rec, texels, width, plane, g)
+            cover_plane(s, n, k, rec, g, veil)
         else:
-            a, b, c, d, e, f = shade_body(k, rec, texels, table, geom, pixels, row, column, False)
-        red = min(min(red + a, 1.0) + d, 1.0)
-        green = min(min(green + b, 1.0) + e, 1.0)
-        blue = min(min(blue + c, 1.0) + f, 1.0)
-    if behind != NOTHING and veiled:
-        a, b, c, d, e, f = shade_plane(k, rec, texels, table, grid, vertices, behind, pixels, row, column)
-        rest = (1.0 - rec[behind, OPACITY]) * (1.0 - rec[behind, OPACITY])  # MuJoCo draws what is transparent twice
-        red = red * rest + min(a + d, 1.0) * (1.0 - rest)
-        green = green * rest + min(b + e, 1.0) * (1.0 - rest)
-        blue = blue * rest + min(c + f, 1.0) * (1.0 - rest)
-    return red, green, blue
-
-
-@leaf
-def drop_hidden_images(number, inverse, behind, behind_number, first, mirror):
-    """Keep a pixel's mirror images where the mirror is in front, and the image beyond it."""
-    for s in range(first, first + 4):
-        if behind_number[s] != NOTHING and (number[s] != mirror or behind[s] >= inverse[s]):
-            behind_number[s] = NOTHING
-
-
-@leaf
-def share_of(number, behind_number, first, s):
-    """How many of a pixel's samples show what sample s does; 0 if one before it does."""
-    count = 1
-    for t in range(first, first + 4):
-        if t != s and number[t] == number[s] and behind_number[t] == behind_number[s]:
-            if t < s:
-                return 0
-            count += 1
-    return count
+            shade_body(s, n, k, rec, texels, width, g, mirrored)
+            cover_body(s, n, k, rec, g, k[REFLECTANCE] if mirrored else 1.0)
+        give_base(s, n, jobs, color, room, at)
 
 
 @part
-def shade_picture(
-    k, rec, texels, table, grid, vertices, heaven, known,
-    inverse, number, behind, behind_number, veiled, pixels, out, f,
-):  # fmt: skip
-    """Write frame f of `out`: each surface in a pixel is shaded once and weighted by its samples."""
-    mirror, layered = int(k[MIRROR]), veiled or k[MIRROR] >= 0.0
-    half = (pixels + 1) // 2
-    for place in range(4 * half * half):  # two by two, as texture footprints are shared
-        quad, corner = place >> 2, place & 3
-        row, column = 2 * (quad // half) + (corner >> 1) - (pixels & 1), 2 * (quad % half) + (corner & 1)
-        if row < 0 or row >= pixels or column >= pixels:
+def shade_heaven(s, k, texels, width, jobs, color, pixels, first, total):
+    """Colors of `total` jobs of the sky, listed from `first` on."""
+    room = room_for(pixels)
+    for at in range(first, first + total, CHUNK):
+        n = min(CHUNK, first + total - at)
+        aim(s, n, jobs, room, at, pixels, k[STEP])
+        shade_sky(s, n, k, texels, width)
+        give_base(s, n, jobs, color, room, at)
+
+
+@part
+def keep_heaven(s, k, texels, width, jobs, color, pixels, geoms):
+    """Fill the last part of `color` with the sky in every pixel."""
+    room, total = room_for(pixels), pixels * pixels
+    at = lists_at(room, geoms, 0, 0)
+    for first in range(0, total, CHUNK):
+        n = min(CHUNK, total - first)
+        for i in range(n):
+            jobs[i], jobs[room + i], jobs[at + i] = (first + i) // pixels, (first + i) % pixels, i
+        shade_heaven(s, k, texels, width, jobs, color, pixels, at, n)
+        for c in range(3):
+            for i in range(n):
+                put(color, 3 * room + c * total + first + i, get(color, c * room + i))
+
+
+@part
+def take_heaven(jobs, color, room, pixels, first, total):
+    """As `shade_heaven`, from what `keep_heaven` has kept."""
+    for i in range(first, first + total):
+        job = get(jobs, i)
+        pixel = 3 * room + get(jobs, job) * pixels + get(jobs, room + job)
+        for c in range(3):
+            put(color, c * room + job, get(color, c * pixels * pixels + pixel))
+
+
+@stage
+def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known):
+    """Colors of all listed jobs: mirror images, what is in front, what that is seen through.
+
+    Args:
+      known: the sky is kept.
+    """
+    geoms, room = rec.shape[0], room_for(pixels)
+    for layer in range(3):
+        if (layer == 0 and veiled) or (layer == 2 and not veiled):
             continue
-        first = 4 * (row * pixels + column)
-        if layered and not veiled:
-            drop_hidden_images(number, inverse, behind, behind_number, first, mirror)
-        red, green, blue, left, s = 0.0, 0.0, 0.0, 4, first
-        while left > 0:
-            count = share_of(number, behind_number, first, s)
-            if count > 0:
-                a, b, c = shade_surface(
-                    k, rec, texels, table, grid, vertices, heaven, known,
-                    int(number[s]), int(behind_number[s]), veiled, pixels, row, column,
-                )  # fmt: skip
-                red, green, blue, left = red + count * a, green + count * b, blue + count * c, left - count
-            s += 1
-        out[f, row, column, 0] = np.uint8(red * 63.75 + 0.5)
-        out[f, row, column, 1] = np.uint8(green * 63.75 + 0.5)
-        out[f, row, column, 2] = np.uint8(blue * 63.75 + 0.5)
+        which = 0 if layer == 1 else 1
+        for g in range(geoms):
+            if get(jobs, length_at(room, geoms, which, g)) > 0:
+                rest = (1.0 - rec[g, OPACITY]) * (1.0 - rec[g, OPACITY])  # MuJoCo draws what is transparent twice
+                veil = 1.0 - rest if layer == 2 else 1.0
+                shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, layer == 0, veil)
+        first, total = lists_at(room, geoms, 0, geoms), np.int64(get(jobs, length_at(room, geoms, 0, geoms)))
+        if layer == 1 and known:
+            take_heaven(jobs, color, room, pixels, first, total)
+        elif layer == 1:
+            shade_heaven(s, k, texels, width, jobs, color, pixels, first, total)
 
 
-@leaf
-def same_sky(axes, sky, f):
-    """Whether frame f shows the sky as the frame before it did."""
-    same = f > 0 and sky[f] == sky[f - 1]
-    for row in range(3):
-        for column in range(3):
-            same = same and axes[f, row, column] == axes[f - 1, row, column]
-    return same
+# -- pictures --------------------------------------------------------------------------------------
 
 
 @part
-def light_frame(k, rec, grid, vertices):
+def clip(k, c0, c1, r0, r1):
+    """Paint this part of the picture only."""
+    k[CLIP], k[CLIP + 1], k[CLIP + 2], k[CLIP + 3] = c0, c1, r0, r1
+
+
+@part
+def clip_to_some(k, rec, pixels, goal):
+    """Paint only where the goal's geoms are (`goal` 1), or all others that move (0); gives whether they can be seen."""
+    clip(k, i8(0), pixels, i8(0), pixels)
+    left, right, top, bottom = pixels, 0, pixels, 0
+    for g in range(rec.shape[0]):
+        if rec[g, KIND] != PLANE and rec[g, GOAL] == goal and (goal or rec[g, MOVING] > 0.0):
+            c0, c1, r0, r1 = body_box(k, rec, g, i8(PLACE), i8(AXIS), pixels)
+            if c0 < c1 and r0 < r1:
+                left, right, top, bottom = min(left, c0), max(right, c1), min(top, r0), max(bottom, r1)
+    if goal and (k[CONE] > 0.0 or k[MIRROR] >= 0.0):
+        return True  # its shadow and mirror image may be anywhere
+    clip(k, left, right, top, bottom)
+    return left < right
+
+
+@stage
+def paint(
+    inverse, number, behind, behind_number, rays, s, k, rec, texels, width, plane, jobs, color,
+    which, inside, known, out,
+):  # fmt: skip
+    """Paint the CLIP of a frame into a picture (row, column, 3)."""
+    pixels, bottom = rays.size // 9, int(k[CLIP + 3])
+    veiled, room = veils(rec, inside), room_for(pixels)
+    draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled)
+    for row in range(int(k[CLIP + 2]), bottom, room // (4 * pixels)):
+        past_row = min(row + room // (4 * pixels), bottom)
+        count = list_jobs(number, behind_number, jobs, color, k, pixels, rec.shape[0], row, past_row)
+        shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known)
+        write_pixels(jobs, color, room, count, out)
+
+
+@part
+def set_constants(k, constants):
+    """The first entries of k."""
+    for i in range(constants.size):
+        k[i] = constants[i]
+
+
+@part
+def copy_picture(source, target):
+    """(row, column, 3) to another."""
+    for row in range(source.shape[0]):
+        for column in range(source.shape[1]):
+            for c in range(3):
+                target[row, column, c] = source[row, column, c]
+
+
+@part
+def same(array, f):
+    """Whether array[f] is equal to array[f - 1], both (row, column)."""
+    for row in range(array.shape[1]):
+        for column in range(array.shape[2]):
+            if array[f, row, column] != array[f - 1, row, column]:
+                return False
+    return True
+
+
+@part
+def same_sky(axes, sky, f):
+    """Whether frame f shows the sky as the frame before it does."""
+    return 0 < f < sky.size and sky[f] == sky[f - 1] and same(axes, f)
+
+
+@stage
+def light_frame(s, k, rec, plane):
     """Make the lamp's light on the lit plane and its shadow map ready."""
     for i in range(4):
         k[WINDOW + i] = 0.0
@@ -361,49 +615,99 @@ def light_frame(k, rec, grid, vertices):
     aim_shadows(k, rec)
     for g in range(rec.shape[0]):
         if rec[g, KIND] == PLANE:
-            light_vertices(k, rec, grid, vertices, g)
+            light_vertices(s, k, rec, plane, g)
 
 
-@part
+@stage
+def pose(k, rec, looks, center, turn, eye, axes, lamp, rgb, look, sky, f, pixels):
+    """Everything of frame f into the camera's frame."""
+    pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
+    pose_camera(k, eye, axes, lamp, sky, f)
+    clip(k, i8(0), pixels, i8(0), pixels)
+
+
+@stage
 def paint_frames(
-    looks, constants, boxes, grid, texels, table, xs, ys, offsets,
+    looks, constants, boxes, texels, width, rays,
     center, turn, eye, axes, lamp, rgb, look, sky,
-    inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
-    hide_goal, out,
+    inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
+    stays, shown, hidden,
 ):  # fmt: skip
-    """Paint frames into `out` (frame, pixels, pixels, 3) uint8; arguments as `Still`, `Frames` and `Work` name them."""
-    k[: constants.size] = constants
+    """Paint frames into `shown`, and without the goal into `hidden`, each (frame, pixels, pixels, 3) uint8, or of no
+    frames where it is not wanted; arguments as `Still`, `Frames` and `Work` name them.
+
+    Args:
+      stays: no plane, shadow or mirror image ever moves.
+    """
+    set_constants(k, constants)
+    pixels, has_kept, known = rays.size // 9, False, False
+    all_, both = ALL if len(shown) else NO_GOAL, len(shown) > 0 and len(hidden) > 0
     for f in range(look.size):
-        pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
-        pose_camera(k, eye, axes, lamp, sky, f)
-        veiled = draw_front(inverse, number, xs, ys, offsets, k, rec, hide_goal, in_a_box(boxes, eye, f))
-        draw_behind(inverse, behind, behind_number, xs, ys, offsets, k, rec, hide_goal, veiled)
-        light_frame(k, rec, grid, vertices)
-        if not same_sky(axes, sky, f):
-            known[:] = False
-        shade_picture(
-            k, rec, texels, table, grid, vertices, heaven, known,
-            inverse, number, behind, behind_number, veiled, ys.size, out, f,
-        )  # fmt: skip
+        out = shown[f] if len(shown) else hidden[f]
+        pose(k, rec, looks, center, turn, eye, axes, lamp, rgb, look, sky, f, pixels)
+        face_planes(rec)
+        light_frame(s, k, rec, plane)
+        inside = in_a_box(boxes, eye, f)
+        known = known and same_sky(axes, sky, f)
+        if not known and same_sky(axes, sky, f + 1):
+            keep_heaven(s, k, texels, width, jobs, color, pixels, rec.shape[0])
+            known = True
+        still = (
+            stays
+            and same_sky(axes, sky, f)
+            and look[f] == look[f - 1]
+            and same(eye.reshape(-1, 1, 3), f)
+            and same(rgb, f)
+        )
+        has_kept = has_kept and still
+        # What does not move, once; what moves; the goal; the goal's place without it.
+        for step in range(4):
+            picture, which = out, all_
+            if step == 0 and still:
+                if has_kept:
+                    continue
+                picture, which, has_kept = kept, NOTHING_MOVING, True
+            elif step == 1 and still:
+                copy_picture(kept, out)
+                if not clip_to_some(k, rec, pixels, i8(0)):
+                    continue
+            elif step == 2 and still and all_ == ALL:
+                if not clip_to_some(k, rec, pixels, i8(1)):
+                    continue
+            elif step == 3 and both:
+                picture, which = hidden[f], NO_GOAL
+                copy_picture(out, picture)
+                if not clip_to_some(k, rec, pixels, i8(1)):
+                    continue
+            elif step > 0:
+                continue
+            paint(
+                inverse, number, behind, behind_number, rays, s, k, rec, texels, width, plane, jobs, color,
+                which, inside, known, picture,
+            )  # fmt: skip
 
 
-@part
+@stage
 def label_frames(
-    looks, constants, boxes, grid, texels, table, xs, ys, offsets,
+    looks, constants, boxes, texels, width, rays,
     center, turn, eye, axes, lamp, rgb, look, sky,
-    inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
+    inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
     depth, geom,
 ):  # fmt: skip
     """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them."""
-    k[: constants.size] = constants
+    set_constants(k, constants)
+    pixels = rays.size // 9
     for f in range(look.size):
-        pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
-        pose_camera(k, eye, axes, lamp, sky, f)
-        rec[:, OWN_OPACITY] = 1.0 / BACK_OF_PLANE
-        draw_front(inverse, number, xs, ys, offsets, k, rec, False, False)
-        for row in range(ys.size):
-            for column in range(ys.size):
-                sample = 4 * (row * ys.size + column)
+        pose(k, rec, looks, center, turn, eye, axes, lamp, rgb, look, sky, f, pixels)
+        for g in range(rec.shape[0]):
+            rec[g, OWN_OPACITY] = 1.0 / BACK_OF_PLANE
+        face_planes(rec)
+        clear(inverse, number, k, pixels)
+        draw_bodies(inverse, number, rays, k, rec, i8(ALL), i8(PLACE), i8(AXIS))
+        draw_planes(inverse, number, rays, k, rec, True)
+        for row in range(pixels):
+            for column in range(pixels):
+                sample = 4 * (row * pixels + column)
                 sky_there = number[sample] == NOTHING
                 depth[f, row, column] = np.float32(0) if sky_there else np.float32(1) / inverse[sample]
                 geom[f, row, column] = -1 if sky_there else number[sample]
@@ -413,39 +717,39 @@ def painter(version: int):
     """`paint_frames` compiled and kept on disk under a version: numba itself looks at one file's date alone."""
 
     @njit(nogil=True, error_model="numpy", cache=True)
-    def paint(
-        looks, constants, boxes, grid, texels, table, xs, ys, offsets,
+    def paint_them(
+        looks, constants, boxes, texels, width, rays,
         center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
-        hide_goal, out,
+        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
+        stays, shown, hidden,
     ):  # fmt: skip
         if version != 0:
             paint_frames(
-                looks, constants, boxes, grid, texels, table, xs, ys, offsets,
+                looks, constants, boxes, texels, width, rays,
                 center, turn, eye, axes, lamp, rgb, look, sky,
-                inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
-                hide_goal, out,
+                inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
+                stays, shown, hidden,
             )  # fmt: skip
 
-    return paint
+    return paint_them
 
 
 def labeler(version: int):
     """`label_frames` compiled and kept on disk under a version."""
 
     @njit(nogil=True, error_model="numpy", cache=True)
-    def label(
-        looks, constants, boxes, grid, texels, table, xs, ys, offsets,
+    def label_them(
+        looks, constants, boxes, texels, width, rays,
         center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
+        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
         depth, geom,
     ):  # fmt: skip
         if version != 0:
             label_frames(
-                looks, constants, boxes, grid, texels, table, xs, ys, offsets,
+                looks, constants, boxes, texels, width, rays,
                 center, turn, eye, axes, lamp, rgb, look, sky,
-                inverse, number, behind, behind_number, rec, k, vertices, heaven, known,
+                inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
                 depth, geom,
             )  # fmt: skip
 
-    return label
+    return label_them

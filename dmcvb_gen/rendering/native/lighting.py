@@ -2,19 +2,52 @@
 
 A light's color at a point is `material * (ambient + diffuse * N.L) + specular * (N.H)^exponent`, the lamp's times
 `cos(angle off its axis)^exponent` inside its cone. As in OpenGL, the lit plane is lit at the vertices that MuJoCo
-draws it with, and blended between them.
+draws it with, and blended between them. Points and their light lie in rows of `lanes`.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from dmcvb_gen.rendering.native.lanes import (
+    CHUNK,
+    CONE_FACTOR,
+    HEAD,
+    HEAD_SHINE,
+    LAMP_BLUE,
+    LAMP_DIFFUSE,
+    LAMP_GREEN,
+    LAMP_RED,
+    LAMP_SHINE,
+    LIGHT,
+    NX,
+    NY,
+    NZ,
+    PX,
+    PY,
+    PZ,
+    RAISED,
+    WAY_X,
+    WAY_Y,
+    WAY_Z,
+    U,
+    V,
+    distinct,
+    get,
+    leaf,
+    part,
+    put,
+    stage,
+)
 from dmcvb_gen.rendering.native.records import (
     AXIS,
     BOUNDS,
     CONE,
     EXPONENT,
     EYE,
+    GRID,
     HEADLIGHT,
     KIND,
     LAMP,
@@ -29,68 +62,92 @@ from dmcvb_gen.rendering.native.records import (
     TURN,
     WINDOW,
 )
-from dmcvb_gen.rendering.native.sampling import leaf, part
+from dmcvb_gen.rendering.native.sampling import fill
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
 from dmcvb_gen.rendering.native.visibility import slopes_of_ball
 
-
-@leaf
-def power(base, exponent):
-    """`base` to a whole power by multiplication, so that its bits are the same everywhere."""
-    result = 1.0
-    while exponent > 0:
-        if exponent & 1:
-            result *= base
-        base *= base
-        exponent >>= 1
-    return result
+f4, i4, i8 = np.float32, np.int32, np.int64
+DIM = 0.8
+"""Squared (N.H) below which a highlight with a large exponent is left out: less than one part in a thousand."""
+SHARP = 64
+"""The least of these exponents."""
+GRAIN = 1000.0
+"""Steps of the shadow map's coordinates, when the extent of some points is measured."""
+OUTSIDE = 3e9
+"""A coordinate beyond every body's outline in the shadow map."""
 
 
 @leaf
-def highlight(nx, ny, nz, lx, ly, lz, vx, vy, vz, exponent):
-    """(N.H)^exponent; n and l are of unit length, v points to the eye."""
-    length = math.sqrt(vx * vx + vy * vy + vz * vz)
-    hx, hy, hz = lx * length + vx, ly * length + vy, lz * length + vz
+def half_vector(nx, ny, nz, lx, ly, lz, px, py, pz, least):
+    """(N.H), 0 where it is negative or its square is below `least`; n and l are of unit length, the eye is at 0."""
+    length = math.sqrt(px * px + py * py + pz * pz)
+    hx, hy, hz = lx * length - px, ly * length - py, lz * length - pz
     towards = nx * hx + ny * hy + nz * hz
-    if towards <= 0.0:
-        return 0.0
-    square = towards * towards / (hx * hx + hy * hy + hz * hz)
-    if square < 0.8 and exponent >= 64:  # below one part in a thousand
-        return 0.0
-    return power(math.sqrt(square), exponent)
+    square = towards * towards / max(hx * hx + hy * hy + hz * hz, f4(1e-30))
+    return math.sqrt(square) if (towards > f4(0)) & (square >= least) else f4(0)
 
 
 @leaf
-def headlight_terms(k, eye, px, py, pz, nx, ny, nz, exponent):
-    """(N.L, specular) of the headlight at a point p; `eye` is where its direction is in k."""
-    diffuse = -(nx * k[eye] + ny * k[eye + 1] + nz * k[eye + 2])
-    if diffuse <= 0.0:
-        return 0.0, 0.0
-    return diffuse, highlight(nx, ny, nz, -k[eye], -k[eye + 1], -k[eye + 2], -px, -py, -pz, exponent)
+def least_square(exponent):
+    """The squared (N.H) from which a highlight counts."""
+    return f4(DIM) if exponent >= SHARP else f4(0)
 
 
 @part
-def lamp_terms(k, lamp, px, py, pz, nx, ny, nz, exponent):
-    """(factor of the cone, N.L, specular) of the lamp at a point p; `lamp` is where it is in k."""
-    lx, ly, lz = k[lamp] - px, k[lamp + 1] - py, k[lamp + 2] - pz
-    length = math.sqrt(lx * lx + ly * ly + lz * lz)
-    if length == 0.0:
-        return 0.0, 0.0, 0.0
-    lx, ly, lz = lx / length, ly / length, lz / length
-    off = -(lx * k[lamp + 3] + ly * k[lamp + 4] + lz * k[lamp + 5])
-    if off < k[CONE]:
-        return 0.0, 0.0, 0.0
-    factor = power(off, int(k[CONE + 1]))
-    diffuse = nx * lx + ny * ly + nz * lz
-    if diffuse <= 0.0:
-        return factor, 0.0, 0.0
-    return factor, diffuse, highlight(nx, ny, nz, lx, ly, lz, -px, -py, -pz, exponent)
+def head_light(s, n, k, eye, exponent):
+    """Points and normals in; HEAD, and HEAD_SHINE before it is raised, out; `eye` is where its direction is in k."""
+    distinct()
+    ex, ey, ez, least = f4(k[eye]), f4(k[eye + 1]), f4(k[eye + 2]), least_square(exponent)
+    for i in range(n):
+        px, py, pz = get(s, PX + i), get(s, PY + i), get(s, PZ + i)
+        nx, ny, nz = get(s, NX + i), get(s, NY + i), get(s, NZ + i)
+        diffuse = -(nx * ex + ny * ey + nz * ez)
+        shine = half_vector(nx, ny, nz, -ex, -ey, -ez, px, py, pz, least)
+        put(s, HEAD + i, max(diffuse, f4(0)))
+        put(s, HEAD_SHINE + i, shine if diffuse > f4(0) else f4(0))
 
 
-@leaf
-def lit(k, light, c, own, factor, diffuse, specular):
-    """Channel c of a light's color; `light` is where it is in k, `own` the material's color there."""
-    return factor * (own * (k[light + c] + k[light + 3 + c] * diffuse) + k[light + 6 + c] * specular)
+@part
+def lamp_light(s, n, k, lamp, exponent):
+    """Points and normals in; CONE_FACTOR (yet to be raised), LAMP_DIFFUSE, LAMP_SHINE (likewise), LIGHT out.
+
+    Args:
+      lamp: where its place and direction are in k.
+    """
+    distinct()
+    ox, oy, oz = f4(k[lamp]), f4(k[lamp + 1]), f4(k[lamp + 2])
+    ax, ay, az = f4(k[lamp + 3]), f4(k[lamp + 4]), f4(k[lamp + 5])
+    cone, least = f4(k[CONE]), least_square(exponent)
+    for i in range(n):
+        px, py, pz = get(s, PX + i), get(s, PY + i), get(s, PZ + i)
+        nx, ny, nz = get(s, NX + i), get(s, NY + i), get(s, NZ + i)
+        lx, ly, lz = ox - px, oy - py, oz - pz
+        over = f4(1) / max(math.sqrt(lx * lx + ly * ly + lz * lz), f4(1e-6))
+        lx, ly, lz = lx * over, ly * over, lz * over
+        off = -(lx * ax + ly * ay + lz * az)
+        diffuse = nx * lx + ny * ly + nz * lz
+        shine = half_vector(nx, ny, nz, lx, ly, lz, px, py, pz, least)
+        put(s, CONE_FACTOR + i, off if off >= cone else f4(0))
+        put(s, LAMP_DIFFUSE + i, max(diffuse, f4(0)))
+        put(s, LAMP_SHINE + i, shine if diffuse > f4(0) else f4(0))
+        put(s, LIGHT + i, f4(1))
+
+
+@part
+def raise_row(s, n, row, exponent):
+    """A row to a whole power, by multiplication, so that its bits are the same everywhere; 0 stays 0."""
+    for i in range(n):
+        put(s, RAISED + i, f4(1) if get(s, row + i) > f4(0) else f4(0))
+    while exponent > 0:
+        if exponent & 1:
+            for i in range(n):
+                put(s, RAISED + i, get(s, RAISED + i) * get(s, row + i))
+        for i in range(n):
+            base = get(s, row + i)
+            put(s, row + i, base * base)
+        exponent >>= 1
+    for i in range(n):
+        put(s, row + i, get(s, RAISED + i))
 
 
 # -- shadows ---------------------------------------------------------------------------------------
@@ -115,12 +172,12 @@ def aim_shadows(k, rec):
         least_x, most_x, least_y, most_y = 1e9, -1e9, 1e9, -1e9
         for end in range(2 if kind == CAPSULE else 1):
             reach = 0.0 if kind != CAPSULE else (rec[g, SIZE + 1] if end == 0 else -rec[g, SIZE + 1])
-            right, up, depth = in_map(
-                k,
-                rec[g, PLACE] + reach * rec[g, AXIS],
-                rec[g, PLACE + 1] + reach * rec[g, AXIS + 1],
-                rec[g, PLACE + 2] + reach * rec[g, AXIS + 2],
-            )
+            dx = rec[g, PLACE] + reach * rec[g, AXIS] - k[LAMP]
+            dy = rec[g, PLACE + 1] + reach * rec[g, AXIS + 1] - k[LAMP + 1]
+            dz = rec[g, PLACE + 2] + reach * rec[g, AXIS + 2] - k[LAMP + 2]
+            depth = dx * x + dy * y + dz * z
+            right = dx * k[SHADOW] + dy * k[SHADOW + 1] + dz * k[SHADOW + 2]
+            up = dx * ux + dy * uy + dz * uz
             low, high = slopes_of_ball(right, depth, rec[g, SIZE])
             least_x, most_x = min(least_x, low), max(most_x, high)
             low, high = slopes_of_ball(up, depth, rec[g, SIZE])
@@ -129,79 +186,88 @@ def aim_shadows(k, rec):
         rec[g, BOUNDS + 2], rec[g, BOUNDS + 3] = least_y, most_y
 
 
-@leaf
-def in_map(k, px, py, pz):
-    """A point as (right, up, depth) of the shadow map."""
-    dx, dy, dz = px - k[LAMP], py - k[LAMP + 1], pz - k[LAMP + 2]
-    return (
-        dx * k[SHADOW] + dy * k[SHADOW + 1] + dz * k[SHADOW + 2],
-        dx * k[SHADOW + 3] + dy * k[SHADOW + 4] + dz * k[SHADOW + 5],
-        dx * k[SHADOW + 6] + dy * k[SHADOW + 7] + dz * k[SHADOW + 8],
-    )
+@part
+def ways_from_lamp(s, n, k):
+    """Points and LIGHT in; ways from the lamp to them out, none (the lamp is seen) outside the shadow map's square
+    or where there is no light. Gives the extent of the others in the map: least and greatest right and up, grains.
+    """
+    distinct()
+    ox, oy, oz = f4(k[LAMP]), f4(k[LAMP + 1]), f4(k[LAMP + 2])
+    rx, ry, rz = f4(k[SHADOW]), f4(k[SHADOW + 1]), f4(k[SHADOW + 2])
+    ux, uy, uz = f4(k[SHADOW + 3]), f4(k[SHADOW + 4]), f4(k[SHADOW + 5])
+    fx, fy, fz = f4(k[SHADOW + 6]), f4(k[SHADOW + 7]), f4(k[SHADOW + 8])
+    edge, far = f4(k[CONE + 2]), i4(1 << 30)
+    left, right, low, high = far, i4(-far), far, i4(-far)
+    for i in range(n):
+        dx, dy, dz = get(s, PX + i) - ox, get(s, PY + i) - oy, get(s, PZ + i) - oz
+        depth = dx * fx + dy * fy + dz * fz
+        over = f4(1) / max(depth, f4(1e-6))
+        across, up = (dx * rx + dy * ry + dz * rz) * over, (dx * ux + dy * uy + dz * uz) * over
+        inside = (depth > f4(0)) & (abs(across) <= edge) & (abs(up) <= edge) & (get(s, LIGHT + i) > f4(0))
+        a = i4(f4(GRAIN) * min(max(across, f4(-GRAIN)), f4(GRAIN)))
+        b = i4(f4(GRAIN) * min(max(up, f4(-GRAIN)), f4(GRAIN)))
+        left, right = min(left, a if inside else far), max(right, a if inside else i4(-far))
+        low, high = min(low, b if inside else far), max(high, b if inside else i4(-far))
+        put(s, WAY_X + i, dx if inside else f4(0))
+        put(s, WAY_Y + i, dy if inside else f4(0))
+        put(s, WAY_Z + i, dz if inside else f4(0))
+    return left, right, low, high
 
 
 @leaf
-def ball_blocks(dx, dy, dz, ox, oy, oz, radius):
+def ball_blocks(dx, dy, dz, ox, oy, oz, square_of_radius):
     """Whether the way from the origin to d meets a ball around o before its end."""
     square = dx * dx + dy * dy + dz * dz
     along = dx * ox + dy * oy + dz * oz
-    rest = along * along - square * (ox * ox + oy * oy + oz * oz - radius * radius)
-    if rest <= 0.0 or along <= 0.0:
-        return False
-    return along - math.sqrt(rest) < square * 0.9995
+    rest = along * along - square * (ox * ox + oy * oy + oz * oz - square_of_radius)
+    return (rest > f4(0)) & (along > f4(0)) & (along - math.sqrt(max(rest, f4(0))) < square * f4(0.9995))
 
 
 @part
-def capsule_blocks(dx, dy, dz, ox, oy, oz, ax, ay, az, radius, half):
-    """Whether the way from the origin to d meets a capsule before its end."""
-    nx, ny, nz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
-    mx, my, mz = oy * az - oz * ay, oz * ax - ox * az, ox * ay - oy * ax
-    square = nx * nx + ny * ny + nz * nz
-    moment = mx * mx + my * my + mz * mz - radius * radius
-    along = mx * nx + my * ny + mz * nz
-    rest = along * along - square * moment
-    reach = half
-    if moment > 0.0:
-        if rest <= 0.0 or along <= 0.0:
-            return False
-        part_of_way = (along - math.sqrt(rest)) / square
-        place = part_of_way * (dx * ax + dy * ay + dz * az) - (ox * ax + oy * ay + oz * az)
-        if abs(place) <= half:
-            return part_of_way < 0.9995
-        reach = half if place > 0.0 else -half
-    elif ox * ax + oy * ay + oz * az > 0.0:
-        reach = -half
-    return ball_blocks(dx, dy, dz, ox + reach * ax, oy + reach * ay, oz + reach * az, radius)
+def cast_shadow(s, n, k, rec, g):
+    """Ways from the lamp in; LIGHT is 0 where capsule or ball g is in the way."""
+    distinct()
+    dx, dy, dz = rec[g, PLACE] - k[LAMP], rec[g, PLACE + 1] - k[LAMP + 1], rec[g, PLACE + 2] - k[LAMP + 2]
+    ex, ey, ez = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
+    half, radius = rec[g, SIZE + 1] if rec[g, KIND] == CAPSULE else 0.0, rec[g, SIZE]
+    mx, my, mz = dy * ez - dz * ey, dz * ex - dx * ez, dx * ey - dy * ex
+    moment, center = mx * mx + my * my + mz * mz - radius * radius, dx * ex + dy * ey + dz * ez
+    outside = moment > 0.0  # of the endless cylinder
+    toward = center <= 0.0  # else only the nearer end can be in the way
+    ox, oy, oz, ax, ay, az = f4(dx), f4(dy), f4(dz), f4(ex), f4(ey), f4(ez)
+    mx, my, mz, moment, center = f4(mx), f4(my), f4(mz), f4(moment), f4(center)
+    half, square_of_radius = f4(half), f4(radius * radius)
+    for i in range(n):
+        dx, dy, dz = get(s, WAY_X + i), get(s, WAY_Y + i), get(s, WAY_Z + i)
+        nx, ny, nz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
+        square, along = nx * nx + ny * ny + nz * nz, mx * nx + my * ny + mz * nz
+        rest = along * along - square * moment
+        met = (rest > f4(0)) & (along > f4(0))
+        share = (along - math.sqrt(max(rest, f4(0)))) / max(square, f4(1e-12))
+        place = share * (dx * ax + dy * ay + dz * az) - center
+        end = half if ((place > f4(0)) if outside else toward) else -half
+        ball = ball_blocks(dx, dy, dz, ox + end * ax, oy + end * ay, oz + end * az, square_of_radius)
+        side = share < f4(0.9995)
+        blocked = (met & (side if abs(place) <= half else ball)) if outside else ball
+        put(s, LIGHT + i, f4(0) if blocked else get(s, LIGHT + i))
 
 
-@part
-def in_shadow(k, rec, px, py, pz, itself):
-    """Whether a body other than `itself` is between the lamp and a point, inside the square the shadow map sees."""
-    right, up, depth = in_map(k, px, py, pz)
-    if depth <= 0.0:
-        return False
-    right, up = right / depth, up / depth
-    if abs(right) > k[CONE + 2] or abs(up) > k[CONE + 2]:
-        return False
-    dx, dy, dz = px - k[LAMP], py - k[LAMP + 1], pz - k[LAMP + 2]
+@stage
+def cast_shadows(s, n, k, rec, itself):
+    """Points in; LIGHT is 0 where a body other than `itself` is between them and the lamp."""
+    left, right, low, high = ways_from_lamp(s, n, k)
+    if left > right:
+        return
     for g in range(rec.shape[0]):
         if (
-            g == itself
-            or rec[g, KIND] == PLANE
-            or right < rec[g, BOUNDS]
-            or right > rec[g, BOUNDS + 1]
-            or up < rec[g, BOUNDS + 2]
-            or up > rec[g, BOUNDS + 3]
+            g != itself
+            and rec[g, KIND] != PLANE
+            and GRAIN * rec[g, BOUNDS] <= right + 2
+            and GRAIN * rec[g, BOUNDS + 1] >= left - 2
+            and GRAIN * rec[g, BOUNDS + 2] <= high + 2
+            and GRAIN * rec[g, BOUNDS + 3] >= low - 2
         ):
-            continue
-        ox, oy, oz = rec[g, PLACE] - k[LAMP], rec[g, PLACE + 1] - k[LAMP + 1], rec[g, PLACE + 2] - k[LAMP + 2]
-        if rec[g, KIND] == CAPSULE:
-            ax, ay, az = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
-            if capsule_blocks(dx, dy, dz, ox, oy, oz, ax, ay, az, rec[g, SIZE], rec[g, SIZE + 1]):
-                return True
-        elif ball_blocks(dx, dy, dz, ox, oy, oz, rec[g, SIZE]):
-            return True
-    return False
+            cast_shadow(s, n, k, rec, g)
 
 
 # -- the lit plane ---------------------------------------------------------------------------------
@@ -223,75 +289,131 @@ def cone_slope(cosine, down):
 
 
 @part
-def light_vertices(k, rec, grid, vertices, g):
-    """Fill WINDOW (first and past the last along two axes), and `vertices` in it, with the lamp's color on plane g.
-
-    An opaque plane is lit in two passes; on one that is seen through both lights are added before they are cut at 1.
-    """
-    together = rec[g, OPACITY] < OPAQUE
+def lit_window(k, rec, plane, g):
+    """Fill WINDOW: the vertices (first, past the last; along two axes) of plane g that the lamp's cone reaches."""
     dx, dy, dz = k[LAMP] - rec[g, PLACE], k[LAMP + 1] - rec[g, PLACE + 1], k[LAMP + 2] - rec[g, PLACE + 2]
     nx, ny, nz = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
     height = dx * nx + dy * ny + dz * nz
     reach = height * cone_slope(k[CONE], -(k[LAMP + 3] * nx + k[LAMP + 4] * ny + k[LAMP + 5] * nz))
     for axis in range(2):
         middle = dx * rec[g, TURN + axis] + dy * rec[g, TURN + 3 + axis] + dz * rec[g, TURN + 6 + axis]
-        lines, first = int(k[LINES + axis]), 0
-        while first < lines and grid[axis, first] < middle - reach:
+        lines, first, grid = int(k[LINES + axis]), 0, axis * int(k[GRID])
+        while first < lines and plane[grid + first] < middle - reach:
             first += 1
         past = first
-        while past < lines and grid[axis, past] <= middle + reach and height > 0.0:
+        while past < lines and plane[grid + past] <= middle + reach and height > 0.0:
             past += 1
         # With the dark vertices around it, so that every cell that has any light has all its corners.
         k[WINDOW + 2 * axis], k[WINDOW + 2 * axis + 1] = max(first - 1, 0), min(past + 1, lines)
-    share, exponent = rec[g, SHARE], int(rec[g, EXPONENT])
-    for i in range(int(k[WINDOW]), int(k[WINDOW + 1])):
-        for j in range(int(k[WINDOW + 2]), int(k[WINDOW + 3])):
-            px = rec[g, PLACE] + grid[0, i] * rec[g, TURN] + grid[1, j] * rec[g, TURN + 1]
-            py = rec[g, PLACE + 1] + grid[0, i] * rec[g, TURN + 3] + grid[1, j] * rec[g, TURN + 4]
-            pz = rec[g, PLACE + 2] + grid[0, i] * rec[g, TURN + 6] + grid[1, j] * rec[g, TURN + 7]
-            factor, diffuse, specular = lamp_terms(k, LAMP, px, py, pz, nx, ny, nz, exponent)
-            head, head_specular = headlight_terms(k, EYE, px, py, pz, nx, ny, nz, exponent)
-            for c in range(3):
-                own = rec[g, RGB + c]
-                color = min(lit(k, SPOT, c, own, factor, diffuse, specular * share), 1.0)
-                if together:
-                    first = min(lit(k, HEADLIGHT, c, own, 1.0, head, head_specular * share), 1.0)
-                    color = min(color, 1.0 - first)
-                vertices[i, j, c] = color
-
-
-@leaf
-def cell_of(grid, axis, lines, x):
-    """The cell of a plane's grid that holds x."""
-    if x < grid[axis, 1]:
-        return 0
-    if lines < 4 or x >= grid[axis, lines - 2]:
-        return lines - 2
-    return min(1 + int((x - grid[axis, 1]) / (grid[axis, 2] - grid[axis, 1])), lines - 3)
 
 
 @part
-def lamp_on_plane(k, grid, vertices, x, y):
-    """The lamp's color at (x, y) of the lit plane; OpenGL draws each cell as two triangles."""
-    i, j = cell_of(grid, 0, int(k[LINES]), x), cell_of(grid, 1, int(k[LINES + 1]), y)
-    if i < k[WINDOW] or i + 1 >= k[WINDOW + 1] or j < k[WINDOW + 2] or j + 1 >= k[WINDOW + 3]:
-        return 0.0, 0.0, 0.0
-    wide, high = grid[0, i + 1] - grid[0, i], grid[1, j + 1] - grid[1, j]
-    a = (x - grid[0, i]) / wide if wide > 0.0 else 0.0
-    b = (y - grid[1, j]) / high if high > 0.0 else 0.0
-    return (
-        blended(vertices, i, j, a, b, 0),
-        blended(vertices, i, j, a, b, 1),
-        blended(vertices, i, j, a, b, 2),
-    )
+def store_vertices(s, n, k, rec, plane, g, first, high, lines):
+    """Light at some vertices of the lit plane in, the lamp's color there (red, green, blue of each) out.
+
+    Args:
+      first: of these vertices in the window, which is `high` vertices high; `lines`: of the grid's second axis.
+    """
+    together = rec[g, OPACITY] < OPAQUE
+    share = rec[g, SHARE]
+    for i in range(n):
+        row, column = int(k[WINDOW]) + (first + i) // high, int(k[WINDOW + 2]) + (first + i) % high
+        at = 2 * int(k[GRID]) + 3 * (row * lines + column)
+        for c in range(3):
+            own = rec[g, RGB + c]
+            color = own * (k[SPOT + c] + k[SPOT + 3 + c] * s[LAMP_DIFFUSE + i])
+            color += k[SPOT + 6 + c] * share * s[LAMP_SHINE + i]
+            color = min(s[CONE_FACTOR + i] * color, 1.0)
+            if together:
+                head = own * (k[HEADLIGHT + c] + k[HEADLIGHT + 3 + c] * s[HEAD + i])
+                color = min(color, 1.0 - min(head + k[HEADLIGHT + 6 + c] * share * s[HEAD_SHINE + i], 1.0))
+            plane[at + c] = color
+
+
+@stage
+def light_vertices(s, k, rec, plane, g):
+    """Fill WINDOW, and the vertices in it, with the lamp's color on plane g.
+
+    An opaque plane is lit in two passes; on one that is seen through both lights are added before they are cut at 1.
+    """
+    lit_window(k, rec, plane, g)
+    high, exponent = int(k[WINDOW + 3] - k[WINDOW + 2]), int(rec[g, EXPONENT])
+    total = int(k[WINDOW + 1] - k[WINDOW]) * high
+    for first in range(0, total, CHUNK):
+        n = min(CHUNK, total - first)
+        for i in range(n):
+            x = plane[int(k[WINDOW]) + (first + i) // high]
+            y = plane[int(k[GRID] + k[WINDOW + 2]) + (first + i) % high]
+            s[PX + i] = rec[g, PLACE] + x * rec[g, TURN] + y * rec[g, TURN + 1]
+            s[PY + i] = rec[g, PLACE + 1] + x * rec[g, TURN + 3] + y * rec[g, TURN + 4]
+            s[PZ + i] = rec[g, PLACE + 2] + x * rec[g, TURN + 6] + y * rec[g, TURN + 7]
+        for axis in range(3):
+            fill(s, n, NX + axis * CHUNK, f4(rec[g, AXIS + axis]))
+        head_light(s, n, k, i8(EYE), exponent)
+        lamp_light(s, n, k, i8(LAMP), exponent)
+        raise_lights(s, n, k, exponent)
+        store_vertices(s, n, k, rec, plane, g, first, high, int(k[LINES + 1]))
+
+
+@part
+def raise_lights(s, n, k, exponent):
+    """Raise what `head_light` and `lamp_light` have left to be raised."""
+    raise_row(s, n, i8(HEAD_SHINE), exponent)
+    if k[CONE] > 0.0:
+        raise_row(s, n, i8(LAMP_SHINE), exponent)
+        raise_row(s, n, i8(CONE_FACTOR), int(k[CONE + 1]))
 
 
 @leaf
-def blended(vertices, i, j, a, b, c):
-    """Blend of color c of a cell's corners, (a, b) being the place in it."""
-    right, up = vertices[i + 1, j, c], vertices[i, j + 1, c]
-    if a + b <= 1.0:
-        corner = vertices[i, j, c]
-        return corner + a * (right - corner) + b * (up - corner)
-    corner = vertices[i + 1, j + 1, c]
-    return corner + (1.0 - a) * (up - corner) + (1.0 - b) * (right - corner)
+def cell_of(place, first, over, lines):
+    """The cell of a grid that holds a place: `over` is the inverse of all cells' width but the outermost ones'."""
+    return min(max(np.floor((place - first) * over) + f4(1), f4(0)), lines - f4(2))
+
+
+@leaf
+def lamp_color(plane, corner, right, up, a, b, c):
+    """Blend of color c of three vertices, a and b being the shares of two of them."""
+    middle = get(plane, corner + c)
+    return middle + a * (get(plane, right + c) - middle) + b * (get(plane, up + c) - middle)
+
+
+@part
+def lamp_on_plane(s, n, k, rec, plane, g):
+    """U and V on the lit plane g in; LAMP_RED and the others, and LIGHT where there is any, out.
+
+    OpenGL draws each cell of the grid as two triangles. Gives whether there is any light.
+    """
+    distinct()
+    wide, high = f4(k[LINES]), f4(k[LINES + 1])
+    count, second = i4(k[LINES + 1]), i4(k[GRID])
+    x1, y1 = plane[1], plane[second + 1]
+    over_x = f4(1) / (plane[2] - x1) if wide > f4(2) else f4(0)
+    over_y = f4(1) / (plane[second + 2] - y1) if high > f4(2) else f4(0)
+    half_x, half_y = f4(rec[g, SIZE]), f4(rec[g, SIZE + 1])
+    i0, i1, j0, j1 = f4(k[WINDOW]), f4(k[WINDOW + 1]), f4(k[WINDOW + 2]), f4(k[WINDOW + 3])
+    any_light = i4(0)
+    for i in range(n):
+        x, y = get(s, U + i) * half_x, get(s, V + i) * half_y
+        row, column = cell_of(x, x1, over_x, wide), cell_of(y, y1, over_y, high)
+        seen = (row >= i0) & (row + f4(1) < i1) & (column >= j0) & (column + f4(1) < j1)
+        r, c = i4(row), i4(column)
+        left, low = get(plane, r), get(plane, i4(second + c))
+        a = (x - left) / max(get(plane, i4(r + i4(1))) - left, f4(1e-9))
+        b = (y - low) / max(get(plane, i4(second + c + i4(1))) - low, f4(1e-9))
+        at = i4(i4(r * count) + c) if seen else i4(0)
+        right, up = i4(at + count), i4(at + i4(1))
+        lower = a + b <= f4(1)
+        corner = at if lower else i4(at + count + i4(1))
+        a, b = (a if lower else f4(1) - b), (b if lower else f4(1) - a)
+        first = i4(i4(2) * second)
+        corner, right, up = i4(first + corner * i4(3)), i4(first + right * i4(3)), i4(first + up * i4(3))
+        red = lamp_color(plane, corner, right, up, a, b, 0) if seen else f4(0)
+        green = lamp_color(plane, corner, right, up, a, b, 1) if seen else f4(0)
+        blue = lamp_color(plane, corner, right, up, a, b, 2) if seen else f4(0)
+        put(s, LAMP_RED + i, red)
+        put(s, LAMP_GREEN + i, green)
+        put(s, LAMP_BLUE + i, blue)
+        lit = red + green + blue > f4(0)
+        put(s, LIGHT + i, f4(1) if lit else f4(0))
+        any_light = max(any_light, i4(1) if lit else i4(0))
+    return any_light > 0

@@ -22,11 +22,11 @@ from dmcvb_gen.rendering.native import records as columns
 from dmcvb_gen.rendering.native.frame import Frames, Still, make_work
 from dmcvb_gen.rendering.native.scene import PLANE, Scene, look_of, scene_of
 from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
-from dmcvb_gen.rendering.native.visibility import sample_tables
+from dmcvb_gen.rendering.native.visibility import sample_rays
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
 
-VERSION = 1
+VERSION = 2
 """Goes up when pictures change."""
 SAMPLES = 4
 CHUNK = 256
@@ -79,7 +79,10 @@ class NativeRenderer(Renderer):
         self._records = np.zeros((0, len(self._scene.geoms), columns.RGB + 3))
         fields = ["geom_xpos", "geom_xmat"] + (["light_xpos", "light_xdir"] if self._scene.lamp >= 0 else [])
         self._kinematics = Kinematics(task, fields)
-        self._work = make_work(len(self._scene.geoms), size, self._scene.lines, columns.WIDTH)
+        self._stays = (
+            self._scene.mirror < 0 and self._scene.lamp < 0 and not self._scene.moving[self._scene.kind == PLANE].any()
+        )
+        self._work = make_work(len(self._scene.geoms), size, self._scene.grid)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -103,7 +106,8 @@ class NativeRenderer(Renderer):
             picture = np.empty((len(rows), self.size, self.size, 3), np.uint8)
             for column, view in enumerate(indices):
                 frames, still = self._frames(poses, exogenous[rows], view), self._still(view)
-                _call("painter", *still, *frames, *self._work, bool(hide_goal), picture)
+                shown, hidden = (picture[:0], picture) if hide_goal else (picture, picture[:0])
+                _call("painter", *still, *frames, *self._work, self._stays, shown, hidden)
                 out[rows, column] = picture
         return out
 
@@ -165,6 +169,7 @@ class NativeRenderer(Renderer):
             rec = np.zeros(self._records.shape[1:])
             rec[:, columns.KIND], rec[:, columns.SIZE : columns.SIZE + 3] = scene.kind, scene.size
             rec[:, columns.GOAL], rec[:, columns.BOXED] = scene.goal, _boxed(self.task, scene)
+            rec[:, columns.MOVING] = scene.moving
             rec[:, columns.MATERIAL], rec[:, columns.OWN_OPACITY] = look.material, look.color[:, 3]
             rec[:, columns.TEXTURE], rec[:, columns.REPEAT : columns.REPEAT + 2] = look.texture, look.repeat
             rec[:, columns.SHARE], rec[:, columns.EXPONENT] = look.shine.T
@@ -177,7 +182,6 @@ class NativeRenderer(Renderer):
         """The constant arguments of a view; with `centers` all samples lie in the middle of their pixels."""
         scene, angle = self._scene, self._angles[view]
         step = 2 * math.tan(angle / 2) / self.size
-        xs, ys, offsets = sample_tables(self.size, step, centers)
         constants = np.concatenate(
             [
                 [step, scene.near, scene.far, scene.mirror, scene.reflectance],
@@ -185,19 +189,16 @@ class NativeRenderer(Renderer):
                 scene.spot,
                 scene.cone,
                 scene.lines,
-                [scene.horizon],
+                [scene.grid.shape[1], scene.horizon],
             ]
         )
         return Still(
             looks=self._records,
             constants=constants,
             boxes=scene.boxes,
-            grid=scene.grid,
             texels=self._textures.texels,
-            table=self._textures.table,
-            xs=xs,
-            ys=ys,
-            offsets=offsets,
+            width=self._textures.table.shape[1],
+            rays=sample_rays(self.size, step, centers),
         )
 
 

@@ -1,185 +1,211 @@
 """Texture coordinates in, colors out: mip levels and weights as OpenGL on a CPU (Mesa's llvmpipe) chooses them.
 
-Everything here is plain arithmetic that gives the same bits on every processor: no function of a mathematics
-library, no contraction into fused operations.
+Everything works on rows of `lanes`. Texels and weights are whole numbers below 2^24, which float32 holds exactly.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit
 
+from dmcvb_gen.rendering.native.lanes import (
+    BLUE,
+    DX,
+    DY,
+    DZ,
+    FACE,
+    FOOTPRINT,
+    GREEN,
+    LEVEL,
+    MIX,
+    RED,
+    RIGHT_X,
+    RIGHT_Y,
+    RIGHT_Z,
+    UP_X,
+    UP_Y,
+    UP_Z,
+    S,
+    T,
+    distinct,
+    get,
+    leaf,
+    part,
+    put,
+    stage,
+)
 from dmcvb_gen.rendering.native.records import FACES, FIRST, LEVELS
 
-part = njit(nogil=True, error_model="numpy")
-"""For the parts of the entry points in `frame`, which alone are kept on disk."""
-leaf = njit(nogil=True, error_model="numpy", forceinline=True)
-"""For small parts: numba hands an array over as seven numbers or more, so a call can cost more than its work."""
+f4, i4 = np.float32, np.int32
 
 
-@leaf
-def level_of_detail(rho_squared):
-    """(finer level, share of the next one in 1/256) of a footprint of `rho` texels a pixel.
+@part
+def fill(s, n, row, value):
+    """Set a row of `lanes`."""
+    for i in range(n):
+        put(s, row + i, value)
+
+
+@part
+def choose_levels(s, n, last):
+    """FOOTPRINT in; LEVEL, its share MIX and no color out. Gives whether any place mixes two levels.
 
     The logarithm is linear between powers of two, and a level is taken alone within a quarter of it: llvmpipe's
     "brilinear" choice.
+
+    Args:
+      last: the coarsest level.
     """
-    if not rho_squared > 1.0:
-        return 0, 0
-    bits = np.int64(np.float32(rho_squared).view(np.int32))
-    lod = 0.5 * ((bits >> 23) - 127 + (bits & 0x7FFFFF) * (1.0 / 0x800000)) + 0.25
-    level = int(lod)
-    share = 2.0 * (lod - level) - 1.0
-    return level, int(256.0 * share) if share > 0.0 else 0
+    distinct()
+    most = i4(0)
+    for i in range(n):
+        rho = get(s, FOOTPRINT + i)
+        bits = f4(rho).view(i4)
+        power, rest = f4(i4((bits >> i4(23)) - i4(127))), f4(i4(bits & i4(0x7FFFFF))) * f4(1.0 / 0x800000)
+        lod = f4(0.5) * (power + rest) + f4(0.25)
+        lod = lod if rho > f4(1) else f4(0)
+        level = i4(lod)
+        share = np.floor(f4(256) * max(f4(2) * (lod - f4(level)) - f4(1), f4(0)))
+        share = share if level < last else f4(0)
+        put(s, LEVEL + i, f4(min(level, i4(last))))
+        put(s, MIX + i, share)
+        put(s, RED + i, f4(0))
+        put(s, GREEN + i, f4(0))
+        put(s, BLUE + i, f4(0))
+        most = max(most, i4(share))
+    return most > 0
 
 
 @leaf
-def repeated(coordinate, size):
-    """The two texels around a repeating coordinate, and the second one's weight in 1/256."""
-    place = (coordinate - math.floor(coordinate)) * size + 0.5
-    second = int(place)
-    weight = int(256.0 * (place - second))
-    first = second - 1
-    if first < 0:
-        first = size - 1
-    if second >= size:
-        second = 0
-    return first, second, weight
+def blend(one, two, three, four, across, down, shift):
+    """Channel of four texels (top left, top right, bottom left, bottom right), times 65536.
 
-
-@leaf
-def clamped(coordinate, size):
-    """As `repeated`, for a coordinate in [0, 1] that ends at the texture's edge."""
-    place = coordinate * size + 0.5
-    second = int(place)
-    weight = int(256.0 * (place - second))
-    return max(second - 1, 0), min(second, size - 1), weight
-
-
-@leaf
-def blend_of_four(texels, top, bottom, left, right, across, down):
-    """Red and blue (in the halves of one integer), and green, of four texels, times 65536."""
-    a, b, all_ = np.uint64(across), np.uint64(down), np.uint64(256)
-    eight = np.uint64(8)
-    one, two = np.uint64(texels[top + left]), np.uint64(texels[top + right])
-    three, four = np.uint64(texels[bottom + left]), np.uint64(texels[bottom + right])
-    low = np.uint64(0xFF)
-    move, high = np.uint64(16), np.uint64(0xFF0000)
-    u, v, w, x = (all_ - a) * (all_ - b), a * (all_ - b), (all_ - a) * b, a * b
-    red_blue = (
-        ((one & low) | ((one & high) << move)) * u
-        + ((two & low) | ((two & high) << move)) * v
-        + ((three & low) | ((three & high) << move)) * w
-        + ((four & low) | ((four & high) << move)) * x
-    )
-    green = (
-        ((one >> eight) & low) * u
-        + ((two >> eight) & low) * v
-        + ((three >> eight) & low) * w
-        + ((four >> eight) & low) * x
-    )
-    return red_blue, green
-
-
-@leaf
-def unpacked(red_blue, green, nearer, farther, share):
-    """Two levels' `blend_of_four` mixed, as colors in [0, 1]."""
-    unit = 1.0 / (255.0 * 65536.0)
-    low, half = np.uint64(0xFFFFFFFF), np.uint64(32)
-    red, blue, green_ = np.int64(red_blue & low), np.int64(red_blue >> half), np.int64(green)
-    if share > 0:
-        rest = 256 - share
-        red = red * rest + np.int64(nearer & low) * share
-        blue = blue * rest + np.int64(nearer >> half) * share
-        green_ = green_ * rest + np.int64(farther) * share
-        unit *= 1.0 / 256.0
-    return red * unit, green_ * unit, blue * unit
-
-
-@leaf
-def repeating_level(texels, table, texture, level, s, t):
-    """`blend_of_four` at (s, t) of a level of a repeating texture."""
-    entry = FIRST + 3 * level
-    columns = table[texture, entry + 1]
-    left, right, across = repeated(s, columns)
-    top, bottom, down = repeated(t, table[texture, entry + 2])
-    base = table[texture, entry]
-    return blend_of_four(texels, base + top * columns, base + bottom * columns, left, right, across, down)
+    Args:
+      shift: bits below the channel; `across`, `down`: weights of right and bottom in 1/256.
+    """
+    a, b = f4(i4((one >> shift) & i4(255))), f4(i4((two >> shift) & i4(255)))
+    c, d = f4(i4((three >> shift) & i4(255))), f4(i4((four >> shift) & i4(255)))
+    left, top = f4(256) - across, f4(256) - down
+    return (a * left + b * across) * top + (c * left + d * across) * down
 
 
 @part
-def sample_repeating(texels, table, texture, s, t, rho_squared):
-    """Color of a repeating texture at (s, t), for a squared footprint in texels."""
-    level, share = level_of_detail(rho_squared)
-    last = table[texture, LEVELS] - 1
-    if level >= last:
-        level, share = last, 0
-    red_blue, green = repeating_level(texels, table, texture, level, s, t)
-    more, more_green = np.uint64(0), np.uint64(0)
-    if share > 0:
-        more, more_green = repeating_level(texels, table, texture, level + 1, s, t)
-    return unpacked(red_blue, green, more, more_green, share)
+def add_repeating(s, n, texels, at, last, further, weight, slope):
+    """Add one level's color at (S, T) to RED, GREEN, BLUE, `weight + slope * MIX` times.
+
+    Args:
+      at: where in `texels` the table of textures has the texture's first level; `further`: 1 for the coarser level.
+    """
+    distinct()
+    for i in range(n):
+        entry = at + 3 * min(i4(get(s, LEVEL + i)) + further, last)
+        base, columns, rows = get(texels, entry), get(texels, entry + 1), get(texels, entry + 2)
+        x, y = get(s, S + i), get(s, T + i)
+        x, y = (x - np.floor(x)) * f4(columns) + f4(0.5), (y - np.floor(y)) * f4(rows) + f4(0.5)
+        right, bottom = i4(x), i4(y)
+        across, down = np.floor(f4(256) * (x - f4(right))), np.floor(f4(256) * (y - f4(bottom)))
+        left, top = i4(right - i4(1)), i4(bottom - i4(1))
+        left, top = left if left >= 0 else i4(columns - i4(1)), top if top >= 0 else i4(rows - i4(1))
+        right, bottom = right if right < columns else i4(0), bottom if bottom < rows else i4(0)
+        top, bottom = i4(base + i4(top * columns)), i4(base + i4(bottom * columns))
+        one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
+        three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
+        share = (weight + slope * get(s, MIX + i)) * f4(1.0 / (255.0 * 65536.0 * 256.0))
+        put(s, RED + i, get(s, RED + i) + share * blend(one, two, three, four, across, down, i4(0)))
+        put(s, GREEN + i, get(s, GREEN + i) + share * blend(one, two, three, four, across, down, i4(8)))
+        put(s, BLUE + i, get(s, BLUE + i) + share * blend(one, two, three, four, across, down, i4(16)))
+
+
+@stage
+def sample_repeating(s, n, texels, width, texture):
+    """S, T, FOOTPRINT in; color of a repeating texture out.
+
+    Args:
+      texels: the table of textures, and the textures; `width` of the table's rows.
+    """
+    at = texture * width
+    last = i4(texels[at + LEVELS] - 1)
+    mixed = choose_levels(s, n, last)
+    add_repeating(s, n, texels, at + FIRST, last, i4(0), f4(256), f4(-1))
+    if mixed:
+        add_repeating(s, n, texels, at + FIRST, last, i4(1), f4(0), f4(1))
 
 
 @leaf
-def cube_face(x, y, z):
-    """Face of a cube map, its two coordinates' numerators and the length that divides them (OpenGL's table)."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if az >= ax and az >= ay:
-        return (4, x, -y, az) if z >= 0.0 else (5, -x, -y, az)
-    if ax > ay:
-        return (0, -z, -y, ax) if x >= 0.0 else (1, z, -y, ax)
-    return (2, x, z, ay) if y >= 0.0 else (3, x, -z, ay)
+def turn_to_face(along_z, along_x, sign, x, y, z):
+    """Two coordinates and the length towards a face of a cube map (OpenGL's table) of a direction, or a change of it.
 
-
-@leaf
-def face_change(face, dx, dy, dz):
-    """How the numerators and the length of a face change with the direction."""
-    if face == 0:
-        return -dz, -dy, dx
-    if face == 1:
-        return dz, -dy, -dx
-    if face == 2:
-        return dx, dz, dy
-    if face == 3:
-        return dx, -dz, -dy
-    if face == 4:
-        return dx, -dy, dz
-    return -dx, -dy, -dz
-
-
-@leaf
-def cube_level(texels, table, texture, level, face, s, t):
-    """`blend_of_four` at (s, t) in [0, 1] of a face of a level of a cube map."""
-    entry = FIRST + 3 * level
-    side = table[texture, entry + 1]
-    left, right, across = clamped(s, side)
-    top, bottom, down = clamped(t, side)
-    base = table[texture, entry]
-    if table[texture, FACES] > 1:
-        base += face * side * side
-    return blend_of_four(texels, base + top * side, base + bottom * side, left, right, across, down)
+    Args:
+      along_z, along_x: the pair of faces, neither for y; `sign`: 1 or -1, which of the two.
+    """
+    across = x if not along_x else -sign * z
+    across = sign * x if along_z else across
+    upwards = -y if along_z or along_x else sign * z
+    length = z if along_z else (x if along_x else y)
+    return across, upwards, sign * length
 
 
 @part
-def sample_cube(texels, table, texture, x, y, z, ux, uy, uz, vx, vy, vz):
-    """Color of a cube map in direction (x, y, z), changing by u from pixel to pixel in a row, by v upwards."""
-    face, s, t, major = cube_face(x, y, z)
-    over = 1.0 / major
-    s, t = s * over, t * over
-    us, ut, um = face_change(face, ux, uy, uz)
-    vs, vt, vm = face_change(face, vx, vy, vz)
-    most = max(max(abs(us - s * um), abs(ut - t * um)), max(abs(vs - s * vm), abs(vt - t * vm)))
-    rho = 0.5 * table[texture, FIRST + 1] * most * over
-    level, share = level_of_detail(rho * rho)
-    last = table[texture, LEVELS] - 1
-    if level >= last:
-        level, share = last, 0
-    s, t = 0.5 * s + 0.5, 0.5 * t + 0.5
-    red_blue, green = cube_level(texels, table, texture, level, face, s, t)
-    more, more_green = np.uint64(0), np.uint64(0)
-    if share > 0:
-        more, more_green = cube_level(texels, table, texture, level + 1, face, s, t)
-    return unpacked(red_blue, green, more, more_green, share)
+def face_cube(s, n, half):
+    """Direction and its changes in; FACE, coordinates S, T in [0, 1] and FOOTPRINT out.
+
+    Args:
+      half: half the texels a side of the finest level.
+    """
+    distinct()
+    for i in range(n):
+        x, y, z = get(s, DX + i), get(s, DY + i), get(s, DZ + i)
+        ax, ay, az = abs(x), abs(y), abs(z)
+        along_z = (az >= ax) & (az >= ay)
+        along_x = (not along_z) & (ax > ay)
+        chosen = z if along_z else (x if along_x else y)
+        sign = f4(1) if chosen >= f4(0) else f4(-1)
+        across, upwards, length = turn_to_face(along_z, along_x, sign, x, y, z)
+        over = f4(1) / length
+        across, upwards = across * over, upwards * over
+        a, b, c = turn_to_face(along_z, along_x, sign, get(s, RIGHT_X + i), get(s, RIGHT_Y + i), get(s, RIGHT_Z + i))
+        d, e, f = turn_to_face(along_z, along_x, sign, get(s, UP_X + i), get(s, UP_Y + i), get(s, UP_Z + i))
+        most = max(max(abs(a - across * c), abs(b - upwards * c)), max(abs(d - across * f), abs(e - upwards * f)))
+        rho = half * most * over
+        first = f4(4) if along_z else (f4(0) if along_x else f4(2))
+        put(s, FACE + i, first if sign > f4(0) else first + f4(1))
+        put(s, S + i, min(max(f4(0.5) * across + f4(0.5), f4(0)), f4(1)))
+        put(s, T + i, min(max(f4(0.5) * upwards + f4(0.5), f4(0)), f4(1)))
+        put(s, FOOTPRINT + i, rho * rho)
+
+
+@part
+def add_clamped(s, n, texels, at, many, last, further, weight, slope):
+    """As `add_repeating`, of a cube map: coordinates end at a face's edge.
+
+    Args:
+      many: 1 if the faces differ, else 0.
+    """
+    distinct()
+    for i in range(n):
+        entry = at + 3 * min(i4(get(s, LEVEL + i)) + further, last)
+        base, side = get(texels, entry), get(texels, entry + 1)
+        x, y = get(s, S + i) * f4(side) + f4(0.5), get(s, T + i) * f4(side) + f4(0.5)
+        right, bottom = i4(x), i4(y)
+        across, down = np.floor(f4(256) * (x - f4(right))), np.floor(f4(256) * (y - f4(bottom)))
+        left, top = max(i4(right - i4(1)), i4(0)), max(i4(bottom - i4(1)), i4(0))
+        right, bottom = min(right, i4(side - i4(1))), min(bottom, i4(side - i4(1)))
+        base = i4(base + i4(many * i4(get(s, FACE + i))) * i4(side * side))
+        top, bottom = i4(base + i4(top * side)), i4(base + i4(bottom * side))
+        one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
+        three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
+        share = (weight + slope * get(s, MIX + i)) * f4(1.0 / (255.0 * 65536.0 * 256.0))
+        put(s, RED + i, get(s, RED + i) + share * blend(one, two, three, four, across, down, i4(0)))
+        put(s, GREEN + i, get(s, GREEN + i) + share * blend(one, two, three, four, across, down, i4(8)))
+        put(s, BLUE + i, get(s, BLUE + i) + share * blend(one, two, three, four, across, down, i4(16)))
+
+
+@part
+def sample_cube(s, n, texels, width, texture):
+    """Direction and its changes to the right and upwards in; color of a cube map out. See `sample_repeating`."""
+    at = texture * width
+    last, many = i4(texels[at + LEVELS] - 1), i4(1 if texels[at + FACES] > 1 else 0)
+    face_cube(s, n, f4(0.5) * f4(texels[at + FIRST + 1]))
+    mixed = choose_levels(s, n, last)
+    add_clamped(s, n, texels, at + FIRST, many, last, i4(0), f4(256), f4(-1))
+    if mixed:
+        add_clamped(s, n, texels, at + FIRST, many, last, i4(1), f4(0), f4(1))

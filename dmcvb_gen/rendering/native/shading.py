@@ -1,15 +1,65 @@
-"""A surface and a pixel in, colors out: of the headlight's pass and of the lamp's, which OpenGL draws after it."""
+"""A surface and some pixels in, its colors there out: the headlight's pass and the lamp's, drawn after it in OpenGL.
+
+Works on rows of `lanes`: `aim` fills the rays, `shade_body` or `shade_plane` everything else, and `cover_*` lays the
+color over what BASE_RED and the others hold.
+"""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from dmcvb_gen.rendering.native.lanes import (
+    BASE_BLUE,
+    BASE_GREEN,
+    BASE_RED,
+    BLUE,
+    CHUNK,
+    CONE_FACTOR,
+    DX,
+    FOOTPRINT,
+    GREEN,
+    HEAD,
+    HEAD_SHINE,
+    LAMP_BLUE,
+    LAMP_DIFFUSE,
+    LAMP_GREEN,
+    LAMP_RED,
+    LAMP_SHINE,
+    LIGHT,
+    NX,
+    NY,
+    NZ,
+    PX,
+    PY,
+    PZ,
+    QUAD_X,
+    QUAD_Y,
+    RAY_X,
+    RAY_Y,
+    RED,
+    RIGHT_X,
+    UP_X,
+    S,
+    T,
+    U,
+    V,
+    X,
+    Y,
+    distinct,
+    get,
+    part,
+    put,
+    stage,
+)
 from dmcvb_gen.rendering.native.lighting import (
-    headlight_terms,
-    in_shadow,
+    cast_shadows,
+    head_light,
+    lamp_light,
     lamp_on_plane,
-    lamp_terms,
-    lit,
+    raise_lights,
+    raise_row,
 )
 from dmcvb_gen.rendering.native.records import (
     AXIS,
@@ -26,8 +76,6 @@ from dmcvb_gen.rendering.native.records import (
     MIRRORED_PLACE,
     OPACITY,
     PLACE,
-    QUAD,
-    REFLECTANCE,
     REPEAT,
     RGB,
     SHARE,
@@ -39,207 +87,298 @@ from dmcvb_gen.rendering.native.records import (
     TURN,
     VIEW,
 )
-from dmcvb_gen.rendering.native.sampling import leaf, part, sample_cube, sample_repeating
+from dmcvb_gen.rendering.native.sampling import fill, sample_cube, sample_repeating
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE
 
-
-@leaf
-def ray_of(step, pixels, row, column):
-    """x and y of the ray through a pixel's center."""
-    half = 0.5 * pixels
-    return (column + 0.5 - half) * step, (half - row - 0.5) * step
+f4, i4, i8 = np.float32, np.int32, np.int64
 
 
-@leaf
-def quad_ray(step, pixels, row, column):
-    """The ray of the first pixel of the two by two in which OpenGL takes differences (to the right, and up)."""
-    last = pixels - 1
-    return ray_of(step, pixels, last - ((last - row) & ~1), column & ~1)
+@part
+def aim(s, n, jobs, room, first, pixels, step):
+    """Rays through the pixels of n jobs, and through the first pixels of the two by two where footprints are taken.
+
+    Args:
+      jobs: int32, rows, from `room` on columns of all jobs, and from `first` on the numbers of these.
+    """
+    distinct()
+    half, last, step = f4(0.5 * pixels), i4(pixels - 1), f4(step)
+    for i in range(n):
+        job = get(jobs, first + i)
+        row, column = get(jobs, job), get(jobs, job + room)
+        quad_row, quad_column = i4(last - i4(i4(last - row) & i4(-2))), i4(column & i4(-2))
+        put(s, X + i, (f4(column) + f4(0.5) - half) * step)
+        put(s, Y + i, (half - f4(row) - f4(0.5)) * step)
+        put(s, QUAD_X + i, (f4(quad_column) + f4(0.5) - half) * step)
+        put(s, QUAD_Y + i, (half - f4(quad_row) - f4(0.5)) * step)
 
 
-@leaf
-def place_on_plane(rec, g, x, y):
-    """A plane's coordinates, over its half lengths, where the ray (x, y) meets it."""
-    at = FUNCTIONS
-    over = 1.0 / max(rec[g, at] * x + rec[g, at + 1] * y + rec[g, at + 2], 1e-9)
-    return (
-        (rec[g, at + 3] * x + rec[g, at + 4] * y + rec[g, at + 5]) * over,
-        (rec[g, at + 6] * x + rec[g, at + 7] * y + rec[g, at + 8]) * over,
-    )
+# -- planes ----------------------------------------------------------------------------------------
 
 
-@leaf
-def texel_on_plane(k, rec, texels, table, g, pixels, row, column, a, b):
-    """Color of a plane's texture at a pixel, (a, b) being the place on it over its half lengths."""
+@part
+def meet_plane(s, n, rec, g, step, wide, high):
+    """Rays in; points, places U and V, texture coordinates S and T, and FOOTPRINT on plane g out.
+
+    Args:
+      wide, high: texels of its texture.
+    """
+    distinct()
+    at, one, least = FUNCTIONS, f4(1), f4(1e-9)
+    a, b, c = f4(rec[g, at]), f4(rec[g, at + 1]), f4(rec[g, at + 2])
+    ua, ub, uc = f4(rec[g, at + 3]), f4(rec[g, at + 4]), f4(rec[g, at + 5])
+    va, vb, vc = f4(rec[g, at + 6]), f4(rec[g, at + 7]), f4(rec[g, at + 8])
+    scale_u, scale_v = f4(rec[g, REPEAT] * rec[g, SIZE]), f4(rec[g, REPEAT + 1] * rec[g, SIZE + 1])
+    texels_u, texels_v, step = scale_u * f4(wide), scale_v * f4(high), f4(step)
+    for i in range(n):
+        x, y = get(s, X + i), get(s, Y + i)
+        depth = one / max(a * x + b * y + c, least)
+        u, v = (ua * x + ub * y + uc) * depth, (va * x + vb * y + vc) * depth
+        put(s, PX + i, x * depth)
+        put(s, PY + i, y * depth)
+        put(s, PZ + i, -depth)
+        put(s, U + i, u)
+        put(s, V + i, v)
+        put(s, S + i, scale_u * (one + u))
+        put(s, T + i, scale_v * (one - v))
+        x, y = get(s, QUAD_X + i), get(s, QUAD_Y + i)
+        w, u, v = a * x + b * y + c, ua * x + ub * y + uc, va * x + vb * y + vc
+        over = one / max(w, least)
+        right, up = one / max(w + a * step, least), one / max(w + b * step, least)
+        u0, v0 = u * over, v * over
+        across = max(abs((u + ua * step) * right - u0), abs((u + ub * step) * up - u0)) * texels_u
+        down = max(abs((v + va * step) * right - v0), abs((v + vb * step) * up - v0)) * texels_v
+        rho = max(across, down)
+        put(s, FOOTPRINT + i, rho * rho)
+
+
+@stage
+def shade_plane(s, n, k, rec, texels, width, plane, g):
+    """Rays in; texture, headlight and lamp (LAMP_RED and the others, LIGHT) on plane g out."""
     texture = int(rec[g, TEXTURE])
-    if texture < 0:
-        return 1.0, 1.0, 1.0
-    scale_a, scale_b = rec[g, REPEAT] * rec[g, SIZE], rec[g, REPEAT + 1] * rec[g, SIZE + 1]
-    quad = ((row + (pixels & 1)) >> 1) * pixels + (column >> 1)
-    if k[QUAD] != quad or k[QUAD + 1] != g:  # else as for the pixel before
-        step = k[STEP]
-        x, y = quad_ray(step, pixels, row, column)
-        a0, b0 = place_on_plane(rec, g, x, y)
-        a1, b1 = place_on_plane(rec, g, x + step, y)
-        a2, b2 = place_on_plane(rec, g, x, y + step)
-        rho = max(
-            max(abs(a1 - a0), abs(a2 - a0)) * scale_a * table[texture, FIRST + 1],
-            max(abs(b1 - b0), abs(b2 - b0)) * scale_b * table[texture, FIRST + 2],
-        )
-        k[QUAD], k[QUAD + 1], k[QUAD + 2] = quad, g, rho * rho
-    return sample_repeating(texels, table, texture, scale_a * (1.0 + a), scale_b * (1.0 - b), k[QUAD + 2])
-
-
-@part
-def shade_plane(k, rec, texels, table, grid, vertices, g, pixels, row, column):
-    """(red, green, blue) of plane g in the headlight's pass, then in the lamp's."""
-    x, y = ray_of(k[STEP], pixels, row, column)
-    a, b = place_on_plane(rec, g, x, y)
-    red, green, blue = texel_on_plane(k, rec, texels, table, g, pixels, row, column, a, b)
-    along, across = a * rec[g, SIZE], b * rec[g, SIZE + 1]
-    px = rec[g, PLACE] + along * rec[g, TURN] + across * rec[g, TURN + 1]
-    py = rec[g, PLACE + 1] + along * rec[g, TURN + 3] + across * rec[g, TURN + 4]
-    pz = rec[g, PLACE + 2] + along * rec[g, TURN + 6] + across * rec[g, TURN + 7]
+    at = max(texture, 0) * width + FIRST
+    meet_plane(s, n, rec, g, k[STEP], texels[at + 1], texels[at + 2])
+    if texture >= 0:
+        sample_repeating(s, n, texels, width, texture)
+    else:
+        for c in range(3):
+            fill(s, n, RED + c * CHUNK, f4(1))
+    for axis in range(3):
+        fill(s, n, NX + axis * CHUNK, f4(rec[g, AXIS + axis]))
     exponent = int(rec[g, EXPONENT])
-    diffuse, specular = headlight_terms(k, EYE, px, py, pz, rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2], exponent)
-    specular *= rec[g, SHARE]
-    lamp_red, lamp_green, lamp_blue = 0.0, 0.0, 0.0
-    if k[CONE] > 0.0:
-        lamp_red, lamp_green, lamp_blue = lamp_on_plane(k, grid, vertices, along, across)
-        # Only opaque surfaces show shadows.
-        if lamp_red + lamp_green + lamp_blue > 0.0 and rec[g, OPACITY] >= OPAQUE and in_shadow(k, rec, px, py, pz, g):
-            lamp_red, lamp_green, lamp_blue = 0.0, 0.0, 0.0
-    return (
-        red * min(lit(k, HEADLIGHT, 0, rec[g, RGB], 1.0, diffuse, specular), 1.0),
-        green * min(lit(k, HEADLIGHT, 1, rec[g, RGB + 1], 1.0, diffuse, specular), 1.0),
-        blue * min(lit(k, HEADLIGHT, 2, rec[g, RGB + 2], 1.0, diffuse, specular), 1.0),
-        red * lamp_red,
-        green * lamp_green,
-        blue * lamp_blue,
-    )
+    head_light(s, n, k, i8(EYE), exponent)
+    fill(s, n, i8(LIGHT), f4(0))
+    if k[CONE] > 0.0 and lamp_on_plane(s, n, k, rec, plane, g) and rec[g, OPACITY] >= OPAQUE:
+        cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
+    raise_row(s, n, i8(HEAD_SHINE), exponent)
 
 
 @part
-def meet_body(rec, g, place, axis, x, y):
-    """Depth and outward unit normal where the ray (x, y, -1) meets a body, or at its outline if it passes by.
+def cover_plane(s, n, k, rec, g, veil):
+    """Lay plane g over the base colors; with `veil` below 1 blended with them.
+
+    Args:
+      veil: how much of the base colors is hidden.
+    """
+    distinct()
+    share, hidden, one = f4(rec[g, SHARE]), f4(veil), f4(1)
+    own_r, own_g, own_b = f4(rec[g, RGB]), f4(rec[g, RGB + 1]), f4(rec[g, RGB + 2])
+    at = HEADLIGHT
+    flat_r, flat_g, flat_b = own_r * f4(k[at]), own_g * f4(k[at + 1]), own_b * f4(k[at + 2])
+    matt_r, matt_g, matt_b = own_r * f4(k[at + 3]), own_g * f4(k[at + 4]), own_b * f4(k[at + 5])
+    spec_r, spec_g, spec_b = share * f4(k[at + 6]), share * f4(k[at + 7]), share * f4(k[at + 8])
+    veiled = hidden < one
+    for i in range(n):
+        diffuse, shine, light = get(s, HEAD + i), get(s, HEAD_SHINE + i), get(s, LIGHT + i)
+        red, green, blue = get(s, RED + i), get(s, GREEN + i), get(s, BLUE + i)
+        lit_r = red * get(s, LAMP_RED + i) if light > f4(0) else f4(0)
+        lit_g = green * get(s, LAMP_GREEN + i) if light > f4(0) else f4(0)
+        lit_b = blue * get(s, LAMP_BLUE + i) if light > f4(0) else f4(0)
+        red = red * min(flat_r + matt_r * diffuse + spec_r * shine, one)
+        green = green * min(flat_g + matt_g * diffuse + spec_g * shine, one)
+        blue = blue * min(flat_b + matt_b * diffuse + spec_b * shine, one)
+        base_r, base_g, base_b = get(s, BASE_RED + i), get(s, BASE_GREEN + i), get(s, BASE_BLUE + i)
+        if veiled:
+            red = base_r * (one - hidden) + min(red + lit_r, one) * hidden
+            green = base_g * (one - hidden) + min(green + lit_g, one) * hidden
+            blue = base_b * (one - hidden) + min(blue + lit_b, one) * hidden
+        else:
+            red = min(min(base_r + red, one) + lit_r, one)
+            green = min(min(base_g + green, one) + lit_g, one)
+            blue = min(min(base_b + blue, one) + lit_b, one)
+        put(s, BASE_RED + i, red)
+        put(s, BASE_GREEN + i, green)
+        put(s, BASE_BLUE + i, blue)
+
+
+# -- bodies ----------------------------------------------------------------------------------------
+
+
+@part
+def meet_body(s, n, rec, g, place, axis):
+    """RAY_X and RAY_Y in; points and unit normals where these rays meet ball or capsule g out, or at its outline
+    where they pass by.
 
     Args:
       place, axis: the columns of `rec` where its center and axis are.
     """
+    distinct()
     ox, oy, oz = rec[g, place], rec[g, place + 1], rec[g, place + 2]
-    radius = rec[g, SIZE]
-    if rec[g, KIND] == CAPSULE:
-        ax, ay, az, half = rec[g, axis], rec[g, axis + 1], rec[g, axis + 2], rec[g, SIZE + 1]
-        mx, my, mz = oy * az - oz * ay, oz * ax - ox * az, ox * ay - oy * ax
-        moment = mx * mx + my * my + mz * mz - radius * radius
-        along_axis = ox * ax + oy * ay + oz * az
-        reach = half if along_axis < 0.0 else -half
-        if moment > 0.0:
-            nx, ny, nz = y * az + ay, -ax - x * az, x * ay - y * ax
-            turned = mx * x + my * y - mz
-            square = max(radius * radius * (nx * nx + ny * ny + nz * nz) - turned * turned, 0.0)
-            depth = moment / (mx * nx + my * ny + mz * nz + math.sqrt(square))
-            along = (ax * x + ay * y - az) * depth - along_axis
-            if abs(along) <= half:
-                return unit_normal(depth, x, y, ox + along * ax, oy + along * ay, oz + along * az)
-            reach = half if along > 0.0 else -half
-        ox, oy, oz = ox + reach * ax, oy + reach * ay, oz + reach * az
-    ux, uy, uz = -oy - oz * y, oz * x + ox, ox * y - oy * x
-    square = max(radius * radius * (1.0 + x * x + y * y) - (ux * ux + uy * uy + uz * uz), 0.0)
-    depth = (ox * ox + oy * oy + oz * oz - radius * radius) / (ox * x + oy * y - oz + math.sqrt(square))
-    return unit_normal(depth, x, y, ox, oy, oz)
-
-
-@leaf
-def unit_normal(depth, x, y, ox, oy, oz):
-    """The depth, and the direction from o to the point at that depth of the ray (x, y)."""
-    nx, ny, nz = depth * x - ox, depth * y - oy, -depth - oz
-    over = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
-    return depth, nx * over, ny * over, nz * over
-
-
-@leaf
-def own_direction(rec, g, nx, ny, nz):
-    """A direction in geom g's own frame."""
-    return (
-        rec[g, TURN] * nx + rec[g, TURN + 3] * ny + rec[g, TURN + 6] * nz,
-        rec[g, TURN + 1] * nx + rec[g, TURN + 4] * ny + rec[g, TURN + 7] * nz,
-        rec[g, TURN + 2] * nx + rec[g, TURN + 5] * ny + rec[g, TURN + 8] * nz,
-    )
+    ax, ay, az = rec[g, axis], rec[g, axis + 1], rec[g, axis + 2]
+    half, radius = rec[g, SIZE + 1] if rec[g, KIND] == CAPSULE else 0.0, rec[g, SIZE]
+    mx, my, mz = oy * az - oz * ay, oz * ax - ox * az, ox * ay - oy * ax
+    moment, center = mx * mx + my * my + mz * mz - radius * radius, ox * ax + oy * ay + oz * az
+    inside = ox * ox + oy * oy + oz * oz - radius * radius + half * half  # of the balls, less 2 * reach * center
+    outside, nearer, rr = moment > 0.0, center < 0.0, f4(radius * radius)
+    upper, lower = f4(inside + 2.0 * half * center), f4(inside - 2.0 * half * center)
+    mx, my, mz, moment, center = f4(mx), f4(my), f4(mz), f4(moment), f4(center)
+    ox, oy, oz, ax, ay, az, half, zero = f4(ox), f4(oy), f4(oz), f4(ax), f4(ay), f4(az), f4(half), f4(0)
+    for i in range(n):
+        x, y = get(s, RAY_X + i), get(s, RAY_Y + i)
+        nx, ny, nz = y * az + ay, -ax - x * az, x * ay - y * ax
+        turned = mx * x + my * y - mz
+        square = max(rr * (nx * nx + ny * ny + nz * nz) - turned * turned, zero)
+        depth = moment / (mx * nx + my * ny + mz * nz + math.sqrt(square))
+        along = (ax * x + ay * y - az) * depth - center
+        side = outside & (abs(along) <= half)
+        end = (along > zero) if outside else nearer
+        reach = half if end else -half
+        ex, ey, ez = ox + reach * ax, oy + reach * ay, oz + reach * az
+        ux, uy, uz = -ey - ez * y, ez * x + ex, ex * y - ey * x
+        square = max(rr * (f4(1) + x * x + y * y) - (ux * ux + uy * uy + uz * uz), zero)
+        ball = (upper if end else lower) / (ex * x + ey * y - ez + math.sqrt(square))
+        depth = depth if side else ball
+        cx, cy, cz = ox + along * ax if side else ex, oy + along * ay if side else ey, oz + along * az if side else ez
+        px, py, pz = depth * x, depth * y, -depth
+        nx, ny, nz = px - cx, py - cy, pz - cz
+        over = f4(1) / math.sqrt(nx * nx + ny * ny + nz * nz)
+        put(s, PX + i, px)
+        put(s, PY + i, py)
+        put(s, PZ + i, pz)
+        put(s, NX + i, nx * over)
+        put(s, NY + i, ny * over)
+        put(s, NZ + i, nz * over)
 
 
 @part
-def ball_direction(rec, g, x, y):
-    """Where the ray (x, y) meets ball g, as a direction in the ball's own frame."""
-    _, nx, ny, nz = meet_body(rec, g, PLACE, AXIS, x, y)
-    return own_direction(rec, g, nx, ny, nz)
+def turn_rays(s, n, source_x, source_y, dx, dy):
+    """RAY_X and RAY_Y from two other rows, moved."""
+    for i in range(n):
+        put(s, RAY_X + i, get(s, source_x + i) + dx)
+    for i in range(n):
+        put(s, RAY_Y + i, get(s, source_y + i) + dy)
 
 
 @part
-def texel_on_ball(k, rec, texels, table, g, pixels, row, column, nx, ny, nz):
-    """Color of the cube map around ball g at a pixel with a normal."""
-    texture = int(rec[g, TEXTURE])
-    if texture < 0:
-        return 1.0, 1.0, 1.0
-    step = k[STEP]
-    x, y, z = own_direction(rec, g, nx, ny, nz)
-    qx, qy = quad_ray(step, pixels, row, column)
-    ax, ay, az = ball_direction(rec, g, qx, qy)
-    bx, by, bz = ball_direction(rec, g, qx + step, qy)
-    cx, cy, cz = ball_direction(rec, g, qx, qy + step)
-    return sample_cube(texels, table, texture, x, y, z, bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az)
+def own_directions(s, n, rec, g, first, less):
+    """Normals in; they in geom g's own frame out, in the three rows from `first` on, less those from `less` on."""
+    for axis in range(3):
+        a, b, c = f4(rec[g, TURN + axis]), f4(rec[g, TURN + 3 + axis]), f4(rec[g, TURN + 6 + axis])
+        to, off = first + axis * CHUNK, less + axis * CHUNK
+        for i in range(n):
+            put(s, to + i, a * get(s, NX + i) + b * get(s, NY + i) + c * get(s, NZ + i))
+        if less >= 0:
+            for i in range(n):
+                put(s, to + i, get(s, to + i) - get(s, off + i))
 
 
-@part
-def shade_body(k, rec, texels, table, g, pixels, row, column, mirrored):
-    """(red, green, blue) of body g in the headlight's pass, then in the lamp's; of its mirror image if asked for."""
-    place, axis = (MIRRORED_PLACE, MIRRORED_AXIS) if mirrored else (PLACE, AXIS)
-    eye, lamp = (MIRRORED, MIRRORED + 3) if mirrored else (EYE, LAMP)
-    tint = k[REFLECTANCE] if mirrored else 1.0  # dims color, but no highlight
-    x, y = ray_of(k[STEP], pixels, row, column)
-    depth, nx, ny, nz = meet_body(rec, g, place, axis, x, y)
-    px, py, pz = depth * x, depth * y, -depth
-    share, exponent = rec[g, SHARE], int(rec[g, EXPONENT])
-    diffuse, specular = headlight_terms(k, eye, px, py, pz, nx, ny, nz, exponent)
-    specular *= share
-    factor, lamp_diffuse, lamp_specular = 0.0, 0.0, 0.0
+@stage
+def cover_ball(s, n, k, rec, texels, width, g):
+    """Rays in; color of the cube map around ball g out."""
+    step = f4(k[STEP])
+    turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), f4(0), f4(0))
+    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    own_directions(s, n, rec, g, i8(DX), i8(-1))
+    turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), step, f4(0))
+    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    own_directions(s, n, rec, g, i8(RIGHT_X), i8(DX))
+    turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), f4(0), step)
+    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    own_directions(s, n, rec, g, i8(UP_X), i8(DX))
+    turn_rays(s, n, i8(X), i8(Y), f4(0), f4(0))
+    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    own_directions(s, n, rec, g, i8(DX), i8(-1))
+    sample_cube(s, n, texels, width, int(rec[g, TEXTURE]))
+
+
+@stage
+def shade_body(s, n, k, rec, texels, width, g, mirrored):
+    """Rays in; texture, headlight and lamp on body g, or on its mirror image, out."""
+    exponent = int(rec[g, EXPONENT])
+    turn_rays(s, n, i8(X), i8(Y), f4(0), f4(0))
+    if rec[g, TEXTURE] >= 0.0:
+        cover_ball(s, n, k, rec, texels, width, g)
+    else:
+        for c in range(3):
+            fill(s, n, RED + c * CHUNK, f4(1))
+    if mirrored:
+        meet_body(s, n, rec, g, i8(MIRRORED_PLACE), i8(MIRRORED_AXIS))
+    elif rec[g, TEXTURE] < 0.0:
+        meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    head_light(s, n, k, MIRRORED if mirrored else EYE, exponent)
     if k[CONE] > 0.0:
-        factor, lamp_diffuse, lamp_specular = lamp_terms(k, lamp, px, py, pz, nx, ny, nz, exponent)
-        lamp_specular *= share
-        if factor * lamp_diffuse > 0.0 and not mirrored and in_shadow(k, rec, px, py, pz, g):
-            factor = 0.0
-    red, green, blue = texel_on_ball(k, rec, texels, table, g, pixels, row, column, nx, ny, nz)
-    own_red, own_green, own_blue = tint * rec[g, RGB], tint * rec[g, RGB + 1], tint * rec[g, RGB + 2]
-    return (
-        red * min(lit(k, HEADLIGHT, 0, own_red, 1.0, diffuse, specular), 1.0),
-        green * min(lit(k, HEADLIGHT, 1, own_green, 1.0, diffuse, specular), 1.0),
-        blue * min(lit(k, HEADLIGHT, 2, own_blue, 1.0, diffuse, specular), 1.0),
-        red * min(lit(k, SPOT, 0, own_red, factor, lamp_diffuse, lamp_specular), 1.0),
-        green * min(lit(k, SPOT, 1, own_green, factor, lamp_diffuse, lamp_specular), 1.0),
-        blue * min(lit(k, SPOT, 2, own_blue, factor, lamp_diffuse, lamp_specular), 1.0),
-    )
+        lamp_light(s, n, k, MIRRORED + 3 if mirrored else LAMP, exponent)
+        if not mirrored:
+            cast_shadows(s, n, k, rec, g)
+    else:
+        fill(s, n, i8(LIGHT), f4(0))
+    raise_lights(s, n, k, exponent)
 
 
 @part
-def shade_sky(k, texels, table, pixels, row, column):
-    """(red, green, blue) of the sky: a cube of pictures around the eye, turned by 90 degrees around x."""
-    texture = int(k[SKY])
+def cover_body(s, n, k, rec, g, tint):
+    """Lay body g over the base colors.
+
+    Args:
+      tint: dims its color, but no highlight.
+    """
+    distinct()
+    share, one, dim = f4(rec[g, SHARE]), f4(1), f4(tint)
+    own_r, own_g, own_b = dim * f4(rec[g, RGB]), dim * f4(rec[g, RGB + 1]), dim * f4(rec[g, RGB + 2])
+    at = HEADLIGHT
+    flat_r, flat_g, flat_b = own_r * f4(k[at]), own_g * f4(k[at + 1]), own_b * f4(k[at + 2])
+    matt_r, matt_g, matt_b = own_r * f4(k[at + 3]), own_g * f4(k[at + 4]), own_b * f4(k[at + 5])
+    spec_r, spec_g, spec_b = share * f4(k[at + 6]), share * f4(k[at + 7]), share * f4(k[at + 8])
+    at = SPOT
+    lamp_r, lamp_g, lamp_b = own_r * f4(k[at]), own_g * f4(k[at + 1]), own_b * f4(k[at + 2])
+    beam_r, beam_g, beam_b = own_r * f4(k[at + 3]), own_g * f4(k[at + 4]), own_b * f4(k[at + 5])
+    glow_r, glow_g, glow_b = share * f4(k[at + 6]), share * f4(k[at + 7]), share * f4(k[at + 8])
+    for i in range(n):
+        diffuse, shine, light = get(s, HEAD + i), get(s, HEAD_SHINE + i), get(s, LIGHT + i)
+        factor = get(s, CONE_FACTOR + i) if light > f4(0) else f4(0)
+        lamp, glow = get(s, LAMP_DIFFUSE + i), get(s, LAMP_SHINE + i)
+        red, green, blue = get(s, RED + i), get(s, GREEN + i), get(s, BLUE + i)
+        lit_r = red * min(factor * (lamp_r + beam_r * lamp + glow_r * glow), one)
+        lit_g = green * min(factor * (lamp_g + beam_g * lamp + glow_g * glow), one)
+        lit_b = blue * min(factor * (lamp_b + beam_b * lamp + glow_b * glow), one)
+        red = red * min(flat_r + matt_r * diffuse + spec_r * shine, one)
+        green = green * min(flat_g + matt_g * diffuse + spec_g * shine, one)
+        blue = blue * min(flat_b + matt_b * diffuse + spec_b * shine, one)
+        put(s, BASE_RED + i, min(min(get(s, BASE_RED + i) + red, one) + lit_r, one))
+        put(s, BASE_GREEN + i, min(min(get(s, BASE_GREEN + i) + green, one) + lit_g, one))
+        put(s, BASE_BLUE + i, min(min(get(s, BASE_BLUE + i) + blue, one) + lit_b, one))
+
+
+# -- sky -------------------------------------------------------------------------------------------
+
+
+@part
+def shade_sky(s, n, k, texels, width):
+    """Rays in; base colors of the sky out: a cube of pictures around the eye, turned by 90 degrees around x."""
+    texture, step = int(k[SKY]), k[STEP]
     if texture < 0:
-        return 0.0, 0.0, 0.0
-    step = k[STEP]
-    x, y = ray_of(step, pixels, row, column)
-    v = VIEW
-    return sample_cube(
-        texels,
-        table,
-        texture,
-        k[v] * x + k[v + 1] * y - k[v + 2],
-        k[v + 6] * x + k[v + 7] * y - k[v + 8],
-        -(k[v + 3] * x + k[v + 4] * y - k[v + 5]),
-        k[v] * step,
-        k[v + 6] * step,
-        -k[v + 3] * step,
-        k[v + 1] * step,
-        k[v + 7] * step,
-        -k[v + 4] * step,
-    )
+        for c in range(3):
+            fill(s, n, BASE_RED + c * CHUNK, f4(0))
+        return
+    for axis in range(3):
+        view = VIEW + (0 if axis == 0 else 6 if axis == 1 else 3)
+        sign = -1.0 if axis == 2 else 1.0
+        a, b, c = f4(sign * k[view]), f4(sign * k[view + 1]), f4(sign * k[view + 2])
+        to = DX + axis * CHUNK
+        for i in range(n):
+            put(s, to + i, a * get(s, X + i) + b * get(s, Y + i) - c)
+        fill(s, n, RIGHT_X + axis * CHUNK, f4(sign * k[view] * step))
+        fill(s, n, UP_X + axis * CHUNK, f4(sign * k[view + 1] * step))
+    sample_cube(s, n, texels, width, texture)
+    for c in range(3):
+        for i in range(n):
+            put(s, BASE_RED + c * CHUNK + i, get(s, RED + c * CHUNK + i))

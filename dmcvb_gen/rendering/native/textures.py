@@ -1,4 +1,4 @@
-"""Pictures in, mip levels as one flat buffer of texels out; a texel is a uint32, red in its lowest byte.
+"""Pictures in, mip levels as one flat buffer of texels out; a texel is an int32, red in its lowest byte.
 
 The levels are those that Mesa's `glGenerateMipmap` makes: each side halved and rounded down, each texel the
 bilinear sample of the level before. Textures in sRGB are kept in linear light, as OpenGL samples them.
@@ -74,9 +74,9 @@ def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) ->
 
 
 def packed(picture: np.ndarray) -> np.ndarray:
-    """(h, w, 3) uint8 -> (h * w,) uint32 texels."""
-    wide = picture.reshape(-1, 3).astype(np.uint32)
-    return wide[:, 0] | wide[:, 1] << np.uint32(8) | wide[:, 2] << np.uint32(16)
+    """(h, w, 3) uint8 -> (h * w,) int32 texels."""
+    wide = picture.reshape(-1, 3).astype(np.int32)
+    return wide[:, 0] | wide[:, 1] << np.int32(8) | wide[:, 2] << np.int32(16)
 
 
 class Textures:
@@ -88,8 +88,8 @@ class Textures:
       finest: the finest level of a background that pictures can show.
 
     Attributes:
-      texels: (texel,) uint32, all levels of all textures.
-      table: (texture, column) int64, where they are: see `records.FIRST`. Backgrounds come after the model's own.
+      texels: (texel,) int32, the table, then all levels of all textures.
+      table: (texture, column) int32, where they are: see `records.FIRST`. Backgrounds come after the model's own.
       slots: how many backgrounds there is room for.
     """
 
@@ -109,14 +109,15 @@ class Textures:
         self.slots = int(np.clip(SKY_BYTES // each, 8, 256)) if backgrounds is not None else 0
         textures += [sky] * self.slots
         most = max((len(sizes) for sizes, _, _ in textures), default=0)
-        self.table = np.zeros((max(len(textures), 1), FIRST + 3 * most), np.int64)
-        total = 0
+        self.table = np.zeros((max(len(textures), 1), FIRST + 3 * most), np.int32)
+        total = self.table.size
         for row, (sizes, faces, first) in zip(self.table, textures, strict=False):
             row[LEVELS], row[FACES] = len(sizes), faces
             for level, (width, height) in enumerate(sizes):
                 row[FIRST + 3 * level : FIRST + 3 * level + 3] = total, width, height
                 total += faces * width * height if level >= first else 0
-        self.texels = np.empty(max(total, 1), np.uint32)  # memory is taken when a texture is written
+        self.texels = np.empty(total, np.int32)  # memory is taken when a texture is written
+        self.texels[: self.table.size] = self.table.ravel()
 
     def make_ready(self, index: int) -> None:
         """Build the levels of one of the model's textures, once."""

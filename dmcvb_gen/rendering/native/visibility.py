@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from dmcvb_gen.rendering.native.records import AXIS, FAR, FUNCTIONS, HORIZON, NEAR, PLACE, SIZE, TURN, VIEW
-from dmcvb_gen.rendering.native.sampling import part
+from dmcvb_gen.rendering.native.lanes import distinct, get, part, put
+from dmcvb_gen.rendering.native.records import AXIS, CLIP, FAR, FUNCTIONS, HORIZON, NEAR, PLACE, SIZE, STEP, TURN, VIEW
 
 SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
 """Where the four samples lie in a pixel: to the right and down."""
@@ -20,8 +20,10 @@ NOTHING = 255
 """The number in place of a geom where there is none: the sky."""
 
 
-def sample_tables(size: int, step: float, centers: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ray coordinates of all samples: x of (4 * column + sample), y of each row's upper edge, y offset as x.
+def sample_rays(size: int, step: float, centers: bool = False) -> np.ndarray:
+    """(9 * size,) float32: ray coordinates of all samples.
+
+    First x of (4 * column + sample), then, in the same order, y below the upper edge of a row, then y of these edges.
 
     Args:
       step: of x and y from pixel to pixel.
@@ -30,7 +32,7 @@ def sample_tables(size: int, step: float, centers: bool = False) -> tuple[np.nda
     right, down = np.full((2, 4), 0.5) if centers else np.array(SAMPLES).T
     x = ((np.arange(size)[:, None] + right) * step - size * step / 2).ravel()
     y = size * step / 2 - np.arange(size) * step
-    return x.astype(np.float32), y.astype(np.float32), np.tile(-down * step, size).astype(np.float32)
+    return np.concatenate([x, np.tile(-down * step, size), y]).astype(np.float32)
 
 
 @part
@@ -44,18 +46,19 @@ def slopes_of_ball(side, depth, radius):
 
 
 @part
-def screen_box(left, right, low, high, size, step):
-    """Columns and rows (first, past the last) of the pixels that slopes in these ranges touch."""
-    half = 0.5 * size
+def screen_box(left, right, low, high, k, size):
+    """Columns and rows (first, past the last) of the pixels that slopes in these ranges touch, inside CLIP."""
+    half, step = 0.5 * size, k[STEP]
     first_column = int(math.floor(min(max(left / step + half - 0.01, 0.0), size)))
     past_column = int(math.ceil(min(max(right / step + half + 0.01, 0.0), size)))
     first_row = int(math.floor(min(max(half - high / step - 0.01, 0.0), size)))
     past_row = int(math.ceil(min(max(half - low / step + 0.01, 0.0), size)))
-    return first_column, past_column, first_row, past_row
+    first_column, past_column = max(first_column, int(k[CLIP])), min(past_column, int(k[CLIP + 1]))
+    return first_column, past_column, max(first_row, int(k[CLIP + 2])), min(past_row, int(k[CLIP + 3]))
 
 
 @part
-def box_of_body(rec, g, place, axis, half, size, step):
+def box_of_body(k, rec, g, place, axis, half, size):
     """Pixels that a ball (`half` 0) or capsule can touch; none if it is behind the camera.
 
     Args:
@@ -74,43 +77,43 @@ def box_of_body(rec, g, place, axis, half, size, step):
         low, high = min(low, least), max(high, most)
     if behind:
         return 0, 0, 0, 0
-    return screen_box(left, right, low, high, size, step)
+    return screen_box(left, right, low, high, k, size)
 
 
 @part
-def draw_sphere(inverse, number, xs, ys, offsets, c0, c1, r0, r1, px, py, pz, radius, nearest, geom):
+def draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom):
     """Put a ball into the buffers, in columns c0 to c1 and rows r0 to r1.
 
     Args:
-      px, py, pz: its center.
+      place: the column of `rec` where its center is.
       nearest: the largest inverse depth drawn.
     """
+    distinct()
+    px, py, pz, radius = rec[g, place], rec[g, place + 1], rec[g, place + 2], rec[g, SIZE]
     inside = px * px + py * py + pz * pz - radius * radius
     if inside <= 0.0:
         return  # its back faces are not drawn
     ex, ey, ez = np.float32(px), np.float32(py), np.float32(pz)
     rr, unit, zero, one = np.float32(radius * radius), np.float32(1.0 / inside), np.float32(0), np.float32(1)
     limit = np.float32(nearest)
-    first, past, width = 4 * c0, 4 * c1, ys.size
-    xr, dr = xs[first:past], offsets[first:past]
+    size = rays.size // 9
     for row in range(r0, r1):
-        top = ys[row]
-        at = 4 * width * row
-        wr, nr = inverse[at + first : at + past], number[at + first : at + past]
-        for i in range(xr.size):
-            x, y = xr[i], top + dr[i]
+        top, at = rays[8 * size + row], 4 * size * row
+        for i in range(4 * c0, 4 * c1):
+            x, y, before = get(rays, i), top + get(rays, 4 * size + i), get(inverse, at + i)
             ux, uy, uz = -ey - ez * y, ez * x + ex, ex * y - ey * x
             square = rr * (one + x * x + y * y) - (ux * ux + uy * uy + uz * uz)
             along = ex * x + ey * y - ez
             w = (along + math.sqrt(max(square, zero))) * unit
-            seen = (square > zero) & (along > zero) & (w > wr[i]) & (w < limit)
-            wr[i] = w if seen else wr[i]
-            nr[i] = geom if seen else nr[i]
+            seen = (square > zero) & (along > zero) & (w > before) & (w < limit)
+            put(inverse, at + i, w if seen else before)
+            put(number, at + i, geom if seen else get(number, at + i))
 
 
 @part
-def draw_capsule(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, place, axis, nearest, geom):
+def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom):
     """Put a capsule into the buffers; see `draw_sphere` and `box_of_body`."""
+    distinct()
     zero, one = np.float32(0), np.float32(1)
     radius, half = rec[g, SIZE], rec[g, SIZE + 1]
     px, py, pz = rec[g, place], rec[g, place + 1], rec[g, place + 2]
@@ -134,14 +137,11 @@ def draw_capsule(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, place
         return
     upper_unit, lower_unit = np.float32(1.0 / upper), np.float32(1.0 / lower)
     toward = along_axis < 0.0  # seen from inside the endless cylinder, the near end is this one
-    first, past, width = 4 * c0, 4 * c1, ys.size
-    xr, dr = xs[first:past], offsets[first:past]
+    size = rays.size // 9
     for row in range(r0, r1):
-        top = ys[row]
-        at = 4 * width * row
-        wr, nr = inverse[at + first : at + past], number[at + first : at + past]
-        for i in range(xr.size):
-            x, y = xr[i], top + dr[i]
+        top, at = rays[8 * size + row], 4 * size * row
+        for i in range(4 * c0, 4 * c1):
+            x, y, before = get(rays, i), top + get(rays, 4 * size + i), get(inverse, at + i)
             nx, ny, nz = y * az + ay, -ax - x * az, x * ay - y * ax  # d x axis
             moment_along = cx * x + cy * y - cz
             square = rr * (nx * nx + ny * ny + nz * nz) - moment_along * moment_along
@@ -156,14 +156,15 @@ def draw_capsule(inverse, number, xs, ys, offsets, c0, c1, r0, r1, rec, g, place
             w_end = (along + math.sqrt(max(ball, zero))) * (upper_unit if up else lower_unit)
             w = w_side if side else w_end
             hit = (side & (square > zero)) | ((not side) & (ball > zero) & (along > zero))
-            seen = hit & (w > wr[i]) & (w < limit)
-            wr[i] = w if seen else wr[i]
-            nr[i] = geom if seen else nr[i]
+            seen = hit & (w > before) & (w < limit)
+            put(inverse, at + i, w if seen else before)
+            put(number, at + i, geom if seen else get(number, at + i))
 
 
 @part
-def draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, k, rec, g, geom):
+def draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, geom):
     """Put a rectangle into the buffers, from its FUNCTIONS, as far as the sky does not hide it."""
+    distinct()
     at = FUNCTIONS
     a, b, c = np.float32(rec[g, at]), np.float32(rec[g, at + 1]), np.float32(rec[g, at + 2])
     ua, ub, uc = np.float32(rec[g, at + 3]), np.float32(rec[g, at + 4]), np.float32(rec[g, at + 5])
@@ -172,21 +173,18 @@ def draw_plane(inverse, number, xs, ys, offsets, c0, c1, r0, r1, k, rec, g, geom
     at, over = VIEW, 1.0 / k[HORIZON]  # a ray's run in the world's horizontal plane, over the horizon
     ea, eb, ec = np.float32(k[at] * over), np.float32(k[at + 1] * over), np.float32(k[at + 2] * over)
     na, nb, nc = np.float32(k[at + 3] * over), np.float32(k[at + 4] * over), np.float32(k[at + 5] * over)
-    first, past, width = 4 * c0, 4 * c1, ys.size
-    xr, dr = xs[first:past], offsets[first:past]
+    size = rays.size // 9
     for row in range(r0, r1):
-        top = ys[row]
-        at = 4 * width * row
-        wr, nr = inverse[at + first : at + past], number[at + first : at + past]
-        for i in range(xr.size):
-            x, y = xr[i], top + dr[i]
+        top, at = rays[8 * size + row], 4 * size * row
+        for i in range(4 * c0, 4 * c1):
+            x, y, before = get(rays, i), top + get(rays, 4 * size + i), get(inverse, at + i)
             w = a * x + b * y + c
             u, v = ua * x + ub * y + uc, va * x + vb * y + vc
             east, north = ea * x + eb * y - ec, na * x + nb * y - nc
-            seen = (w > wr[i]) & (w >= least) & (w <= most) & (abs(u) <= w) & (abs(v) <= w)
+            seen = (w > before) & (w >= least) & (w <= most) & (abs(u) <= w) & (abs(v) <= w)
             seen &= east * east + north * north <= w * w
-            wr[i] = w if seen else wr[i]
-            nr[i] = geom if seen else nr[i]
+            put(inverse, at + i, w if seen else before)
+            put(number, at + i, geom if seen else get(number, at + i))
 
 
 @part
@@ -226,7 +224,7 @@ def corner_of_plane(rec, g, corner):
 
 
 @part
-def box_of_plane(rec, g, near, size, step):
+def box_of_plane(k, rec, g, near, size):
     """Pixels that a rectangle can touch: the outline of its corners, cut off at the near plane."""
     left, right, low, high = 1e9, -1e9, 1e9, -1e9
     for corner in range(4):
@@ -241,4 +239,4 @@ def box_of_plane(rec, g, near, size, step):
             left, right, low, high = min(left, cut_x), max(right, cut_x), min(low, cut_y), max(high, cut_y)
     if left > right:
         return 0, 0, 0, 0
-    return screen_box(left, right, low, high, size, step)
+    return screen_box(left, right, low, high, k, size)
