@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -147,6 +148,35 @@ def test_a_shard_that_scratch_cannot_hold_is_refused(tmp_path):
         list(run_jobs(plan.jobs))
 
 
+def test_a_release_grows_in_a_bucket_as_in_a_folder(tmp_path):
+    def grow(place):
+        for episodes, patterns in ((2, [WALKER]), (4, [WALKER, MAZE])):
+            recipe = quick_recipe(*[pattern | {"episodes": episodes} for pattern in patterns])
+            plan = prepare(make_plan(recipe, place))
+            list(run_jobs(plan.jobs))
+            manifest = finish(plan)
+        return manifest
+
+    bucket = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    grown = grow(bucket)
+    assert grown.version == "1.1.0" and grown.complete and grow(tmp_path / "r").digest == grown.digest
+    assert contents(tmp_path / "bucket") == contents(tmp_path / "r")
+    assert open_release(f"file://{tmp_path}/bucket").manifest == grown
+    with pytest.raises(StoreError, match="seed 2, asked for 4"):
+        prepare(make_plan(quick_recipe(seed=4), bucket))
+
+
+def test_many_verify_as_one(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "r")
+    for path in sorted((tmp_path / "r").glob("*/*/*.zarr/reward/c/2/*")):
+        path.write_bytes(path.read_bytes()[:-1] + b"?")
+    one, other = (
+        CliRunner().invoke(main, ["verify", str(tmp_path / "r"), "--json", "--workers", count]) for count in "12"
+    )
+    assert one.exit_code == other.exit_code == 1 and json.loads(one.stdout) == json.loads(other.stdout)
+    assert len(json.loads(one.stdout)["findings"]) == 3
+
+
 BUCKET = ["rollout", "walker-walk", "--episodes", "2", "--max-steps", "3", "--size", "8", "--samples", "1", "--out"]
 
 
@@ -212,28 +242,6 @@ def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
     assert called[2:] == [f"{base} --part {task}/3" for task in (1, 2, 3)]
 
 
-# -- parts that are killed, through a bad network -------------------------------------------------
-
-
-@pytest.fixture
-def s3_server(monkeypatch):
-    """(proxy, direct file system, environment of processes) of a real S3 server with an empty bucket."""
-    s3fs = pytest.importorskip("s3fs")
-    moto = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    from tests.test_publish import CREDENTIALS, Proxy
-
-    moto.start()
-    host, port = moto.get_host_and_port()
-    proxy = Proxy(host, port)
-    for name, value in CREDENTIALS.items():
-        monkeypatch.setenv(name, value)
-    direct = s3fs.S3FileSystem(endpoint_url=f"http://{host}:{port}", skip_instance_cache=True)
-    direct.makedirs("bucket", exist_ok=True)
-    yield proxy, direct, os.environ | {"OMP_NUM_THREADS": "1"}
-    proxy.server.shutdown()
-    moto.stop()
-
-
 # -- Ray ------------------------------------------------------------------------------------------
 
 
@@ -276,3 +284,29 @@ def test_a_ray_cluster_that_loses_a_node_and_gains_one_makes_the_same_release(wh
     assert digests(manifest) == digests(open_release(whole).manifest)
     assert contents(tmp_path / "r") == contents(whole)
     assert {subset.family for subset in plan.manifest.subsets} >= {ANT_MAZE}
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_verifies_exports_and_validates_as_one_process_does(whole, tmp_path):
+    ray = pytest.importorskip("ray")
+    told = {}
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        for name, how in {"ray": ["--executor", "ray"], "here": []}.items():
+            exported = tmp_path / name / "npz"
+            validated = ["--agents", "state-bc", "--profile", "smoke", "--train-unsound", "--threads", "1"]
+            for command in (
+                ["verify", whole, "--json"],
+                ["export", whole, "--to", "npz", "--out", exported],
+                ["validate", whole, *validated, "--out", tmp_path / name / "report"],
+            ):
+                result = CliRunner().invoke(main, [str(word) for word in [*command, *how]])
+                assert result.exit_code in (0, 1), result.output
+                told[name, command[0]] = result.stdout if command[0] == "verify" else None
+            told[name, "export"] = contents(exported)
+            cells = json.loads((tmp_path / name / "report/report.json").read_text())["results"]
+            told[name, "validate"] = [(cell["id"], cell["score"]["returns"]) for cell in cells]
+    finally:
+        ray.shutdown()
+    for what in ("verify", "export", "validate"):
+        assert told["ray", what] == told["here", what] and told["here", what], what

@@ -22,19 +22,20 @@ from dmcvb_gen.benchmarks.setup import Pretraining, Setup, pretraining_of
 from dmcvb_gen.benchmarks.tables import Cell
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_text
-from dmcvb_gen.pool import ignore, open_pool
+from dmcvb_gen.pool import Needs, Workers, ignore, open_pool
 
 TICK_SECONDS = 0.2
 """Progress is told no more often: an Adam step on states takes less than telling of it."""
 
 
 def run_cells(
-    setup: Setup, cells: Sequence[Cell], workers: int = 1, tick: Tick = ignore
+    setup: Setup, cells: Sequence[Cell], workers: Workers = 1, tick: Tick = ignore
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Results of cells as they come; those that need no encoder are run beside the encoders' training.
 
     Args:
-      workers: processes (started fresh, never forked), which share the memory for pictures; 1: all in this one.
+      workers: processes (started fresh, never forked), which share the memory for pictures; 1: all in this one; or a
+        Ray cluster whose nodes see the release and the report's folder.
       tick: told what is trained and how many Adam steps were made.
 
     Raises:
@@ -43,10 +44,11 @@ def run_cells(
     encoders = dict.fromkeys(filter(None, map(pretraining_of, cells)))
     if workers == 1:
         torch.set_num_threads(setup.threads)
-    else:
+    elif isinstance(workers, int):
         setup = share_memory(setup, workers)
     kept = "finished cells are kept: run the same command again"
-    with open_pool(workers, threads=setup.threads, tick=tick, kept=kept) as pool:
+    needs = Needs(cpus=setup.threads, memory=setup.memory, gpus=0 if setup.device == "cpu" else 1)
+    with open_pool(workers, threads=setup.threads, tick=tick, kept=kept, needs=needs) as pool:
         for work in encoders:
             pool.submit(work, try_pretraining, setup, work)
         for cell in cells:

@@ -17,6 +17,7 @@ from dmcvb_gen.benchmarks.setup import Setup, open_data
 from dmcvb_gen.benchmarks.tables import Cell, Missing, plan_benchmark
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import select
+from dmcvb_gen.pool import Workers
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.store import Release
 
@@ -95,7 +96,7 @@ def validate(
     benchmarks: Sequence[str] = ("b1",),
     agents: Sequence[str] = (),
     patterns: Sequence[str] = (),
-    workers: int = 1,
+    workers: Workers = 1,
     train_unsound: bool = False,
     progress: Progress | None = None,
 ) -> Validation:
@@ -107,7 +108,7 @@ def validate(
       benchmarks: names out of `tables.BENCHMARKS`; none: structure checks alone.
       agents: instead of each benchmark's own.
       patterns: only these subsets.
-      workers: cells side by side.
+      workers: cells side by side, or a Ray cluster that sees the same folders.
       train_unsound: run the benchmarks even where a structure check fails.
 
     Raises:

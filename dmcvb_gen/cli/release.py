@@ -23,10 +23,13 @@ def parse_folder(context, parameter, text):
 @click.argument("path", metavar="RELEASE|URL")
 @click.option("--all", "everything", is_flag=True, help="At a URL, read every file; a sample by default.")
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
+@click.option("--workers", type=click.IntRange(1), help="Processes; at a URL, files at once.  [default: 1; 8]")
+@executor_option
+@ray_option
 @remote_option
 @json_option
 @click.pass_context
-def verify(context, path, everything, backgrounds, options, as_json):
+def verify(context, path, everything, backgrounds, workers, executor, ray_address, options, as_json):
     """Check that a release is what it says: digests, shapes, values, physics, pixels, returns.
 
     At a URL nothing is downloaded: manifest, index and commit records are checked, and a sample of files by digest.
@@ -38,15 +41,16 @@ def verify(context, path, everything, backgrounds, options, as_json):
     dmcvb-gen verify releases/demo
     """
     from dmcvb_gen.release.verify import verify as run
-    from dmcvb_gen.release.verify_url import verify_url
+    from dmcvb_gen.release.verify_url import WORKERS, verify_url
     from dmcvb_gen.store.remote import is_url
 
     if is_url(path):
         with tqdm(unit=" files", disable=as_json or None) as bar:
-            result = verify_url(path, options, everything, lambda name: bar.update())
+            result = verify_url(path, options, everything, lambda name: bar.update(), workers or WORKERS)
     else:
         with tqdm(unit=" subsets", disable=as_json or None) as bar:
-            result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()))
+            team = crew(workers or 1, executor, ray_address)
+            result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()), team)
     if as_json:
         findings = [dataclasses.asdict(finding) for finding in result.findings]
         facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
@@ -292,12 +296,14 @@ def card(context, path, check, out, url, as_json):
 @click.option("--merge", is_flag=True, help="lerobot: all subsets as the tasks of one data set.")
 @click.option("--video", is_flag=True, help="lerobot: pictures as mp4, smaller and with losses, not as PNG.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes, a subset each.")
+@executor_option
+@ray_option
 @click.option(
     "--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the exports, a folder a subset."
 )
 @remote_option
 @json_option
-def export(path, to, only, episodes, merge, video, workers, out, options, as_json):
+def export(path, to, only, episodes, merge, video, workers, executor, ray_address, out, options, as_json):
     """Write subsets in another format: a folder a subset, nothing is written over.
 
     A subset that is not whole is refused, unless --episodes names what is there.
@@ -307,8 +313,9 @@ def export(path, to, only, episodes, merge, video, workers, out, options, as_jso
     """
     from dmcvb_gen.release.export import export as run
 
+    team = crew(workers, executor, ray_address)
     with tqdm(unit=" episodes", disable=as_json or None) as bar:
-        given = dict(merge=merge, video=video, workers=workers, storage_options=options, tick=bar.update)
+        given = dict(merge=merge, video=video, workers=team, storage_options=options, tick=bar.update)
         folders = run(path, to, out, only, episodes, **given)
     if as_json:
         return print_json([str(folder) for folder in folders])

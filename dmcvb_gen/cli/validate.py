@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
+from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import json_option, print_json
 
 
@@ -23,6 +24,8 @@ from dmcvb_gen.cli.common import json_option, print_json
 @click.option("--strict", is_flag=True, help="Exit with 1 on warnings too (data unlike the paper's).")
 @click.option("--train-unsound", is_flag=True, help="Run the benchmarks even where a structure check fails.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Cells side by side.")
+@executor_option
+@ray_option
 @click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True)
 @click.option("--compile", is_flag=True, help="torch.compile the losses (pays on CUDA and in long runs).")
@@ -55,6 +58,8 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
         if not torch.cuda.is_available():
             raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
     workers, memory, weights = options.pop("workers"), options.pop("memory"), options.pop("dino_weights")
+    team = crew(workers, options.pop("executor"), options.pop("ray_address"))
+    threads = default_threads(workers) if isinstance(team, int) else 1  # of a task on a cluster
     train_unsound = options.pop("train_unsound")
     setup = Setup(
         root=str(path),
@@ -62,7 +67,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
         profile=get_profile(profile).scaled(scale),
         memory=None if memory is None else int(memory * 1e9),
         dino_weights=weights and str(weights),
-        **options | {"threads": options["threads"] or default_threads(workers)},
+        **options | {"threads": options["threads"] or threads},
     )
     with tqdm(unit=" steps", desc="structure", disable=as_json or None) as bar:
         progress = Progress(
@@ -76,7 +81,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
             benchmarks=() if checks_only else benchmarks or ("b1",),
             agents=[name for name in agents.split(",") if name.strip()],
             patterns=only,
-            workers=workers,
+            workers=team,
             train_unsound=train_unsound,
             progress=progress,
         )

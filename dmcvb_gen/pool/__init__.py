@@ -74,7 +74,7 @@ def open_pool(
     if isinstance(workers, Ray):
         from dmcvb_gen.pool.ray_pool import RayPool
 
-        return RayPool(workers.address, needs, tick)
+        return RayPool(workers.address, needs, tick, threads)
     workers = workers if most is None else min(workers, most)
     return SerialPool(tick) if workers <= 1 else ProcessPool(workers, threads, tick, kept)
 

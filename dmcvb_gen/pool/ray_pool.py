@@ -23,17 +23,18 @@ class RayPool(Pool):
       address: of the cluster ("ray://host:10001", "auto"); by default what RAY_ADDRESS says, else one on this machine.
       needs: of a piece of work, for Ray to place it.
       tick: told what the functions tell, when their result comes.
+      threads: of the libraries that a piece of work uses.
 
     Raises:
       DmcvbError: ray is not installed, or nobody answers at the address.
     """
 
-    def __init__(self, address: str | None = None, needs: Needs | None = None, tick: Tick = ignore):
+    def __init__(self, address: str | None = None, needs: Needs | None = None, tick: Tick = ignore, threads: int = 1):
         try:
             import ray
         except ImportError:
             raise DmcvbError("--executor ray needs a package that is not installed: pip install 'ray>=2.40'") from None
-        self._ray, self._tick, self._needs = ray, tick, needs or Needs()
+        self._ray, self._tick, self._needs, self._threads = ray, tick, needs or Needs(), threads
         self._ours = not ray.is_initialized()
         if self._ours:
             _check_answers(address or os.environ.get("RAY_ADDRESS"))
@@ -56,7 +57,7 @@ class RayPool(Pool):
         while self._waiting or self._running:
             while self._waiting and len(self._running) < self._bound():
                 key, function, arguments = self._waiting.popleft()
-                self._running[work.remote(function, arguments)] = key
+                self._running[work.remote(function, arguments, self._threads)] = key
             done, _ = ray.wait(list(self._running), num_returns=1, timeout=10 * POLL_SECONDS)
             for reference in done:
                 key = self._running.pop(reference)
@@ -100,9 +101,9 @@ def _nobody(address: str, reason: str) -> DmcvbError:
     )
 
 
-def _work(function, arguments) -> tuple[list[tuple], Any]:
+def _work(function, arguments, threads: int) -> tuple[list[tuple], Any]:
     """What a function told, added up where it told numbers, and its result."""
-    limit_threads(1)
+    limit_threads(threads)
     told: list[tuple] = []
 
     def tell(*facts: Any) -> None:

@@ -7,17 +7,20 @@ simulated again and a sample of frames painted again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
+from dmcvb_gen.pool import Workers, run_all
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.store import Subset, open_release
 from dmcvb_gen.store.index import INDEX, Index, read_index, root_digest
 from dmcvb_gen.store.manifest import (
     MANIFEST,
+    CommitRecord,
     FileRecord,
     Manifest,
     SubsetRecord,
@@ -30,6 +33,8 @@ from dmcvb_gen.store.manifest import (
 from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.writer import subset_digest
 
+SHARDS = 8
+"""Shards whose bytes are checked as one piece of work."""
 PREVIEWS = "preview/"
 """Folder that `dmcvb-gen preview` writes to; no part of a release."""
 
@@ -66,8 +71,12 @@ class Verification:
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def check_files(root: Path) -> Iterator[Finding]:
-    """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`."""
+def check_files(root: Path, workers: Workers = 1) -> Iterator[Finding]:
+    """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`.
+
+    Args:
+      workers: processes, or a Ray cluster that sees the folder.
+    """
     try:
         manifest = parse_manifest((root / MANIFEST).read_bytes(), MANIFEST)
     except StoreError as error:
@@ -81,9 +90,16 @@ def check_files(root: Path) -> Iterator[Finding]:
     else:
         if index is None and manifest.digest is not None:
             yield Finding("files", INDEX, "is missing; fetch it again")
-    checked: set[str] = set()
+    works, checked = _works(root, manifest), set()
+    found = in_order(_check_shards, works, workers, lambda subset: None)
     for record in manifest.subsets:
-        yield from _check_shards(root, manifest, record, checked)
+        commits: dict[int, CommitRecord] = {}
+        for work, part in zip(works, found, strict=True):
+            if work.record is record:
+                yield from part.findings
+                checked |= set(part.files)
+                commits |= part.commits
+        yield from _check_digest(record, commits)
     if index is not None:
         yield from _check_index(root, manifest, index, checked)
         if manifest.complete:
@@ -131,34 +147,83 @@ def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Ite
             yield Finding("files", where, f"{name} does not have its digest")
 
 
-def _check_shards(root: Path, manifest: Manifest, record: SubsetRecord, checked: set[str]) -> Iterator[Finding]:
-    """Commit records and their files, which are put into `checked`."""
-    commits = {}
-    for shard in range(shard_count(record)):
+@dataclass(frozen=True)
+class _Shards:
+    """Some shards of a subset, whose bytes are to be checked; travels to a worker."""
+
+    root: Path
+    record: SubsetRecord
+    shards: range
+    wanted: bool
+    """Whether each must be there."""
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """What the bytes of some shards gave: findings, the files that were looked at, the records that can be read."""
+
+    findings: tuple[Finding, ...]
+    files: tuple[str, ...]
+    commits: Mapping[int, CommitRecord]
+
+
+def _works(root: Path, manifest: Manifest) -> list[_Shards]:
+    return [
+        _Shards(root, record, range(first, min(first + SHARDS, shard_count(record))), manifest.complete)
+        for record in manifest.subsets
+        for first in range(0, shard_count(record), SHARDS)
+    ]
+
+
+def _check_shards(work: _Shards, tick: Callable[[str], None] = lambda subset: None) -> _Checked:
+    """Commit records and their files."""
+    root, record, commits, checked, findings = work.root, work.record, {}, [], []
+    for shard in work.shards:
         path = commit_path(record.name, shard)
         if not (root / path).is_file():
-            if manifest.complete:
-                yield Finding("files", record.name, f"shard {shard} is missing: no {path}")
+            if work.wanted:
+                findings.append(Finding("files", record.name, f"shard {shard} is missing: no {path}"))
             continue
         try:
             commit = commits[shard] = checked_commit((root / path).read_bytes(), path, record, shard)
         except StoreError as error:
-            yield Finding("files", record.name, f"{path} is damaged: {error}")
+            findings.append(Finding("files", record.name, f"{path} is damaged: {error}"))
             continue
         for file in commit.files:
-            checked.add(file.path)
-            yield from _check_file(root, file, record.name, f" of shard {shard}")
+            checked.append(file.path)
+            findings += _check_file(root, file, record.name, f" of shard {shard}")
+    return _Checked(tuple(findings), tuple(checked), commits)
+
+
+def _check_digest(record: SubsetRecord, commits: Mapping[int, CommitRecord]) -> Iterator[Finding]:
     if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
         yield Finding("files", record.name, "its commit records do not give the digest of the manifest")
 
 
+def in_order(function: Callable, items: Sequence, workers: Workers, tick: Callable[[str], None]) -> list:
+    """Results of all items, in their order, whoever had them first."""
+    numbers = run_all(_numbered, [(number, function, item) for number, item in enumerate(items)], workers, tick=tick)
+    return [result for _, result in sorted((result for _, result in numbers), key=lambda pair: pair[0])]
+
+
+def _numbered(item: tuple[int, Callable, Any], tick: Callable[[str], None]) -> tuple[int, Any]:
+    number, function, work = item
+    return number, function(work, tick=tick)
+
+
 def verify(
-    path: str | Path, backgrounds: str | None = None, tick: Callable[[str], None] = lambda subset: None
+    path: str | Path,
+    backgrounds: str | None = None,
+    tick: Callable[[str], None] = lambda subset: None,
+    workers: Workers = 1,
 ) -> Verification:
     """Check a release.
 
     Args:
       backgrounds: where the manifest's videos are now, if they moved.
+      tick: told each subset whose values are looked at.
+      workers: processes, or a Ray cluster that sees the folder: bytes are checked a few shards at a time, values a
+        subset.
 
     Raises:
       DmcvbError: there is no release, or nothing is committed.
@@ -166,7 +231,7 @@ def verify(
     root = Path(path)
     if not (root / MANIFEST).is_file():
         open_release(path)  # says what is the matter
-    findings = list(check_files(root))
+    findings = list(check_files(root, workers))
     damaged = {finding.subset for finding in findings}
     counts = {"subsets": 0, "episodes": 0, "steps": 0}
     if damaged & {MANIFEST, INDEX}:
@@ -174,17 +239,20 @@ def verify(
     release = open_release(path, skip=damaged)
     if not release.subsets and not findings:
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
-    for name, subset in release.subsets.items():
-        tick(name)
+    for subset in release.subsets.values():
         counts["subsets"] += 1
         counts["episodes"] += len(subset.episodes)
         counts["steps"] += subset.steps
-        findings += _check_subset(subset, backgrounds)
+    works = [(subset, backgrounds) for subset in release.subsets.values()]
+    for found in in_order(_check_subset, works, workers, tick):
+        findings += found
     incomplete = {name: count for name, count in release.shortfalls.items() if name not in damaged}
     return Verification(counts, tuple(findings), incomplete, release.manifest.digest)
 
 
-def _check_subset(subset: Subset, backgrounds: str | None) -> list[Finding]:
+def _check_subset(work: tuple[Subset, str | None], tick: Callable[[str], None]) -> list[Finding]:
+    subset, backgrounds = work
+    tick(subset.name)
     try:
         from dmcvb_gen.release import contents
     except ModuleNotFoundError as error:

@@ -30,6 +30,7 @@ def verify_url(
     options: dict[str, Any] | None = None,
     everything: bool = False,
     tick: Callable[[str], None] = lambda path: None,
+    workers: int = WORKERS,
 ) -> Verification:
     """Check a published release where it is.
 
@@ -37,6 +38,7 @@ def verify_url(
       options: of fsspec.
       everything: read all files, not a sample.
       tick: told each file that was read.
+      workers: files at once.
 
     Raises:
       StoreError: no release is there, or it cannot be read.
@@ -60,7 +62,7 @@ def verify_url(
             return None
         return Finding("files", subset_of(source.manifest, file.path), f"{file.path} does not have its digest")
 
-    findings += [found for found in in_parallel(look, chosen, WORKERS, lambda _: tick("")) if found]
+    findings += [found for found in in_parallel(look, chosen, workers, lambda _: tick("")) if found]
     counts = {"subsets": 0, "episodes": 0, "steps": 0, "files": len(chosen)}
     try:
         release = open_release(url, options)

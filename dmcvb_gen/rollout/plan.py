@@ -22,11 +22,11 @@ from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX
-from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment
+from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment, subset_path
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
-from dmcvb_gen.store.writer import create_subset, finish_release, start_release
+from dmcvb_gen.store.writer import create_subset, finish_release, mark_created, start_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
@@ -233,22 +233,8 @@ def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False,
     elif there is None:
         manifest = _prepare_bucket(plan, cast(BucketSite, plan.site))
     else:
-        manifest = _unchanged(plan.site, there, plan.manifest)
+        manifest = _grow_bucket(plan, cast(BucketSite, plan.site), there)
     return replace(plan, manifest=manifest)
-
-
-def _unchanged(site: Site, there: Manifest, asked: Manifest) -> Manifest:
-    """The manifest of a bucket, if it holds all that is asked for.
-
-    Raises:
-      StoreError: it would have to grow.
-    """
-    if merged(there, asked, site.place) is not there:
-        raise StoreError(
-            f"{site.place} would have to grow, which releases do in folders alone; fetch it, roll out what is new into "
-            "that folder, and publish it as the next version"
-        )
-    return there
 
 
 def check_versions(manifest: Manifest) -> None:
@@ -284,21 +270,64 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
 def _prepare_bucket(plan: Plan, site: BucketSite) -> Manifest:
     """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
     with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
-        root = Path(folder)
-        copy_inputs(root, plan.manifest.subsets, plan.inputs or {})
-        create_groups(root, plan.manifest, plan.manifest.subsets)
-        begun = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
-        begun = {name: path for name, path in begun.items() if not Path(name).name.startswith(".")}
+        begun = _begun(Path(folder), plan, plan.manifest, plan.manifest.subsets)
         strange = set(site.listing()) - set(begun) - {MANIFEST}
         if strange and site.manifest() is None:
             raise StoreError(
                 f"{site.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
             )
-        pieces = [(name, path.read_bytes()) for name, path in begun.items()]
-        in_parallel(lambda piece: site.write(*piece), pieces, CONNECTIONS, ignore)
+        in_parallel(lambda name: site.write(name, begun[name].read_bytes()), list(begun), CONNECTIONS, ignore)
     if site.create(MANIFEST, json_bytes(plan.manifest)):
         return plan.manifest
-    return _unchanged(site, site.manifest() or plan.manifest, plan.manifest)
+    first = site.manifest()
+    if first is None:
+        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
+    return _grow_bucket(plan, site, first)
+
+
+def _begun(root: Path, plan: Plan, manifest: Manifest, records: Sequence[SubsetRecord]) -> dict[str, Path]:
+    """Everything of subsets but shards, made in a folder: path in the release -> file."""
+    if plan.inputs is not None:
+        copy_inputs(root, records, plan.inputs)
+    create_groups(root, manifest, records)
+    made = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+    return {name: path for name, path in made.items() if not Path(name).name.startswith(".")}
+
+
+def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
+    """The manifest of a bucket once it holds all that is asked for; what is new is put there first, the manifest last.
+
+    Raises:
+      StoreError: what is there contradicts what is asked for, or somebody else grows the release at the same time.
+    """
+    manifest = merged(there, plan.manifest, site.place)
+    if manifest is there:
+        return there
+    old = {record.name: record for record in there.subsets}
+    changed = [record for record in manifest.subsets if record != old.get(record.name)]
+    with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
+        root = Path(folder)
+        listed = site.listing()
+        for record in changed:
+            if record.name in old:  # its arrays are there, and get room for more episodes
+                _bring_metadata(site, record, listed, root)
+        begun = _begun(root, plan, manifest, changed)
+        new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
+        in_parallel(lambda name: site.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
+    if site.manifest() != there:
+        raise StoreError(f"{site.place} was grown by somebody else meanwhile; run the same command again")
+    site.remove(INDEX)  # written again when the release is finished
+    site.write(MANIFEST, json_bytes(manifest))
+    return manifest
+
+
+def _bring_metadata(site: BucketSite, record: SubsetRecord, listed: Iterable[str], root: Path) -> None:
+    """A subset's zarr.json files as the bucket has them, to the byte."""
+    folder = f"{subset_path(record.name)}/"
+    names = [name for name in listed if name.startswith(folder) and name.endswith("/zarr.json")]
+    for name, text in zip(names, in_parallel(site.read, names, CONNECTIONS, ignore), strict=True):
+        write_bytes(root / name, text or b"")
+    mark_created(root, record)
 
 
 def copy_inputs(root: Path, records: Iterable[SubsetRecord], inputs: Mapping[str, Inputs]) -> None:

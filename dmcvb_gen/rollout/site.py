@@ -260,6 +260,16 @@ class BucketSite(Site):
         filesystem, base = self._open()
         retry(self.place, path, lambda: put_object(filesystem, f"{base}/{path}", data))
 
+    def remove(self, path: str) -> None:
+        """Remove a small file, if it is there."""
+        filesystem, base = self._open()
+
+        def attempt() -> None:
+            with contextlib.suppress(FileNotFoundError):
+                filesystem.rm_file(f"{base}/{path}")
+
+        retry(self.place, path, attempt)
+
     def listing(self):
         filesystem, base = self._open()
 
@@ -281,7 +291,8 @@ class BucketSite(Site):
         group = json.loads(text)
         files.write_bytes(folder / path, text)
         for name, node in group["consolidated_metadata"]["metadata"].items():
-            files.write_json(folder / subset_path(record.name) / name / "zarr.json", node)
+            bare = {key: value for key, value in node.items() if key != "consolidated_metadata"}  # it would grow stale
+            files.write_json(folder / subset_path(record.name) / name / "zarr.json", bare)
 
     def inputs(self, record, folder):
         wanted = [policy.path for policy in record.policies]

@@ -11,7 +11,7 @@ from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.names import select
-from dmcvb_gen.pool import ignore, open_pool
+from dmcvb_gen.pool import Workers, ignore, open_pool
 from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.store.remote import is_url, public, storage_errors
@@ -113,7 +113,7 @@ def export(
     *,
     merge: bool = False,
     video: bool = False,
-    workers: int = 1,
+    workers: Workers = 1,
     storage_options: dict | None = None,
     tick: Callable[[int], None] = ignore,
 ) -> list[Path]:
@@ -126,7 +126,7 @@ def export(
       only: subset patterns; episodes: (first, last + 1); all by default.
       merge: lerobot: all subsets as the tasks of one data set, `out` itself.
       video: lerobot: pictures as mp4 (smaller, with losses) and not as PNG.
-      workers: processes, a subset each.
+      workers: processes (or a Ray cluster that sees the same folders), a subset each.
       tick: told 1 for each episode.
 
     Returns:
@@ -157,7 +157,7 @@ def export(
     for folder in folders:
         if folder.exists():
             raise StoreError(f"{folder} is there already; choose another --out")
-    with open_pool(min(workers, len(works)), tick=tick, kept=KEPT) as pool:
+    with open_pool(workers, tick=tick, kept=KEPT, most=len(works)) as pool:
         for work in works:
             pool.submit(work.folder, _write, work)
         for _ in pool.results():
