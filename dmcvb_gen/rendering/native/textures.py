@@ -7,6 +7,7 @@ bilinear sample of the level before. Textures in sRGB are kept in linear light, 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -74,9 +75,27 @@ def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) ->
 
 
 def packed(picture: np.ndarray) -> np.ndarray:
-    """(h, w, 3) uint8 -> (h * w,) int32 texels."""
-    wide = picture.reshape(-1, 3).astype(np.int32)
-    return wide[:, 0] | wide[:, 1] << np.int32(8) | wide[:, 2] << np.int32(16)
+    """(h, w, 3 or 4) uint8 -> (h * w,) int32 texels; nothing reads the fourth byte."""
+    if picture.shape[2] == 3:
+        picture = np.concatenate([picture, np.zeros_like(picture[..., :1])], axis=2)
+    return np.ascontiguousarray(picture).view("<i4").ravel()
+
+
+def background_levels(picture: np.ndarray, finest: int) -> Iterator[tuple[int, np.ndarray]]:
+    """(h, w, 3) uint8 -> number and (side, side, 4) uint8 of the levels from `finest` on of a background on the sky.
+
+    The same as `levels` of the picture made SKY_WIDTH wide, by Pillow: halves of even sides are boxes of four texels.
+    """
+    current = Image.fromarray(picture).convert("RGBX")  # as Pillow keeps RGB anyway, and as texels are packed
+    current = current.resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR)
+    for level, (width, height) in enumerate(level_sizes(SKY_WIDTH, SKY_WIDTH)):
+        if level and not current.width % 2:
+            current = current.reduce(2)
+        elif level:
+            smaller = halved(np.asarray(current, np.float32), width, height)
+            current = Image.fromarray(np.floor(smaller + 0.5).astype(np.uint8), "RGBX")
+        if level >= finest:
+            yield level, np.asarray(current)
 
 
 class Textures:
@@ -139,11 +158,8 @@ class Textures:
                 raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
             full = len(self._slot) >= self.slots
             texture = self._slot.popitem(last=False)[1] if full else self._model.ntex + len(self._slot)
-            picture = Image.fromarray(self._backgrounds.frames(video)[frame])
-            wide = np.asarray(picture.resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR))
-            for level, smaller in enumerate(levels(wide)):
-                if level >= self._finest:
-                    self._write(texture, level, smaller)
+            for level, smaller in background_levels(self._backgrounds.frames(video)[frame], self._finest):
+                self._write(texture, level, smaller)
             self._slot[key] = texture
         self._slot.move_to_end(key)
         return self._slot[key]
