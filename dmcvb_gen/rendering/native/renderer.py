@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import logging
 import math
-import time
 from collections.abc import Iterator, Sequence
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +12,9 @@ import numpy as np
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
-from dmcvb_gen.rendering.native import frame as frame_module
 from dmcvb_gen.rendering.native import records as columns
-from dmcvb_gen.rendering.native.frame import Frames, Still, make_work
+from dmcvb_gen.rendering.native.compiled import call
+from dmcvb_gen.rendering.native.frame import Frames, Still, labeler, make_work, painter
 from dmcvb_gen.rendering.native.scene import PLANE, Scene, look_of, scene_of
 from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
 from dmcvb_gen.rendering.native.visibility import sample_rays
@@ -31,29 +26,6 @@ VERSION = 2
 SAMPLES = 4
 CHUNK = 256
 """Frames whose poses are held at a time."""
-
-_log = logging.getLogger(__name__)
-
-
-@functools.cache
-def _entry(name: str):
-    """A compiled entry point of `frame`, kept on disk by the digest of all of this package's source."""
-    source = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    digest = int.from_bytes(hashlib.sha256(source).digest()[:6], "little") | 1
-    return getattr(frame_module, name)(digest)
-
-
-def _call(name: str, *arguments) -> None:
-    """Call an entry point; say so where it is compiled first."""
-    entry = _entry(name)
-    if entry.signatures:
-        entry(*arguments)
-        return
-    started = time.perf_counter()
-    entry(*arguments)
-    seconds = time.perf_counter() - started
-    if sum(entry.stats.cache_misses.values()):
-        _log.info("compiled the painter in %.0f s; later runs read it from %s", seconds, entry.stats.cache_path)
 
 
 class NativeRenderer(Renderer):
@@ -107,7 +79,7 @@ class NativeRenderer(Renderer):
             for column, view in enumerate(indices):
                 frames, still = self._frames(poses, exogenous[rows], view), self._still(view)
                 shown, hidden = (picture[:0], picture) if hide_goal else (picture, picture[:0])
-                _call("painter", *still, *frames, *self._work, self._stays, shown, hidden)
+                call(painter, *still, *frames, *self._work, self._stays, shown, hidden)
                 out[rows, column] = picture
         return out
 
@@ -124,7 +96,7 @@ class NativeRenderer(Renderer):
             geom = np.empty((len(rows), self.size, self.size), np.int16)
             for column, view in enumerate(indices):
                 frames, still = self._frames(poses, exogenous[rows], view), self._still(view, centers=True)
-                _call("labeler", *still, *frames, *self._work, deep, geom)
+                call(labeler, *still, *frames, *self._work, deep, geom)
                 depth[rows, column], segmentation[rows, column] = deep, numbers[geom]
         return {"depth": depth, "segmentation": segmentation}
 

@@ -14,6 +14,8 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.rendering.native import skies
+from dmcvb_gen.rendering.native.compiled import call
 from dmcvb_gen.rendering.native.records import FACES, FIRST, LEVELS
 
 SKY_WIDTH = 800
@@ -75,27 +77,35 @@ def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) ->
 
 
 def packed(picture: np.ndarray) -> np.ndarray:
-    """(h, w, 3 or 4) uint8 -> (h * w,) int32 texels; nothing reads the fourth byte."""
-    if picture.shape[2] == 3:
-        picture = np.concatenate([picture, np.zeros_like(picture[..., :1])], axis=2)
-    return np.ascontiguousarray(picture).view("<i4").ravel()
+    """(h, w, 3) uint8 -> (h * w,) int32 texels."""
+    return np.concatenate([picture, np.zeros_like(picture[..., :1])], axis=2).view("<i4").ravel()
 
 
 def background_levels(picture: np.ndarray, finest: int) -> Iterator[tuple[int, np.ndarray]]:
-    """(h, w, 3) uint8 -> number and (side, side, 4) uint8 of the levels from `finest` on of a background on the sky.
+    """(h, w, 3) uint8 -> number and (texel,) int32 of the levels from `finest` on of a background on the sky.
 
-    The same as `levels` of the picture made SKY_WIDTH wide, by Pillow: halves of even sides are boxes of four texels.
+    They are `levels` of the picture that Pillow's bilinear filter makes SKY_WIDTH wide and high.
     """
-    current = Image.fromarray(picture).convert("RGBX")  # as Pillow keeps RGB anyway, and as texels are packed
-    current = current.resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR)
-    for level, (width, height) in enumerate(level_sizes(SKY_WIDTH, SKY_WIDTH)):
-        if level and not current.width % 2:
-            current = current.reduce(2)
-        elif level:
-            smaller = halved(np.asarray(current, np.float32), width, height)
-            current = Image.fromarray(np.floor(smaller + 0.5).astype(np.uint8), "RGBX")
-        if level >= finest:
-            yield level, np.asarray(current)
+    if max(picture.shape[:2]) > SKY_WIDTH or min(picture.shape[:2]) < 2:
+        image = Image.fromarray(picture).resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR)
+        texels = [packed(level) for level in levels(np.asarray(image))]
+    else:
+        texels = _sky_levels(picture)
+    yield from list(enumerate(texels))[finest:]
+
+
+def _sky_levels(picture: np.ndarray) -> list[np.ndarray]:
+    """All levels of a sky, from a picture that is no larger."""
+    rows, columns = picture.shape[:2]
+    sides = [width for width, _ in level_sizes(SKY_WIDTH, SKY_WIDTH)]
+    even = 1 + next(i for i, side in enumerate(sides) if side % 2)  # made by halving
+    out = np.empty(sum(side * side for side in sides[:even]), np.int32)
+    narrow, tall = np.empty(rows * columns, np.int32), np.empty(rows * SKY_WIDTH, np.int32)
+    across, down = skies.taps(columns, SKY_WIDTH), skies.taps(rows, SKY_WIDTH)
+    call(skies.sky_maker, np.ascontiguousarray(picture), *across, *down, narrow, tall, out)
+    texels = np.split(out, np.cumsum([side * side for side in sides[:even]])[:-1])
+    last = texels[-1].view(np.uint8).reshape(sides[even - 1], sides[even - 1], 4)[..., :3]
+    return texels + [packed(level) for level in levels(last)[1:]]
 
 
 class Textures:
@@ -148,7 +158,7 @@ class Textures:
         srgb = faces == 1 and self._model.tex_colorspace[index] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
         for face, picture in enumerate(self._faces(index, faces)):
             for level, smaller in enumerate(levels(picture, bool(srgb))):
-                self._write(index, level, smaller, face)
+                self._put(index, level, packed(smaller), face)
 
     def background(self, video: int, frame: int) -> int:
         """The texture of a video's frame, made now if need be; stays for the next `slots` - 1 others."""
@@ -159,13 +169,12 @@ class Textures:
             full = len(self._slot) >= self.slots
             texture = self._slot.popitem(last=False)[1] if full else self._model.ntex + len(self._slot)
             for level, smaller in background_levels(self._backgrounds.frames(video)[frame], self._finest):
-                self._write(texture, level, smaller)
+                self._put(texture, level, smaller)
             self._slot[key] = texture
         self._slot.move_to_end(key)
         return self._slot[key]
 
-    def _write(self, texture: int, level: int, picture: np.ndarray, face: int = 0) -> None:
-        texels = packed(picture)
+    def _put(self, texture: int, level: int, texels: np.ndarray, face: int = 0) -> None:
         first = int(self.table[texture, FIRST + 3 * level]) + face * len(texels)
         self.texels[first : first + len(texels)] = texels
 
