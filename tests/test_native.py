@@ -90,6 +90,37 @@ def test_a_hidden_goal_changes_only_its_own_pixels():
     assert not changed[~grown].any()
 
 
+@pytest.mark.parametrize("size", [33, 64])
+@pytest.mark.parametrize("task_id", [MAZE, "walker-walk"])
+def test_what_is_painted_once_or_in_part_is_what_the_whole_picture_shows(task_id, size):
+    """Frames one by one have nothing to share; together, still cameras keep what does not move, pairs share a frame."""
+    task, setting, physics, labels = frames_of(task_id, "none")
+    renderer = renderer_of("native", task, setting, size)
+    alone = [
+        np.concatenate(
+            [renderer.render(physics[i : i + 1], labels[i : i + 1], None, hide) for i in range(len(physics))]
+        )
+        for hide in (False, True)
+    ]
+    assert (alone[0] != alone[1]).any() == (task_id == MAZE)
+    for pictures in (
+        renderer.render_pair(physics, labels),
+        [renderer.render(physics, labels), renderer.render(physics, labels, hide_goal=True)],
+    ):
+        for found, expected in zip(pictures, alone, strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_what_does_not_move_is_kept_only_as_long_as_it_looks_the_same():
+    task, setting, physics, labels = frames_of(MAZE, "none")
+    labels.style[len(physics) // 2 :] = next(look for look in task.looks(3) if look != labels.style[0])
+    labels.camera_position[-2:, 0] += 0.25
+    order = np.argsort(np.arange(len(physics)) % 3, kind="stable")
+    renderer = renderer_of("native", task, setting)
+    alone = np.concatenate([renderer.render(physics[i : i + 1], labels[i : i + 1]) for i in order])
+    np.testing.assert_array_equal(renderer.render(physics[order], labels[order]), alone)
+
+
 def test_a_style_changes_a_maze():
     task, setting, physics, labels = frames_of(MAZE, "none", 2)
     renderer = renderer_of("native", task, setting)

@@ -50,6 +50,12 @@ class Renderer(abc.ABC):
           (frame, view, size, size, 3) uint8.
         """
 
+    def render_pair(
+        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The frames as `render` paints them, and the same with `hide_goal`."""
+        return self.render(physics, exogenous, views), self.render(physics, exogenous, views, hide_goal=True)
+
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
         """Name, version and every setting that decides a pixel, for the manifest."""

@@ -145,22 +145,30 @@ def paint(
     for view, (name, hidden_name) in zip(task.views, names, strict=True):
         if arrays is not None and name not in arrays and hidden_name not in arrays:
             continue
-        picture = np.zeros((len(physics), rows, size, size, 3), np.uint8)
+        picture, without_goal = np.zeros((len(physics), rows, size, size, 3), np.uint8), []
+        hides, seen, spans = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays), np.zeros(0, int), []
+        if hides:
+            seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
+            seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
         for first in range(0, total, PAINT_FRAMES):
-            e, r = episode[first : first + PAINT_FRAMES], row[first : first + PAINT_FRAMES]
-            picture[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view])[:, 0]
-            tick(len(e))
+            frames = np.arange(first, min(first + PAINT_FRAMES, total))
+            twice = np.isin(frames, seen)
+            for both, some in ((False, frames[~twice]), (True, frames[twice])):
+                if len(some):
+                    e, r = episode[some], row[some]
+                    paint_them = renderer.render_pair if both else renderer.render
+                    painted = paint_them(physics[e, r], exogenous[e, r], views=[view])
+                    picture[e, r] = (painted[0] if both else painted)[:, 0]
+                    without_goal += [(e, r, painted[1][:, 0])] if both else []
+            tick(len(frames))
         if arrays is None or name in arrays:
             yield name, picture
-        if not task.goal_geoms or not (arrays is None or hidden_name in arrays):
+        if not hides:
             continue
-        seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
-        seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
         shown = [picture[e, rows[0]].copy() for e, rows in spans]
         hidden = picture
-        for first in range(0, len(seen), PAINT_FRAMES):
-            e, r = episode[seen[first : first + PAINT_FRAMES]], row[seen[first : first + PAINT_FRAMES]]
-            hidden[e, r] = renderer.render(physics[e, r], exogenous[e, r], views=[view], hide_goal=True)[:, 0]
+        for e, r, frames in without_goal:
+            hidden[e, r] = frames
         for (one, rows_of), before in zip(spans, shown, strict=True):
             behind = hidden[one, rows_of[0]]
             covered = (behind != before).any(axis=-1, keepdims=True)

@@ -72,16 +72,30 @@ class NativeRenderer(Renderer):
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> np.ndarray:
+        return self._paint(physics, exogenous, views, not hide_goal, hide_goal)[int(hide_goal)]
+
+    def render_pair(
+        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Renderer`; the second ones are painted again only where the goal is."""
+        return self._paint(physics, exogenous, views, True, True)
+
+    def _paint(
+        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None, shown: bool, hidden: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Frames with and without the goal; none where they are not asked for."""
         indices = check_frames(self.task, physics, exogenous, views)
-        out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
+        shape = (len(indices), self.size, self.size, 3)
+        out = [np.empty((len(physics) * asked, *shape), np.uint8) for asked in (shown, hidden)]
         for rows, poses in self._parts(physics, exogenous):
-            picture = np.empty((len(rows), self.size, self.size, 3), np.uint8)
+            pictures = [np.empty((len(rows) * asked, *shape[1:]), np.uint8) for asked in (shown, hidden)]
             for column, view in enumerate(indices):
                 frames, still = self._frames(poses, exogenous[rows], view), self._still(view)
-                shown, hidden = (picture[:0], picture) if hide_goal else (picture, picture[:0])
-                call(painter, *still, *frames, *self._work, self._stays, shown, hidden)
-                out[rows, column] = picture
-        return out
+                call(painter, *still, *frames, *self._work, self._stays, *pictures)
+                for whole, part in zip(out, pictures, strict=True):
+                    if len(part):
+                        whole[rows, column] = part
+        return out[0], out[1]
 
     def render_labels(
         self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
