@@ -37,7 +37,7 @@ GUIDE = "ant-maze-empty7x7"
 """The task whose bundled expert walks where --init-from names none."""
 
 
-EVALUATION_STEPS = 20.0
+EVALUATION_STEPS = 40.0
 """Agent steps simulated in evaluations for each one trained, at most: runs take minutes, and medium is picked from
 checkpoints a few hundred steps apart."""
 
@@ -102,6 +102,9 @@ class GuidedRun(Run):
 
     def evaluation_steps(self) -> float:
         return EVALUATION_STEPS
+
+    def most_evaluation_episodes(self) -> int:
+        return 3 * super().most_evaluation_episodes()
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
         settings, config = self.settings, self.config

@@ -55,7 +55,7 @@ not in seconds, so that a run gives the same bits however busy its machine is.""
 DENSE_SHARE = 0.2
 """Share of the way from the paper's medium return to its expert's below which evaluations are dense: medium and mixed
 are picked from there."""
-RISEN = 3
+RISEN = 5
 """Evaluations whose median must be above that."""
 SAVE_SECONDS = 240
 """Seconds after which the next evaluation also saves the state to resume from."""
@@ -193,6 +193,10 @@ class Run(abc.ABC):
         """Agent steps simulated in evaluations for each one trained, at most."""
         return EVALUATION_STEPS[self.task.family]
 
+    def most_evaluation_episodes(self) -> int:
+        """Episodes of an evaluation along the way, at most."""
+        return EVALUATION_EPISODES
+
     def problem(self) -> str | None:
         """Why a run with these settings would come to nothing, and the cure; None where nothing is wrong."""
         return None
@@ -258,7 +262,7 @@ class Run(abc.ABC):
         """Episodes of the evaluation after the steps trained since the one before, so that all keep to their share."""
         since = self.step - max((step for step in self._log.curve if step < self.step), default=0)
         affordable = self.evaluation_steps() * since / self.task.max_steps
-        return int(np.clip(affordable, 1, EVALUATION_EPISODES))
+        return int(np.clip(affordable, 1, self.most_evaluation_episodes()))
 
     def next_evaluation(self, evaluation: Evaluation, planned: int) -> int:
         """The agent step of the evaluation after this one: the planned one, where the run ended before it."""
