@@ -18,7 +18,7 @@ from PIL import Image
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering import make_renderer
-from dmcvb_gen.rendering.native.textures import background_levels
+from dmcvb_gen.rendering.native.textures import background_texels, levels, packed
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from tests.test_rendering import frames_of, needs_opengl, renderer_of
 
@@ -134,12 +134,14 @@ def test_a_style_changes_a_maze():
 def test_a_background_on_the_sky_is_what_pillow_makes_of_it(shape):
     picture = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
     image = Image.fromarray(picture).resize((800, 800), Image.Resampling.BILINEAR)
-    found = dict(background_levels(picture, 1))
-    for level in range(1, 6):
-        image = image.reduce(2)
-        texels = found[level].view(np.uint8).reshape(image.height, image.width, 4)
+    found = background_texels(picture, {}).copy()
+    assert len(found) == sum(side * side for side in (800, 400, 200, 100, 50, 25, 12, 6, 3, 1))
+    for side in (800, 400, 200, 100, 50, 25):
+        level, found = found[: side * side], found[side * side :]
+        texels = level.view(np.uint8).reshape(side, side, 4)
         np.testing.assert_array_equal(texels[..., :3], np.asarray(image))
-    assert list(found) == list(range(1, 10)) and len(found[9]) == 1
+        last, image = np.asarray(image), image.reduce(2)
+    np.testing.assert_array_equal(found, np.concatenate([packed(level) for level in levels(last)[1:]]))
 
 
 def test_what_it_does_not_paint_is_refused():

@@ -47,7 +47,7 @@ def _out_default(name: str) -> str:
 @click.option("--range", "episode_range", metavar="A:B", help="Only the shards that hold episodes A to B - 1.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
-@click.option("--renderer", default="native", show_default=True, help="native, warp or opengl.")
+@click.option("--renderer", default="native", help="native, warp or opengl.  [default: native; --device cuda: warp]")
 @click.option(
     "--samples",
     type=click.IntRange(1, 8),
@@ -99,6 +99,8 @@ def rollout(
 
     if sum((init, bool(part), finishing)) > 1:
         raise click.UsageError("Give one of --init, --part and --finish.")
+    by_warp = device != "cpu" and not options["recipe"] and not _is_given(context, "renderer")
+    options["renderer"] = "warp" if by_warp else options["renderer"]
     chosen = _recipe(context, options, going_on=bool(out))
     if options["slurm_script"]:
         return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
@@ -107,6 +109,8 @@ def rollout(
     if finishing:
         return _finish(site, finish_site, as_json)
     plan = make_plan(chosen, site, only, device, parse_range(episode_range), part or (1, 1), not no_pixels)
+    if by_warp and chosen:
+        click.echo(f"warp paints, as native does not on {device}", err=True)
     if dry_run:
         return _show_plan(plan, estimate(plan), workers, as_json)
     shared = init or bool(part)

@@ -38,7 +38,9 @@ class NativeRenderer(Renderer):
     ):
         check_size(size)
         if device != "cpu":
-            raise RenderingError(f"renderer 'native' paints on the CPU, not on {device!r}; use --device cpu or warp")
+            raise RenderingError(
+                f"renderer 'native' paints on the CPU, not on {device!r}; use --device cpu or --renderer warp"
+            )
         if samples not in (None, SAMPLES):
             raise RenderingError(f"renderer 'native' takes {SAMPLES} samples a pixel, not {samples}; give none")
         self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)

@@ -10,7 +10,7 @@ from numba import njit
 
 from dmcvb_gen.rendering.native.lanes import distinct, get, leaf, part, put
 
-i4 = np.int32
+f4, i4 = np.float32, np.int32
 BITS = 22
 """Of Pillow's weights below the point."""
 
@@ -79,10 +79,37 @@ def halve(texels, side, out):
             put(out, to + x, i4(((sides >> 2) & apart) | ((middle >> 2) << 8)))
 
 
-def sky_maker(version: int):
-    """What makes (rows, columns, 3) uint8 the texels of `side` * `side`, of its half, and so on, one after the other.
+@part
+def shrink(texels, side, out):
+    """(side * side) texels of an odd side made (side // 2)^2, each the blend of the four around its center."""
+    less = side // 2
+    for row in range(less):
+        y = (row + 0.5) * side / less - 0.5
+        top = int(np.floor(y))
+        down = f4(y - top)
+        for column in range(less):
+            x = (column + 0.5) * side / less - 0.5
+            left = int(np.floor(x))
+            across, color = f4(x - left), i4(0)
+            for shift in range(0, 24, 8):
+                a, b = channel(texels, side * top + left, shift), channel(texels, side * top + left + 1, shift)
+                at = side * (top + 1) + left
+                c, d = channel(texels, at, shift), channel(texels, at + 1, shift)
+                near, far = a * (f4(1) - down) + c * down, b * (f4(1) - down) + d * down
+                value = np.floor(near * (f4(1) - across) + far * across + f4(0.5))
+                color |= i4(i4(value) << shift)
+            out[less * row + column] = color
 
-    As many halves as there are even sides; see `frame.painter`.
+
+@leaf
+def channel(texels, at, shift):
+    """A channel of a texel, as a float."""
+    return f4(i4((texels[at] >> shift) & 255))
+
+
+def sky_maker(version: int):
+    """What makes (rows, columns, 3) uint8 the texels of `side` * `side`, and of all smaller levels, one after the
+    other; see `frame.painter`.
     """
 
     @njit(nogil=True, error_model="numpy", cache=True)
@@ -96,8 +123,11 @@ def sky_maker(version: int):
             widen(narrow, across, across_weight, rows, columns, side, tall)
             heighten(tall, down, down_weight, side, side, out)
             at = 0
-            while side % 2 == 0:
-                halve(out[at : at + side * side], side // 2, out[at + side * side :])
+            while side > 1:
+                if side % 2 == 0:
+                    halve(out[at : at + side * side], side // 2, out[at + side * side :])
+                else:
+                    shrink(out[at : at + side * side], side, out[at + side * side :])
                 at, side = at + side * side, side // 2
 
     return make

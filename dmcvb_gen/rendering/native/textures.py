@@ -7,7 +7,6 @@ bilinear sample of the level before. Textures in sRGB are kept in linear light, 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -81,31 +80,25 @@ def packed(picture: np.ndarray) -> np.ndarray:
     return np.concatenate([picture, np.zeros_like(picture[..., :1])], axis=2).view("<i4").ravel()
 
 
-def background_levels(picture: np.ndarray, finest: int) -> Iterator[tuple[int, np.ndarray]]:
-    """(h, w, 3) uint8 -> number and (texel,) int32 of the levels from `finest` on of a background on the sky.
+def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.ndarray:
+    """(h, w, 3) uint8 -> (texel,) int32, all levels of a background on the sky, one after the other.
 
     They are `levels` of the picture that Pillow's bilinear filter makes SKY_WIDTH wide and high.
+
+    Args:
+      room: memory that is kept for the next call; the texels are in it.
     """
-    if max(picture.shape[:2]) > SKY_WIDTH or min(picture.shape[:2]) < 2:
-        image = Image.fromarray(picture).resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR)
-        texels = [packed(level) for level in levels(np.asarray(image))]
-    else:
-        texels = _sky_levels(picture)
-    yield from list(enumerate(texels))[finest:]
-
-
-def _sky_levels(picture: np.ndarray) -> list[np.ndarray]:
-    """All levels of a sky, from a picture that is no larger."""
     rows, columns = picture.shape[:2]
-    sides = [width for width, _ in level_sizes(SKY_WIDTH, SKY_WIDTH)]
-    even = 1 + next(i for i, side in enumerate(sides) if side % 2)  # made by halving
-    out = np.empty(sum(side * side for side in sides[:even]), np.int32)
-    narrow, tall = np.empty(rows * columns, np.int32), np.empty(rows * SKY_WIDTH, np.int32)
+    if max(rows, columns) > SKY_WIDTH or min(rows, columns) < 2:
+        image = Image.fromarray(picture).resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR)
+        return np.concatenate([packed(level) for level in levels(np.asarray(image))])
+    if "all" not in room:
+        total = sum(width * height for width, height in level_sizes(SKY_WIDTH, SKY_WIDTH))
+        sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}
+        room.update({name: np.empty(size, np.int32) for name, size in sizes.items()})
     across, down = skies.taps(columns, SKY_WIDTH), skies.taps(rows, SKY_WIDTH)
-    call(skies.sky_maker, np.ascontiguousarray(picture), *across, *down, narrow, tall, out)
-    texels = np.split(out, np.cumsum([side * side for side in sides[:even]])[:-1])
-    last = texels[-1].view(np.uint8).reshape(sides[even - 1], sides[even - 1], 4)[..., :3]
-    return texels + [packed(level) for level in levels(last)[1:]]
+    call(skies.sky_maker, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], room["all"])
+    return room["all"]
 
 
 class Textures:
@@ -125,6 +118,7 @@ class Textures:
     def __init__(self, model: mujoco.MjModel, backgrounds, finest: int):
         self._model, self._backgrounds, self._finest = model, backgrounds, finest
         self._ready: set[int] = set()
+        self._room: dict[str, np.ndarray] = {}
         self._slot: OrderedDict[tuple[int, int], int] = OrderedDict()
         cubes = model.tex_type != mujoco.mjtTexture.mjTEXTURE_2D
         textures = [
@@ -168,8 +162,9 @@ class Textures:
                 raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
             full = len(self._slot) >= self.slots
             texture = self._slot.popitem(last=False)[1] if full else self._model.ntex + len(self._slot)
-            for level, smaller in background_levels(self._backgrounds.frames(video)[frame], self._finest):
-                self._put(texture, level, smaller)
+            texels = background_texels(self._backgrounds.frames(video)[frame], self._room)
+            finer = sum(width * height for width, height in level_sizes(SKY_WIDTH, SKY_WIDTH)[: self._finest])
+            self._put(texture, self._finest, texels[finer:])
             self._slot[key] = texture
         self._slot.move_to_end(key)
         return self._slot[key]
