@@ -24,6 +24,8 @@ from dmcvb_gen.names import ANT_MAZE, distractor_of
 from dmcvb_gen.readers.painted import Painting, painted_release
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
+from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
+from dmcvb_gen.release.statistics import level_statistics, states_json
 from dmcvb_gen.rollout.info import describe_release
 from dmcvb_gen.rollout.preview import contact_sheet
 from dmcvb_gen.store import Release, open_release
@@ -34,6 +36,7 @@ from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
 PLOT, SHEET = f"{CARD_FOLDER}/returns.png", f"{CARD_FOLDER}/contact_sheet.png"
+STATES = f"{CARD_FOLDER}/states.json"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Hugging Face's size categories; a row is a step."""
 CITATION = """@inproceedings{ortiz2024dmcvb,
@@ -102,7 +105,7 @@ def check_card(root: str | Path) -> list[str]:
     if problem:
         findings.append(f"{TABLE} {problem}")
     texts = {} if problem else _texts(release, table, _told(release.path, release.manifest))
-    for name in (README, CROISSANT):
+    for name in (README, CROISSANT, STATES):
         path = release.path / name
         if not path.is_file():
             findings.append(f"{name} is missing")
@@ -148,7 +151,7 @@ def _texts(release: Release, table: Path, published: Publication) -> dict[str, s
     limits = _limits(release)
     metadata = croissant(release, facts, summary, CITATION, limits, table, published)
     text = card_text(release, facts, summary, limits, header_facts(table))
-    return {README: text, CROISSANT: json.dumps(metadata, indent=1) + "\n"}
+    return {README: text, CROISSANT: json.dumps(metadata, indent=1) + "\n", STATES: states_json(release)}
 
 
 def _sheet(release: Release) -> np.ndarray:
@@ -202,6 +205,7 @@ def card_text(
     lines += [f"![First episode of every subset]({SHEET})", "", "## Composition", "", *_composition(facts), ""]
     lines += ["## Arrays", "", *_arrays(release), ""]
     lines += ["## Returns", "", *_returns(facts), ""]
+    lines += ["## Levels and states", "", *_levels(release), ""]
     lines += ["## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
     lines += ["## Known limits", "", *(f"- {limit}" for limit in limits), ""]
     lines += ["## Load it", "", *_loading(manifest, first.name), ""]
@@ -265,6 +269,27 @@ def _returns(facts: dict[str, Any]) -> list[str]:
             rows.append(("DMC-VB paper", *(f"{subset['paper'][key]:.1f}" for key in STATISTICS)))
     text = "Episode returns, with those of the DMC-VB paper's data where it has the same task and level."
     return [text, "", f"![Returns]({PLOT})", "", *_table(("subset", *STATISTICS), rows)]
+
+
+def _levels(release: Release) -> list[str]:
+    """How the policies of each level move."""
+    rows = [
+        (
+            f"`{level.task}/{level.level}`",
+            level.episodes,
+            f"{level.speed:.2f}",
+            "" if level.height is None else f"{level.height:.2f}",
+            "" if level.success is None else f"{level.success:.0%}",
+        )
+        for level in level_statistics(release)
+    ]
+    table = _table(("level", "episodes", "speed, m/s", "height, m", "at the goal"), rows)
+    told = f"Mean and standard deviation of every number of the states are in `{STATES}`; both over the first "
+    return [
+        *table,
+        "",
+        f"{told}{STATISTICS_EPISODES} episodes of a level. Heights are of the body, humanoid's of the head.",
+    ]
 
 
 def _loading(manifest: Manifest, name: str) -> list[str]:

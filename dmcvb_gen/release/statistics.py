@@ -1,0 +1,135 @@
+"""What a release's numbers are like: a release in; mean and spread of every state number, how levels move, out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dmcvb_gen.store import Release, Subset
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.tasks.base import Task
+
+EPISODES = 20
+"""First episodes of a task and level that are looked at: states take no more of the memory, however large a release."""
+HEIGHTS = ("height", "head_height", "body_height")
+"""State fields that say how high a body is, where a task has one."""
+
+
+@dataclass(frozen=True)
+class StateStatistics:
+    """Every number of a task's state, over all levels.
+
+    Attributes:
+      steps: observations they are taken over.
+      mean, std: (state,) float64.
+      fields: field -> its place in them.
+    """
+
+    task: str
+    steps: int
+    mean: np.ndarray
+    std: np.ndarray
+    fields: dict[str, slice]
+
+
+@dataclass(frozen=True)
+class LevelStatistics:
+    """How the policies of a level move.
+
+    Attributes:
+      speed: mean horizontal speed of the root, m/s.
+      height: mean height of body or head, meters; None where the state has none.
+      success: share of episodes that reached their goal; None for tasks without one.
+    """
+
+    task: str
+    level: str
+    episodes: int
+    speed: float
+    height: float | None
+    success: float | None
+
+
+def _trajectories(release: Release) -> dict[tuple[str, str], Subset]:
+    """(task, level) -> the first subset with episodes of it; settings share trajectories or resemble each other."""
+    found: dict[tuple[str, str], Subset] = {}
+    for subset in release.subsets.values():
+        if len(subset.episodes):
+            found.setdefault((subset.task, subset.level), subset)
+    return found
+
+
+def _episodes(subset: Subset, name: str) -> Iterable[np.ndarray]:
+    """Observations of an array, episode by episode, the last one included: (length + 1, ...)."""
+    for place, episode in enumerate(subset.episodes[:EPISODES]):
+        yield subset.episode(int(episode), [name])[name][: int(subset.lengths[place]) + 1]
+
+
+def state_statistics(release: Release) -> list[StateStatistics]:
+    """Of every task of a release, in its order."""
+    tasks: dict[str, list[np.ndarray]] = {}
+    for (task, _), subset in _trajectories(release).items():
+        tasks.setdefault(task, []).extend(np.asarray(rows, np.float64) for rows in _episodes(subset, "state"))
+    out = []
+    for name, episodes in tasks.items():
+        states = np.concatenate(episodes)
+        out.append(StateStatistics(name, len(states), states.mean(0), states.std(0), get_task(name).state_slices))
+    return out
+
+
+def states_json(release: Release) -> str:
+    """`state_statistics` as a file: task -> steps, and mean and std of each field's numbers."""
+    tasks = {
+        states.task: {
+            "steps": states.steps,
+            "fields": {
+                field: {"mean": _rounded(states.mean[place]), "std": _rounded(states.std[place])}
+                for field, place in states.fields.items()
+            },
+        }
+        for states in state_statistics(release)
+    }
+    return json.dumps(tasks, indent=1) + "\n"
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    """To five digits: the order of a sum may differ between machines, and shows behind them."""
+    return [float(f"{value:.5g}") for value in values]
+
+
+def level_statistics(release: Release) -> list[LevelStatistics]:
+    """Of every task and level of a release, in its order."""
+    out = []
+    for (name, level), subset in _trajectories(release).items():
+        task = get_task(name)
+        field = next((task.state_slices[height] for height in HEIGHTS if height in task.state_slices), None)
+        height = None
+        if field is not None:
+            height = float(np.concatenate([rows[:, field] for rows in _episodes(subset, "state")]).mean())
+        success = float(subset.read("terminated")[:EPISODES].mean()) if task.goal_geoms else None
+        count = len(subset.episodes[:EPISODES])
+        out.append(LevelStatistics(name, level, count, _speed(task, subset), height, success))
+    return out
+
+
+def _speed(task: Task, subset: Subset) -> float:
+    """Mean horizontal speed of the root over all steps, m/s."""
+    columns = 1 + _root_columns(task.model)  # time comes first
+    seconds = ACTION_REPEAT * task.control_timestep
+    moved = [np.diff(rows[:, columns], axis=0) for rows in _episodes(subset, "physics") if len(rows) > 1]
+    return float(np.sqrt((np.concatenate(moved) ** 2).sum(axis=1)).mean() / seconds)
+
+
+def _root_columns(model: mujoco.MjModel) -> np.ndarray:
+    """Where the root's horizontal position lies in qpos: x and y of a free joint, or the slide along x."""
+    for joint in range(model.njnt):
+        address = int(model.jnt_qposadr[joint])
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            return np.array([address, address + 1])
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and model.jnt_axis[joint][0]:
+            return np.array([address])
+    raise ValueError("the model has no root that moves")
