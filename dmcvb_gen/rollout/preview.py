@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.extras import installed
@@ -79,6 +79,13 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
     return np.stack(out)
 
 
+def _fitting(name: str, width: int) -> str:
+    """As many of a subset's names, from the last on, as a caption of so many pixels has room for."""
+    parts = name.split("/")
+    endings = ["/".join(parts[first:]) for first in range(len(parts))]
+    return next((text for text in endings if ImageFont.load_default().getlength(text) <= width), parts[-1])
+
+
 def _has_map(subset: Subset) -> bool:
     return subset.record.family == ANT_MAZE and "top" in shown(subset).views
 
@@ -114,19 +121,21 @@ def contact_sheet(
     return np.concatenate(strips)
 
 
-def video_frames(subsets: Sequence[Subset], scale: int = 2, frames: int = VIDEO_FRAMES) -> np.ndarray:
-    """The first episode of every subset side by side; (frame, height, width, 3) uint8."""
+def video_frames(
+    subsets: Sequence[Subset], scale: int = 2, frames: int = VIDEO_FRAMES, episode: int | None = None
+) -> np.ndarray:
+    """An episode of every subset side by side, the first by default; (frame, height, width, 3) uint8."""
     columns = []
     for subset in subsets:
-        episode = int(subset.episodes[0])
-        values = subset.episode(episode, ["state", *shown(subset).arrays])
+        shown_one = int(subset.episodes[0]) if episode is None else episode
+        values = subset.episode(shown_one, ["state", *shown(subset).arrays])
         views = [values[name] for name in shown(subset).arrays]
         steps = np.minimum(np.arange(frames), len(views[0]) - 1)
         rows = [_enlarge(view[steps], scale) for view in views]
         if _has_map(subset):
             rows.append(_map(subset, values, steps, scale))
         picture = np.concatenate(rows, axis=1)
-        label = _label(subset.name, picture.shape[2])
+        label = _label(_fitting(subset.name, picture.shape[2]), picture.shape[2])
         columns.append(np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1))
     per_row = min(len(columns), int(np.ceil(np.sqrt(len(columns) * 1.5))))
     height = max(column.shape[1] for column in columns)
@@ -149,6 +158,7 @@ def write_preview(
     episodes: int = 4,
     scale: int = 2,
     frames: int = VIDEO_FRAMES,
+    episode: int | None = None,
     video: str | None = None,
 ) -> list[Path]:
     """Write contact_sheet.png and preview.mp4 (or .webp, .gif) of a release.
@@ -158,6 +168,7 @@ def write_preview(
       only: subset patterns.
       episodes: of each subset on the sheet.
       frames: of the video, 20 a second.
+      episode: that the video shows of each subset; the first by default.
       video: "mp4", "webp" or "gif"; by default mp4 where imageio-ffmpeg is installed, else webp.
 
     Returns:
@@ -181,14 +192,14 @@ def write_preview(
         sheet = folder / "contact_sheet.png"
         Image.fromarray(contact_sheet(subsets, episodes, scale=scale)).save(sheet)
         moving = folder / f"preview.{kind}"
-        (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames))
+        (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames, episode))
     return [sheet, moving]
 
 
 def _write_animation(path: Path, frames: np.ndarray) -> None:
     """(frame, height, width, 3) uint8 as a WebP or GIF."""
     first, *rest = [Image.fromarray(frame) for frame in frames]
-    options: dict[str, Any] = {"quality": 80, "method": 4} if path.suffix == ".webp" else {}
+    options: dict[str, Any] = {"quality": 60, "method": 5} if path.suffix == ".webp" else {}
     first.save(path, save_all=True, append_images=rest, duration=1000 // VIDEO_FPS, loop=0, **options)
 
 
