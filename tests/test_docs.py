@@ -29,8 +29,13 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
+    """Of a page, but for files that are shown whole: they have tests of their own."""
     text = page.read_text()
-    return [Block(found[1], found[2], text[: found.start()].count("\n") + 1) for found in BLOCK.finditer(text)]
+    return [
+        Block(found[1], found[2], text[: found.start()].count("\n") + 1)
+        for found in BLOCK.finditer(text)
+        if "--8<--" not in found[2]
+    ]
 
 
 @pytest.fixture
