@@ -22,10 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.pool import Ray
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.plan import finish, make_plan, prepare
-from dmcvb_gen.rollout.recipe import make_recipe
+from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe
 from dmcvb_gen.rollout.site import site_of
 from dmcvb_gen.store.remote import file_system
 
@@ -156,16 +157,36 @@ def simulate_schedule(
     return end / 3600, lost / seconds.sum()
 
 
+def planned_jobs(maze_steps: float) -> dict[str, list[float]]:
+    """Steps of each job of the whole release, all settings that share its episodes together.
+
+    Args:
+      maze_steps: mean length of a maze's episode.
+    """
+    recipe, steps = load_recipe("dmcvb-v1"), {"locomotion": [], "mazes": []}
+    shared: dict[tuple, int] = {}
+    for request in expand(recipe):
+        maze = family_of(request.task) == ANT_MAZE
+        key = (request.task, request.level, request.setting if maze else "", request.episodes)
+        shared[key] = shared.get(key, 0) + 1
+        if shared[key] > 1:
+            continue
+        length = maze_steps if maze else request.max_steps
+        settings = 1 if maze else sum(r.task == request.task and r.level == request.level for r in expand(recipe))
+        for first in range(0, request.episodes, request.episodes_per_shard):
+            episodes = min(request.episodes_per_shard, request.episodes - first)
+            steps["mazes" if maze else "locomotion"].append(episodes * length * settings)
+    return steps
+
+
 def schedule_table(options) -> None:
     """The whole release on 2, 64 and 1,000 cores, at measured rates."""
     rng = np.random.default_rng(0)
-    jobs = []
-    for task, shards, steps, rate in (
-        ("locomotion", 36 * 40, 50 * 500, options.locomotion_rate),
-        ("mazes", 28 * 400 + 7 * 5, 10 * 250, options.maze_rate),
-    ):
-        jobs.append(rng.normal(1, 0.15, shards).clip(0.5) * steps / rate)
-        print(f"{task}: {shards:,} jobs of {steps / rate:.0f} s, {jobs[-1].sum() / 3600:.0f} core-hours")
+    jobs, plan = [], planned_jobs(options.maze_steps)
+    for task, rate in (("locomotion", options.locomotion_rate), ("mazes", options.maze_rate)):
+        steps = np.array(plan[task])
+        jobs.append(rng.normal(1, 0.15, len(steps)).clip(0.5) * steps / rate)
+        print(f"{task}: {len(steps):,} jobs of {jobs[-1].mean():.0f} s, {jobs[-1].sum() / 3600:.0f} core-hours")
     seconds = np.concatenate(jobs)
     print(f"{'cores':>6} {'lost/h':>6} {'hours':>8} {'ideal':>8} {'work lost':>9}")
     for cores in (2, 64, 1000):
@@ -186,6 +207,7 @@ def main() -> None:
     parser.add_argument("--schedule", action="store_true", help="simulate the schedule only")
     parser.add_argument("--locomotion-rate", type=float, default=330.0, help="steps/s of a core and setting")
     parser.add_argument("--maze-rate", type=float, default=52.0)
+    parser.add_argument("--maze-steps", type=float, default=250.0, help="mean length of a maze's episode")
     parser.add_argument("--restart", type=float, default=120.0, help="seconds until a lost worker is back")
     options = parser.parse_args()
     if options.schedule:

@@ -24,7 +24,7 @@ from dmcvb_gen.rollout.progress import progress_of
 from dmcvb_gen.rollout.recipe import make_recipe
 from dmcvb_gen.rollout.site import FolderSite, Sender, site_of, stage_of
 from dmcvb_gen.store import open_release
-from tests.conftest import roll_out
+from tests.conftest import TINY_MAZE, roll_out
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
 MAZE = {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "hidden", "episodes": 4}
@@ -287,18 +287,20 @@ def test_a_ray_cluster_that_loses_a_node_and_gains_one_makes_the_same_release(wh
 
 
 @pytest.mark.slow
-def test_a_ray_cluster_verifies_exports_and_validates_as_one_process_does(whole, tmp_path):
+def test_a_ray_cluster_verifies_exports_and_validates_as_one_process_does(tmp_path):
     ray = pytest.importorskip("ray")
+    few = {"levels": "random", "episodes": 2}
+    roll_out(quick_recipe(WALKER | few | {"settings": "none"}, MAZE | few | {"tasks": TINY_MAZE}), tmp_path / "r")
     told = {}
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
     try:
         for name, how in {"ray": ["--executor", "ray"], "here": []}.items():
             exported = tmp_path / name / "npz"
             validated = ["--agents", "state-bc", "--profile", "smoke", "--train-unsound", "--threads", "1"]
             for command in (
-                ["verify", whole, "--json"],
-                ["export", whole, "--to", "npz", "--out", exported],
-                ["validate", whole, *validated, "--out", tmp_path / name / "report"],
+                ["verify", tmp_path / "r", "--json"],
+                ["export", tmp_path / "r", "--to", "npz", "--out", exported],
+                ["validate", tmp_path / "r", *validated, "--out", tmp_path / name / "report"],
             ):
                 result = CliRunner().invoke(main, [str(word) for word in [*command, *how]])
                 assert result.exit_code in (0, 1), result.output

@@ -25,11 +25,14 @@ from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import CLAIM, publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rollout.recipe import expand, load_recipe
 from dmcvb_gen.store import open_release, transfer
 from dmcvb_gen.store.index import INDEX
 from dmcvb_gen.store.manifest import commit_path
 from dmcvb_gen.store.remote import public, reason
+from dmcvb_gen.store.schema import EpisodeShape, array_specs
 from dmcvb_gen.store.writer import finish_release
+from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
 from tests.faults.proxy import Proxy
 
@@ -525,3 +528,21 @@ def test_a_grown_release_adds_to_its_repository(tmp_path):
     assert versions == ["1.0.0", "1.1.0"] and list(api.tags) == ["v1.0.0", "v1.1.0"]
     assert not any("none.zarr" in path for commit in api.commits[2:] for path in commit)
     assert api.files["manifest.json"] == (tmp_path / "r/manifest.json").read_bytes()
+
+
+def test_the_whole_release_has_fewer_files_than_the_hub_takes(small_release, small_mazes):
+    def files_of(name, shards, specs):
+        groups, commits = 2, 1
+        return len(specs) + groups + shards * (len(specs) + commits)
+
+    for folder in (small_release, small_mazes):  # counted as they are there
+        for name, subset in open_release(folder).subsets.items():
+            specs = array_specs(EpisodeShape.of(get_task(subset.task)), 64)
+            there = [*(folder / f"{name}.zarr").rglob("*"), *(folder / "commits" / name).rglob("*")]
+            count = sum(path.is_file() and path.name != ".created" for path in there)
+            assert count <= files_of(name, len(subset.commits), specs) <= count + 8 * len(subset.commits)
+    total = 0
+    for request in expand(load_recipe("dmcvb-v1")):
+        specs = array_specs(EpisodeShape.of(get_task(request.task)), 64)
+        total += files_of(request.name, -(-request.episodes // request.episodes_per_shard), specs)
+    assert 50_000 < total < 70_000
