@@ -5,7 +5,7 @@ What a rollout, a repaint, a check and a reader that paints on read have in comm
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -146,7 +146,8 @@ def paint(
         if arrays is not None and name not in arrays and hidden_name not in arrays:
             continue
         picture, without_goal = np.zeros((len(physics), rows, size, size, 3), np.uint8), []
-        hides, seen, spans = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays), np.zeros(0, int), []
+        hides, seen = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays), np.zeros(0, int)
+        spans: list = []
         if hides:
             seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
             seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
@@ -156,7 +157,7 @@ def paint(
             for both, some in ((False, frames[~twice]), (True, frames[twice])):
                 if len(some):
                     e, r = episode[some], row[some]
-                    paint_them = renderer.render_pair if both else renderer.render
+                    paint_them: Callable[..., Any] = renderer.render_pair if both else renderer.render
                     painted = paint_them(physics[e, r], exogenous[e, r], views=[view])
                     picture[e, r] = (painted[0] if both else painted)[:, 0]
                     without_goal += [(e, r, painted[1][:, 0])] if both else []

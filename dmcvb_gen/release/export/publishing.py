@@ -81,7 +81,9 @@ def _to_hub(folder: Path, kind: str, url: str, api: Any) -> None:
         from huggingface_hub import HfApi
     except ImportError:
         raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
-    repository, inside = parse_hub_url(url)
+    repository, inside, revision = parse_hub_url(url)
+    if revision:
+        raise StoreError(f"{url} names a revision; exports are published to hf://datasets/OWNER/NAME")
     if kind == "lerobot" and (inside or not (folder / LEROBOT_INFO).is_file()):
         raise StoreError(
             f"LeRobot finds one data set a repository: publish one folder with {LEROBOT_INFO} to "
