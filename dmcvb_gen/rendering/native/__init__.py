@@ -5,11 +5,13 @@ a pixel and surface, light computed at the floor's vertices, textures from the s
 
     lanes.py       how loops touch memory so that they become vector code
     scene.py       a task's model -> arrays of what can be seen, lights, materials by look
-    textures.py    pictures -> mip levels in one buffer; videos -> skies
+    textures.py    pictures -> mip levels in one buffer
+    skies.py       a video's frames -> mip levels of skies
     sampling.py    texture coordinates -> colors
     visibility.py  geoms in the camera's frame -> the nearest of each sample
     lighting.py    points and normals -> light, shadows
     frame.py       one frame from its poses
+    compiled.py    entry points, compiled once a machine
     renderer.py    the `Renderer`: batches, caches, hidden goals
 """
 
