@@ -20,7 +20,6 @@ from __future__ import annotations
 import abc
 import contextlib
 import dataclasses
-import fcntl
 import io
 import json
 import os
@@ -30,6 +29,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numpy as np
 import torch
 
@@ -328,14 +328,15 @@ class Run(abc.ABC):
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
         """One process a folder; the lock ends with the process, however that ends."""
-        with (self.folder / "resume" / "lock").open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise DmcvbError(
-                    f"another process trains in {self.folder}; wait for it, or choose another --out"
-                ) from None
+        lock = filelock.FileLock(self.folder / "resume" / "lock", timeout=0)
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            raise DmcvbError(f"another process trains in {self.folder}; wait for it, or choose another --out") from None
+        try:
             yield
+        finally:
+            lock.release()
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
