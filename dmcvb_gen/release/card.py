@@ -284,7 +284,7 @@ def _levels(release: Release) -> list[str]:
         for level in level_statistics(release)
     ]
     table = _table(("level", "episodes", "speed, m/s", "height, m", "at the goal"), rows)
-    told = f"Mean and standard deviation of every number of the states are in `{STATES}`; both over the first "
+    told = f"Mean and standard deviation of every number of the states are in `{STATES}`; both over up to "
     return [
         *table,
         "",
