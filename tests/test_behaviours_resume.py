@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import fcntl
+import io
 import json
 import resource
 import signal
@@ -21,6 +22,7 @@ from dmcvb_gen.behaviours.learning import runs
 from dmcvb_gen.behaviours.learning.run_log import COLUMNS, read_rows
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.sac import ReplayBuffer
+from dmcvb_gen.behaviours.learning.state_file import STATE, pack_state, read_state
 from dmcvb_gen.behaviours.learning.training import open_run
 from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
 from dmcvb_gen.errors import DmcvbError
@@ -163,7 +165,7 @@ def largest_file(size):
 @pytest.mark.parametrize("algorithm", ["sac", "ppo"])
 def test_a_disk_that_fills_up_while_saving_leaves_the_previous_state(tmp_path, algorithm):
     run = train(tmp_path / "run", algorithm=algorithm, steps=80)
-    path = tmp_path / "run" / "resume" / "state.pt"
+    path = tmp_path / "run" / "resume" / STATE
     before = path.read_bytes()
     checkpoints = sorted((tmp_path / "run" / "checkpoints").iterdir())
     with largest_file(len(before) - 1000), pytest.raises(DmcvbError, match="previous saved state is whole.*--resume"):
@@ -218,11 +220,30 @@ def test_two_processes_do_not_train_in_one_folder(tmp_path):
 def test_a_saved_state_that_holds_code_or_rubbish_is_refused(tmp_path):
     run = open_run(tmp_path / "run", config(), False)
     (tmp_path / "run" / "resume").mkdir()
-    path = tmp_path / "run" / "resume" / "state.pt"
-    for content in (print, "rubbish"):
-        torch.save(content, path) if callable(content) else path.write_text(content)
+    path = tmp_path / "run" / "resume" / STATE
+    whole = pack_state({"step": 0, "seconds": 0.0})
+    pickled = io.BytesIO()
+    torch.save(print, pickled)
+    for content in (pickled.getvalue(), b"rubbish", whole[:-3], whole.replace(b"dict", b"dice"), b""):
+        path.write_bytes(content)
         with pytest.raises(DmcvbError, match="cannot be read"):
             run.train()
+    path.rename(path.with_name("state.pt"))
+    with pytest.raises(DmcvbError, match="older dmcvb-gen"):  # not begun anew over what is there
+        run.train()
+
+
+def test_a_state_comes_back_as_it_was(tmp_path):
+    shared = torch.arange(6.0)
+    state = {"step": 3, "betas": (0.9, 0.999), "state": {0: {"exp": shared[::2]}, 1: {"exp": shared}}, "none": None}
+    state |= {"rng": torch.get_rng_state(), "full": True, "empty": torch.zeros(0, 2), "list": [1, {"a": "b"}], "d": {}}
+    (tmp_path / "resume").mkdir()
+    assert read_state(tmp_path) is None
+    (tmp_path / "resume" / STATE).write_bytes(pack_state(state))
+    back = read_state(tmp_path)
+    assert repr(back) == repr(state) and torch.equal(back["rng"], state["rng"])
+    with pytest.raises(TypeError, match="holds no"):
+        pack_state({"code": print})
 
 
 def test_csv_and_tensorboard_tell_the_same(tmp_path):

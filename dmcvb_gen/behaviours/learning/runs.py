@@ -20,9 +20,7 @@ from __future__ import annotations
 import abc
 import contextlib
 import dataclasses
-import io
 import json
-import os
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -36,6 +34,7 @@ import torch
 from dmcvb_gen.behaviours.learning.networks import as_arrays
 from dmcvb_gen.behaviours.learning.run_log import RunLog
 from dmcvb_gen.behaviours.learning.settings import check_settings
+from dmcvb_gen.behaviours.learning.state_file import STATE, pack_state, read_state
 from dmcvb_gen.behaviours.learning.thinning import superfluous
 from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.evaluation import evaluate
@@ -43,6 +42,7 @@ from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.behaviours.policies.policy_file import save_policy
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import write_bytes
 from dmcvb_gen.names import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.store.manifest import environment
 from dmcvb_gen.tasks import get_task
@@ -229,14 +229,7 @@ class Run(abc.ABC):
 
     def saved(self) -> dict[str, Any] | None:
         """The state to resume from (tensors, numbers and texts only), None where nothing is saved yet."""
-        path = self.folder / "resume" / "state.pt"
-        if not path.exists():
-            return None
-        try:
-            return torch.load(path, weights_only=True)
-        except Exception as error:  # torch raises many kinds for a file that is not its own
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise DmcvbError(f"{path} cannot be read ({reason}); start again with another --out") from None
+        return read_state(self.folder)
 
     # -- what algorithms use ----------------------------------------------------------------
 
@@ -279,18 +272,8 @@ class Run(abc.ABC):
 
     def save(self, state: dict[str, Any]) -> None:
         """Put the state to resume from in place of the previous one, whole or not at all."""
-        data = io.BytesIO()  # torch's own writer would abort the process where the disk is full
-        torch.save(state | {"step": self.step, "seconds": self.seconds}, data)
-        path = self.folder / "resume" / "state.pt"
-        temporary = path.with_suffix(".partial")
-        try:
-            with temporary.open("wb") as file:
-                file.write(data.getbuffer())
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        data = pack_state(state | {"step": self.step, "seconds": self.seconds})
+        write_bytes(self.folder / "resume" / STATE, data)
 
     # -- the folder -------------------------------------------------------------------------
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from dmcvb_gen.behaviours.learning.episodes import Episodes, shaping_of
 from dmcvb_gen.behaviours.learning.networks import as_tensors
@@ -31,6 +30,7 @@ from dmcvb_gen.behaviours.learning.runs import (
 )
 from dmcvb_gen.behaviours.learning.sac import ReplayBuffer, Sac
 from dmcvb_gen.behaviours.learning.settings import check_settings
+from dmcvb_gen.behaviours.learning.state_file import read_state
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.store.manifest import write_json_atomically
@@ -172,10 +172,11 @@ def _start_from(learner: Sac, source: str) -> None:
     """Take networks and normalization from another run, or the actor alone from a policy file."""
     path = Path(source)
     if path.is_dir():
-        saved, config = path / "resume" / "state.pt", read_config(path)
-        if not config or config.algorithm != "sac" or not saved.exists():
+        config = read_config(path)
+        saved = read_state(path) if config and config.algorithm == "sac" else None
+        if not saved:
             raise DmcvbError(f"--init-from {source}: no run of sac is saved there; give its folder or a policy file")
-        _fit(f"--init-from {source}", learner.load_networks, torch.load(saved, weights_only=True)["learner"])
+        _fit(f"--init-from {source}", learner.load_networks, saved["learner"])
         return
     _fit(f"--init-from {source}", learner.actor.load_state_dict, as_tensors(load_policy(path).weights))
     learner.norm.mean = learner.actor.observation_mean.numpy().astype(float)

@@ -18,7 +18,7 @@ from safetensors.numpy import save as dump_safetensors
 from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.behaviours.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
 from dmcvb_gen.errors import PolicyFileError
-from dmcvb_gen.files import parse_json
+from dmcvb_gen.files import parse_json, write_bytes
 from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -32,14 +32,7 @@ def save_policy(path: str | Path, header: PolicyHeader, weights: Mapping[str, np
     """
     tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     data = dump_safetensors(tensors, metadata={"header": header.model_dump_json()})
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, data)
 
 
 def read_header(path: str | Path) -> PolicyHeader:

@@ -1,0 +1,78 @@
+"""Files that runs go on from: nested tensors, numbers and texts in, a safetensors file out, and back.
+
+A run's folder may come from somebody else (`--init-from`, `--resume`), so its state is read as data: tensors by number,
+and a JSON tree that says where each belongs. Nothing in such a file can run.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+
+from dmcvb_gen.errors import DmcvbError
+
+STATE = "state.safetensors"
+"""The file's name in a run's `resume` folder."""
+OLD_STATE = "state.pt"
+"""What versions up to 0.1 wrote."""
+
+
+def pack_state(state: Any) -> bytes:
+    """A tree of dicts, lists, tuples, tensors, numbers, texts and None as a file's bytes.
+
+    Raises:
+      TypeError: anything else is in it.
+    """
+    tensors: dict[str, torch.Tensor] = {}
+
+    def tree(value: Any) -> Any:
+        if isinstance(value, torch.Tensor):
+            name = str(len(tensors))
+            tensors[name] = value.detach().cpu().contiguous().clone()  # a file's tensors share no memory
+            return {"tensor": name}
+        if isinstance(value, dict):
+            return {"dict": [[key, tree(inner)] for key, inner in value.items()]}
+        if isinstance(value, (list, tuple)):
+            return {type(value).__name__: [tree(inner) for inner in value]}
+        if value is None or isinstance(value, (bool, int, float, str)):
+            return value
+        raise TypeError(f"a saved state holds no {type(value).__name__}")
+
+    return safetensors.torch.save(tensors, metadata={"state": json.dumps(tree(state))})
+
+
+def read_state(folder: str | Path) -> dict[str, Any] | None:
+    """What a run saved in its folder, `pack_state` undone; None where it has saved nothing yet.
+
+    Raises:
+      DmcvbError: the file is damaged, or an older version's.
+    """
+    path = Path(folder) / "resume" / STATE
+    if not path.exists():
+        old = path.with_name(OLD_STATE)
+        if old.exists():
+            raise DmcvbError(f"{old} is of an older dmcvb-gen and is not read; give a policy file, or start again")
+        return None
+    try:
+        with safe_open(path, framework="pt") as file:
+            return _value(json.loads((file.metadata() or {})["state"]), file)
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DmcvbError(f"{path} cannot be read ({reason}); start again with another --out") from None
+
+
+def _value(tree: Any, file: Any) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    [(kind, content)] = tree.items()
+    if kind == "tensor":
+        return file.get_tensor(content)
+    if kind == "dict":
+        return {key: _value(inner, file) for key, inner in content}
+    values = [_value(inner, file) for inner in content]
+    return {"list": list, "tuple": tuple}[kind](values)
