@@ -25,14 +25,12 @@ stage() { # NAME COMMAND...: runs it, one line before and after
 }
 
 tenth() { # every tenth subset, begun at a random one, made again
-  local only name
-  mapfile -t only < <(dmcvb-gen info "$out" --json | TENTH="${TENTH:-0}" python -c '
+  local name patterns=()
+  while read -r name; do patterns+=(--only "$name"); done < <(dmcvb-gen info "$out" --json | TENTH="${TENTH:-0}" python -c '
 import json, os, random, sys
 names = sorted(subset["name"] for subset in json.load(sys.stdin)["subsets"])
 for name in random.Random(int(os.environ["TENTH"])).sample(names, -(-len(names) // 10)):
     print(name)')
-  local patterns=()
-  for name in "${only[@]}"; do patterns+=(--only "$name"); done
   dmcvb-gen regenerate "$out" --check --workers "$workers" "${patterns[@]}"
 }
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import functools
 import queue
 import shutil
 import threading
@@ -167,12 +168,15 @@ class Source:
             raise StoreError(f"{place}: {MANIFEST} does not have the digest that {INDEX} says; publish it again")
         return cls(url, filesystem, base, place, text, listing, manifest, index)
 
+    @functools.cached_property
+    def _by_path(self) -> dict[str, FileRecord]:
+        return {file.path: file for file in self.index.files}
+
     def listed(self, path: str) -> FileRecord:
         """What the index says of a file."""
-        for file in self.index.files:
-            if file.path == path:
-                return file
-        raise StoreError(f"{self.place}/{INDEX} does not list {path}; publish the release again")
+        if path not in self._by_path:
+            raise StoreError(f"{self.place}/{INDEX} does not list {path}; publish the release again")
+        return self._by_path[path]
 
     def metadata(self, records: Iterable[SubsetRecord]) -> list[FileRecord]:
         """Zarr metadata and policies of subsets, and the card: what comes whole with any part of the release.

@@ -13,6 +13,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
@@ -53,6 +54,31 @@ def tag_of(manifest: Manifest, folder: str) -> str:
     return "-".join([*folder.split("/")[:-1], f"v{manifest.version}"])
 
 
+def new_api() -> Any:
+    """A `huggingface_hub.HfApi` with the environment's token.
+
+    Raises:
+      StoreError: the package is missing.
+    """
+    try:
+        from huggingface_hub import HfApi
+    except ImportError:
+        raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
+    return HfApi()
+
+
+def newest_of(url: str) -> tuple[str, str]:
+    """Repository and folder of a URL that is published to.
+
+    Raises:
+      StoreError: it names a revision.
+    """
+    repository, folder, revision = parse_hub_url(url)
+    if revision:
+        raise StoreError(f"{url} names a revision, and what is published is the newest; leave @{revision} away")
+    return repository, folder
+
+
 def publish_to_hub(
     root: Path, manifest: Manifest, index: Index, url: str, tick: Callable[[int], None] = lambda count: None, api=None
 ) -> int:
@@ -66,16 +92,12 @@ def publish_to_hub(
       StoreError: the package is missing, another version is there (and not one that this has grown from), access is
         refused, or the Hub cannot be reached.
     """
-    try:
-        from huggingface_hub import CommitOperationAdd, HfApi
-    except ImportError:
-        raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
-    repository, folder, revision = parse_hub_url(url)
-    if revision:
-        raise StoreError(f"{url} names a revision, and releases are published to the newest; leave @{revision} away")
-    api, where = api or HfApi(), dict(repo_id=repository, repo_type="dataset")
+    repository, folder = newest_of(url)
+    api, where = api or new_api(), dict(repo_id=repository, repo_type="dataset")
+    from huggingface_hub import CommitOperationAdd
+
     version = f"{manifest.name} {manifest.version}"
-    with _client_errors(url):
+    with client_errors(url):
         api.create_repo(**where, exist_ok=True)
         head = api.repo_info(**where).sha
         there = _blobs(api, where, [folder + file.path for file in index.files] + [folder + MANIFEST])
@@ -102,7 +124,7 @@ def publish_to_hub(
 
 
 @contextlib.contextmanager
-def _client_errors(url: str, doing: str = "publish to") -> Iterator[None]:
+def client_errors(url: str, doing: str = "publish to") -> Iterator[None]:
     """What the Hub's client raises (many kinds) as one line with a cure."""
     try:
         yield
@@ -163,7 +185,7 @@ def snapshot(url: str, out: Path, wanted: Sequence[FileRecord], shards: Sequence
     stage = out / f".hub{PARTIAL}"
     places = {f"{folder}{subset_path(name)}/*/c/{shard}" for name, shard in shards}
     patterns = sorted(places | {f"{place}/*" for place in places})
-    with _client_errors(url, "fetch from"):
+    with client_errors(url, "fetch from"):
         huggingface_hub.snapshot_download(
             repository, repo_type="dataset", revision=revision, allow_patterns=patterns, local_dir=stage
         )

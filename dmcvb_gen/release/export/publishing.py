@@ -11,10 +11,10 @@ from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.pool import ignore
 from dmcvb_gen.release.export import FORMATS
-from dmcvb_gen.release.hub import parse_hub_url
+from dmcvb_gen.release.hub import client_errors, new_api, newest_of
 from dmcvb_gen.release.publish import Moved
 from dmcvb_gen.store.manifest import FileRecord
-from dmcvb_gen.store.remote import file_system, is_refusal, public, reason, refused
+from dmcvb_gen.store.remote import file_system, public
 from dmcvb_gen.store.transfer import in_parallel, upload
 
 LEROBOT_INFO = "meta/info.json"
@@ -77,31 +77,19 @@ def _record(path: Path, folder: Path) -> FileRecord:
 
 def _to_hub(folder: Path, kind: str, url: str, api: Any) -> None:
     """One commit of all files into a data set repository; LeRobot's loader then looks for a tag of its version."""
-    try:
-        from huggingface_hub import HfApi
-    except ImportError:
-        raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
-    repository, inside, revision = parse_hub_url(url)
-    if revision:
-        raise StoreError(f"{url} names a revision; exports are published to hf://datasets/OWNER/NAME")
+    repository, inside = newest_of(url)
     if kind == "lerobot" and (inside or not (folder / LEROBOT_INFO).is_file()):
         raise StoreError(
             f"LeRobot finds one data set a repository: publish one folder with {LEROBOT_INFO} to "
             "hf://datasets/OWNER/NAME, or export the subsets as one data set with --merge"
         )
-    api = api or HfApi()
-    try:
-        api.create_repo(repo_id=repository, repo_type="dataset", exist_ok=True)
+    api, where = api or new_api(), dict(repo_id=repository, repo_type="dataset")
+    with client_errors(url):
+        api.create_repo(**where, exist_ok=True)
         message = f"{folder.name}: exported to {kind} by dmcvb-gen"
-        api.upload_folder(
-            repo_id=repository, repo_type="dataset", folder_path=folder, path_in_repo=inside, commit_message=message
-        )
+        api.upload_folder(**where, folder_path=folder, path_in_repo=inside, commit_message=message)
         if kind == "lerobot":
             version = json.loads((folder / LEROBOT_INFO).read_text())["codebase_version"]
-            if version in {tag.name for tag in api.list_repo_refs(repo_id=repository, repo_type="dataset").tags}:
-                api.delete_tag(repo_id=repository, repo_type="dataset", tag=version)  # it belongs to what was before
-            api.create_tag(repo_id=repository, repo_type="dataset", tag=version)
-    except Exception as error:  # the client raises many kinds
-        if is_refusal(error) or getattr(getattr(error, "response", None), "status_code", 0) in (401, 403):
-            raise refused(url, error) from None
-        raise StoreError(f"cannot publish to {url} ({reason(error)}); run the same command again") from None
+            if version in {tag.name for tag in api.list_repo_refs(**where).tags}:
+                api.delete_tag(**where, tag=version)  # it belongs to what was before
+            api.create_tag(**where, tag=version)
