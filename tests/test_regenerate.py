@@ -105,6 +105,23 @@ def test_lost_metadata_is_put_back(copy):
     assert Regeneration(copy).repair().shards == ()
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        (f"{NAME}.zarr/discount/zarr.json", b'"level"', b'"leval"'),
+        (f"{NAME}.zarr/zarr.json", b'"walker-walk', b'"walker-wa1k'),
+        ("files.json", b'"bytes": 1', b'"bytes": 7'),
+    ],
+)
+def test_metadata_that_are_still_json_but_not_what_they_were_are_put_back(copy, name, old, new):
+    was = (copy / name).read_bytes()
+    (copy / name).write_bytes(was.replace(old, new, 1))
+    assert (copy / name).read_bytes() != was and not verify(copy).sound
+    assert Regeneration(copy, [NAME], (2, 3)).check().sound, "shards are made with the metadata that are meant"
+    assert Regeneration(copy).repair().sound and verify(copy).sound
+    assert (copy / name).read_bytes() == was
+
+
 def test_a_release_keeps_its_own_codecs_when_the_code_has_new_ones(copy, monkeypatch):
     monkeypatch.setattr("dmcvb_gen.store.writer.picture_layout_for", lambda setting: "zstd-9")
     assert Regeneration(copy, [NAME], (2, 3)).check().sound

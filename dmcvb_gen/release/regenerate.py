@@ -17,14 +17,22 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import copy_file, folder_in_the_making, parse_json, remove_partial, write_json
+from dmcvb_gen.files import (
+    copy_file,
+    folder_in_the_making,
+    parse_json,
+    remove_partial,
+    sha256_bytes,
+    sha256_file,
+    write_json,
+)
 from dmcvb_gen.pool import Tick, Workers, ignore
 from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import copy_inputs, create_groups
 from dmcvb_gen.rollout.site import FolderSite
-from dmcvb_gen.store.index import restore_index, restored_commit
+from dmcvb_gen.store.index import restore_index, restored_commit, trusted_index
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import load_manifest
 from dmcvb_gen.store.remote import storage_errors
@@ -198,8 +206,10 @@ class Regeneration:
         shards = {key: record for key, record in wanted.items() if damage(root, record, key[1]) is not None}
         records = _unique(chosen_shards(manifest, self.only).values())
         with _Workshop(root, manifest, records) as folder:
-            for record in records:
-                _restore_metadata(root, folder, record)
+            metadata = _Metadata(root, manifest)
+            with storage_errors(root, "write to"):
+                for record in records:
+                    metadata.restore(folder, record)
             outcomes = self._repair(root, manifest, shards, folder, tick)
         if not manifest.complete and any(outcome.repaired for outcome in outcomes):
             finish_release(root, manifest)
@@ -248,8 +258,9 @@ class Regeneration:
         records = _unique(shards.values())
         fresh = start_release(out, _unfinished(manifest))
         create_groups(out, fresh, records)
+        metadata = _Metadata(root, manifest)
         for record in records:
-            _take_metadata(root, out, record)
+            metadata.take(out, record)
         done = {record.name: read_commits(out, record) for record in records}
         todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
         commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
@@ -330,20 +341,46 @@ def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardO
 # -- files ----------------------------------------------------------------------------------------
 
 
-def _is_json(path: Path) -> bool:
-    try:
-        parse_json(path.read_bytes())
-    except (OSError, ValueError):
-        return False
-    return True
+class _Metadata:
+    """Which of a release's zarr.json files are what they were: by the index; without one, those that are JSON."""
 
+    def __init__(self, root: Path, manifest: Manifest):
+        self._root, index = root, trusted_index(root, manifest)
+        self._digests = {file.path: file.sha256 for file in index.files} if index else {}
 
-def _take_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
-    """Use the release's own array metadata where it can be read: codecs of today's code may not be the release's."""
-    for target in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
-        source = root / target.relative_to(folder)
-        if _is_json(source):
-            copy_file(source, target)
+    def sound(self, path: str) -> bool:
+        """Whether a file (a path in the release) can be used."""
+        try:
+            data = (self._root / path).read_bytes()
+            parse_json(data)
+        except (OSError, ValueError):
+            return False
+        return path not in self._digests or sha256_bytes(data) == self._digests[path]
+
+    def take(self, folder: Path, record: SubsetRecord) -> None:
+        """Use the release's own array metadata in `folder`: codecs of today's code may not be the release's."""
+        for target in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
+            path = target.relative_to(folder).as_posix()
+            if source := self._source(path):
+                copy_file(source, target)
+
+    def restore(self, folder: Path, record: SubsetRecord) -> None:
+        """Put back what is missing or damaged, from `folder`, where it was made or taken."""
+        for source in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
+            path = source.relative_to(folder).as_posix()
+            if self.sound(path):
+                continue
+            if path in self._digests and sha256_file(source) != self._digests[path]:
+                raise StoreError(f"{self._root / path} is damaged, and this version makes another; fetch it again")
+            copy_file(source, self._root / path)
+        mark_created(self._root, record)
+
+    def _source(self, path: str) -> Path | None:
+        """The file itself, or one of another subset with its digest."""
+        if self.sound(path):
+            return self._root / path
+        twins = [twin for twin, digest in self._digests.items() if digest == self._digests.get(path)]
+        return next((self._root / twin for twin in twins if self.sound(twin)), None)
 
 
 def _unique(records) -> list[SubsetRecord]:
@@ -365,22 +402,14 @@ class _Workshop:
                 raise StoreError(f"cannot write to {self._root}: {error.strerror or error}; give --out") from None
             create_groups(folder, self._manifest, self._records)
             with storage_errors(self._root, "write to"):
+                metadata = _Metadata(self._root, self._manifest)
                 for record in self._records:
-                    _take_metadata(self._root, folder, record)
+                    metadata.take(folder, record)
             self._stack = stack.pop_all()
         return folder
 
     def __exit__(self, *_):
         self._stack.close()
-
-
-def _restore_metadata(root: Path, folder: Path, record: SubsetRecord) -> None:
-    """Put back Zarr metadata that is missing or no JSON; what can be read stays."""
-    for source in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
-        target = root / source.relative_to(folder)
-        if not _is_json(target):
-            copy_file(source, target)
-    mark_created(root, record)
 
 
 def _move_in(root: Path, folder: Path, commit: CommitRecord) -> None:

@@ -203,9 +203,20 @@ def take_in_card(root: Path) -> None:
         files.write_json(root / INDEX, index.model_copy(update={"files": tuple(everything)}).sealed())
 
 
+def trusted_index(root: Path, manifest: Manifest) -> Index | None:
+    """A local release's index, if it has its own digest and gives the manifest's root digest; else None."""
+    try:
+        index = read_index(root)
+    except StoreError:
+        return None
+    if index is None or index.sha256 is None or root_digest(index.files, manifest) != manifest.digest:
+        return None
+    return index
+
+
 def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> None:
-    """Write a missing index again, if the files that are here give the root digest of the manifest."""
-    if manifest.digest is None or (root / INDEX).is_file():
+    """Write a missing or damaged index again, if the files that are here give the root digest of the manifest."""
+    if manifest.digest is None or trusted_index(root, manifest) is not None:
         return
     listed = data_files(root, manifest, commits)
     if root_digest(listed, manifest) == manifest.digest:
