@@ -19,7 +19,7 @@ from PIL import Image
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.release.export import FORMATS, export, format_table
+from dmcvb_gen.release.export import FORMATS, STAMP, export, format_table
 from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
@@ -184,7 +184,7 @@ def read_tfrecords(path):
 
 
 def test_rlds_records_are_examples_of_the_features_that_the_folder_names(exported, episodes):
-    [folder] = exported("rlds").iterdir()
+    [folder] = (path for path in exported("rlds").iterdir() if path.is_dir())
     info = json.loads((folder / "dataset_info.json").read_text())
     [split] = info["splits"]
     assert folder.name == info["version"] == "1.0.0" and split["shardLengths"] == ["2"]
@@ -255,12 +255,19 @@ def test_damaged_or_foreign_folders_are_not_imported(exported, tmp_path):
             import_tfds(tmp_path / "somewhere", tmp_path / "r", **what)
 
 
-def test_the_command_exports_and_never_writes_over(small_release, tmp_path):
-    command = ["export", str(small_release), "--to", "npz", "--only", NAME, "--episodes", "2:3", "--out", str(tmp_path)]
+def test_the_command_exports_goes_on_and_never_writes_over(small_release, tmp_path):
+    command = ["export", str(small_release), "--to", "npz", "--episodes", "2:3", "--out", str(tmp_path)]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 0 and len(list((tmp_path / NAME).glob("*.npz"))) == 1
+    shutil.rmtree(tmp_path / NAME)
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    result = CliRunner().invoke(main, command)  # as after a run that was stopped before the last subset
+    assert result.exit_code == 0 and len(list((tmp_path / NAME).glob("*.npz"))) == 1 and kept
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in kept.items())
+    command[command.index("2:3")] = "1:3"
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 2 and "is there already" in result.output
+    assert not [path for path in tmp_path.rglob(".*") if path.name != STAMP]
 
 
 def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):

@@ -304,7 +304,7 @@ def card(context, path, check, out, url, as_json):
 @remote_option
 @json_option
 def export(path, to, only, episodes, merge, video, workers, executor, ray_address, out, options, as_json):
-    """Write subsets in another format: a folder a subset, nothing is written over.
+    """Write subsets in another format: a folder a subset, nothing is written over. Run again, it goes on.
 
     A subset that is not whole is refused, unless --episodes names what is there.
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
 from dmcvb_gen.names import select
 from dmcvb_gen.pool import Workers, ignore, open_pool
 from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
 from dmcvb_gen.release.export.episodes import Source
+from dmcvb_gen.store.manifest import Manifest
 from dmcvb_gen.store.remote import is_url, public, storage_errors
 
 
@@ -89,7 +91,8 @@ FORMATS = {
 """Name -> format."""
 
 
-KEPT = "the subsets that were written are whole: name the others with --only and run the command again"
+STAMP = ".dmcvb-gen.json"
+"""File in each export: what it was made from, so that the same command goes on where it was stopped."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,19 @@ class _Work:
     options: dict[str, Any]
     subsets: tuple[tuple[str, tuple[int, ...]], ...]
     folder: Path
+    stamp: dict[str, Any]
+
+    @property
+    def done(self) -> bool:
+        """Whether an earlier call wrote this very export. Raises StoreError where something else is."""
+        if not self.folder.exists():
+            return False
+        with contextlib.suppress(OSError, ValueError):
+            if parse_json((self.folder / STAMP).read_bytes()) == self.stamp:
+                return True
+        raise StoreError(
+            f"{self.folder} is there already, and not of this release and these options; choose another --out"
+        )
 
 
 def export(
@@ -117,7 +133,7 @@ def export(
     storage_options: dict | None = None,
     tick: Callable[[int], None] = ignore,
 ) -> list[Path]:
-    """Write subsets in another format; each is there whole, or not at all.
+    """Write subsets in another format; each is there whole, or not at all. Run again, it goes on where it stopped.
 
     Args:
       path: a release, here or at a URL.
@@ -135,7 +151,7 @@ def export(
     Raises:
       UnknownNameError: no such format or subset. DmcvbError: its package is not installed, or an option is not for
       this format. StoreError: a subset is not whole (or lacks some of `episodes`), it is damaged, there is something
-      at `out` already, or it cannot be written.
+      else at `out` already, or it cannot be written.
     """
     if to not in FORMATS:
         raise UnknownNameError("format", to, FORMATS)
@@ -151,18 +167,23 @@ def export(
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
     folders = [Path(out).absolute()] if merge else [Path(out).absolute() / _folder_name(to)(release, n) for n in names]
     works = [
-        _Work(str(path), storage_options, to, options, part, folder)
+        _Work(str(path), storage_options, to, options, part, folder, _stamp(release.manifest, to, options, part))
         for part, folder in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
     ]
-    for folder in folders:
-        if folder.exists():
-            raise StoreError(f"{folder} is there already; choose another --out")
-    with open_pool(workers, tick=tick, kept=KEPT, most=len(works)) as pool:
-        for work in works:
+    todo = [work for work in works if not work.done]
+    with open_pool(workers, tick=tick, most=len(todo)) as pool:
+        for work in todo:
             pool.submit(work.folder, _write, work)
         for _ in pool.results():
             pass
     return folders
+
+
+def _stamp(manifest: Manifest, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
+    """What an export was made from: release (the root digest, where it is finished), format, options and episodes."""
+    digests = {record.name: record.digest for record in manifest.subsets}
+    content = [[name, digests[name], list(episodes)] for name, episodes in subsets]
+    return dict(release=manifest.name, digest=manifest.digest, format=to, options=options, subsets=content)
 
 
 def _formats_with(option: str) -> list[str]:
@@ -208,16 +229,17 @@ def _write(work: _Work, tick: Callable[[int], None] = ignore) -> None:
     """Write one folder, whole or not at all."""
     release = open_for_reading(work.path, work.storage_options)
     sources = [Source(release, release[name], list(episodes), tick) for name, episodes in work.subsets]
-    partial = work.folder.with_name(f".{work.folder.name}.partial")
-    write = _writer(work.to)
-    try:
-        with storage_errors(work.folder, "write to"):
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir(parents=True)
-            write(sources if "merge" in FORMATS[work.to].options else sources[0], partial, **work.options)
-            partial.rename(work.folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    write, parent = _writer(work.to), work.folder.parent
+    with storage_errors(work.folder, "write to"):
+        parent.mkdir(parents=True, exist_ok=True)
+        remove_partial(parent, below=False)
+        with folder_in_the_making(parent, work.folder.name) as made:
+            inside = made / work.folder.name
+            inside.mkdir()
+            write(sources if "merge" in FORMATS[work.to].options else sources[0], inside, **work.options)
+            write_json(inside / STAMP, work.stamp)
+            if not work.done:  # somebody else may have been faster
+                inside.rename(work.folder)
 
 
 def format_table() -> str:
