@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import copy_file
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.plan import make_plan
+from dmcvb_gen.rollout.plan import make_plan, prepare
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.growth import next_version
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
@@ -51,6 +53,41 @@ def test_what_was_there_stays_and_the_rest_is_what_one_rollout_gives(grown, tmp_
     at_once = roll_out(walker({"episodes": 2}, {"settings": "static", "episodes": 2}), tmp_path / "once")
     digests = {record.name: record.digest for record in manifest.subsets}
     assert {record.name: record.digest for record in at_once.subsets}.items() <= digests.items()
+
+
+@pytest.mark.parametrize("marked", [True, False], ids=["rolled out here", "fetched"])
+def test_arrays_grow_whole_wherever_growing_was_interrupted(grown, tmp_path, monkeypatch, marked):
+    name, recipe = "walker-walk/random/none.zarr", walker({"episodes": 3})
+
+    def begin(folder, last=10**9):
+        """Grow the metadata; the disk is full after so many files."""
+        shutil.copytree(grown.parent / "before", folder, dirs_exist_ok=True)
+        if not marked:
+            (folder / name / ".created").unlink(missing_ok=True)
+        left = iter(range(last))
+
+        def copy(source, target):
+            if tmp_path in Path(target).parents and next(left, None) is None:
+                raise OSError(28, "No space left on device")
+            copy_file(source, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr("dmcvb_gen.store.writer.copy_file", copy)
+            prepare(make_plan(recipe, folder))
+        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("zarr.json")}
+
+    wanted = begin(tmp_path / "once")
+    group = json.loads((tmp_path / "once" / name / "zarr.json").read_text())
+    assert {array["shape"][0] for array in group["consolidated_metadata"]["metadata"].values() if "shape" in array} == {
+        3
+    }
+    assert wanted[Path(name) / "zarr.json"] != (grown.parent / "before" / name / "zarr.json").read_bytes()
+    for files in range(0, len(wanted), 3):
+        with pytest.raises(StoreError, match="room"):
+            begin(tmp_path / str(files), files)
+        prepare(make_plan(recipe, tmp_path / str(files)))
+        again = {path.relative_to(tmp_path / str(files)): path for path in (tmp_path / str(files)).rglob("zarr.json")}
+        assert {path: file.read_bytes() for path, file in again.items()} == wanted
 
 
 def test_an_old_recipe_run_again_changes_nothing(grown):

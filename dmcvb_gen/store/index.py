@@ -33,6 +33,7 @@ from dmcvb_gen.store.manifest import (
 )
 from dmcvb_gen.store.remote import storage_errors
 
+ZARR_JSON = "zarr.json"
 INDEX = "files.json"
 CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
 COMMITS = "commits/"
@@ -148,7 +149,7 @@ def data_files(root: Path, manifest: Manifest, commits: dict[str, dict[int, Comm
 def metadata_paths(root: Path, record: SubsetRecord) -> list[str]:
     """Paths of a subset's zarr.json files that are there."""
     folder = root / subset_path(record.name)
-    here = [path for pattern in ("zarr.json", "*/zarr.json", "*/*/zarr.json") for path in folder.glob(pattern)]
+    here = [path for pattern in (ZARR_JSON, f"*/{ZARR_JSON}", f"*/*/{ZARR_JSON}") for path in folder.glob(pattern)]
     return [path.relative_to(root).as_posix() for path in sorted(here)]
 
 

@@ -18,9 +18,9 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import PARTIAL, copy_file, remove_partial, sha256_file
+from dmcvb_gen.files import PARTIAL, copy_file, parse_json, remove_partial, sha256_file
 from dmcvb_gen.store.growth import merged
-from dmcvb_gen.store.index import INDEX, write_release
+from dmcvb_gen.store.index import INDEX, ZARR_JSON, metadata_paths, write_release
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
@@ -112,28 +112,44 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
       StoreError: the folder cannot be written.
     """
     path = root / subset_path(subset.name)
-    if (path / CREATED).exists():
-        with storage_errors(path, "write to"):
-            _grow(path, subset, attributes)
-        return
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
     with storage_errors(path, "write to"):
-        # File by file, each whole: of two who begin at the same time, none may clear away what the other has written.
-        _write_metadata(path, specs, attributes, shape, keep=any((root / "commits" / subset.name).glob("*.json")))
-        mark_created(root, subset)  # an interrupted creation is done again from the start
+        if not (path / CREATED).exists():
+            # File by file, each whole: of two who begin at the same time, none may clear away what the other wrote.
+            _write_metadata(path, specs, attributes, shape, keep=any((root / "commits" / subset.name).glob("*.json")))
+            mark_created(root, subset)  # an interrupted creation is done again from the start
+        _grow(root, subset, attributes)
 
 
-def _grow(path: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> None:
-    """Make room for more episodes in the arrays that are there: metadata alone."""
-    group = zarr.open_group(str(path), mode="r+", use_consolidated=False)
-    arrays = [array for _, array in group.members(max_depth=None) if isinstance(array, zarr.Array)]
-    small = [array for array in arrays if array.shape[0] < subset.episodes]
-    if not small:
+def _grow(root: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> None:
+    """Make room for more episodes in the arrays that are there: metadata alone.
+
+    The group's file, which holds a copy of all arrays' metadata, is put in place last: while it is the old one, what
+    was interrupted is done again.
+    """
+    path = root / subset_path(subset.name)
+    node = parse_json((path / ZARR_JSON).read_bytes())
+    known = (node.get("consolidated_metadata") or {}).get("metadata", {}).values()
+    if all(array["shape"][0] >= subset.episodes for array in known if "shape" in array) and known:
         return
-    for array in small:
-        array.resize((subset.episodes, *array.shape[1:]))
-    group.attrs["release"] = attributes.get("release", "")
-    zarr.consolidate_metadata(str(path))
+    with tempfile.TemporaryDirectory() as folder:
+        for name in metadata_paths(root, subset):
+            copy_file(root / name, Path(folder) / (root / name).relative_to(path))
+        group = zarr.open_group(folder, mode="r+", use_consolidated=False)
+        for _, array in group.members(max_depth=None):
+            if isinstance(array, zarr.Array) and array.shape[0] < subset.episodes:
+                array.resize((subset.episodes, *array.shape[1:]))
+        group.attrs["release"] = attributes.get("release", "")
+        _put_metadata(Path(folder), path)
+
+
+def _put_metadata(folder: Path, path: Path, keep: bool = False) -> None:
+    """Consolidate a group that was made in `folder` and put its metadata in place, the group's last."""
+    zarr.consolidate_metadata(str(folder))
+    for source in sorted(folder.rglob(ZARR_JSON), key=lambda file: -len(file.parts)):
+        target = path / source.relative_to(folder)
+        if not (keep and target.exists()):
+            copy_file(source, target)
 
 
 def add_arrays(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
@@ -159,11 +175,7 @@ def _write_metadata(path: Path, specs: tuple[ArraySpec, ...], attributes: dict, 
         group = zarr.create_group(folder, attributes=attributes, overwrite=True)
         version = attributes.get("schema_version", SCHEMA_VERSION)
         create_arrays(group, specs, *shape, schema_version=version)  # type: ignore[misc]
-        zarr.consolidate_metadata(folder)
-        for source in sorted(Path(folder).rglob("zarr.json"), key=lambda file: -len(file.parts)):
-            target = path / source.relative_to(folder)
-            if not (keep and target.exists()):
-                copy_file(source, target)
+        _put_metadata(Path(folder), path, keep)
 
 
 def write_shard(
