@@ -27,6 +27,8 @@ from dmcvb_gen.benchmarks.setup import Setup, fingerprint, pretraining_of
 from dmcvb_gen.benchmarks.tables import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.distractors import ExogenousWalk
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.pool import Needs, Ray, SerialPool
+from dmcvb_gen.pool.ray_pool import share_of_node
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.store.reader import Release, Subset
@@ -349,6 +351,31 @@ def test_workers_share_the_memory_for_pictures(small_release):
     assert share_memory(setup, 4).memory == 250
     with_default = share_memory(dataclasses.replace(setup, memory=None), 4).memory
     assert with_default == pytest.approx(default_memory() / 4, rel=0.2)
+
+
+def test_cells_on_a_cluster_take_no_more_than_their_share_of_a_node(small_release, tmp_path, monkeypatch):
+    nodes = [
+        {"Alive": True, "Resources": {"CPU": 8.0, "memory": 8e9, "GPU": 2.0}},
+        {"Alive": True, "Resources": {"CPU": 5.0, "memory": 1e10}},
+        {"Alive": True, "Resources": {"CPU": 1.0, "memory": 1e6}},  # too few cores for two
+        {"Alive": False, "Resources": {}},
+    ]
+    assert share_of_node(nodes, Needs(cpus=2)) == 2e9
+    assert share_of_node(nodes, Needs(cpus=2, gpus=1)) == 4e9
+    assert share_of_node(nodes, Needs(cpus=16)) is None
+
+    class Cluster(SerialPool):
+        def memory_each(self):
+            return 4_000_000
+
+    held = []
+    monkeypatch.setattr("dmcvb_gen.benchmarks.run.open_pool", lambda *_, **__: Cluster())
+    monkeypatch.setattr("dmcvb_gen.benchmarks.run.run_cell", lambda setup, *_: held.append(setup.memory) or {})
+    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+    for given in (setup, dataclasses.replace(setup, memory=1000), dataclasses.replace(setup, device="cuda")):
+        list(run_cells(given, cells, Ray("nowhere:1")))
+    assert held == [2_000_000, 1000, None]  # a cell has a GPU, and its memory, alone
 
 
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):

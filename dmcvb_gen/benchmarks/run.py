@@ -47,8 +47,8 @@ def run_cells(
     elif isinstance(workers, int):
         setup = share_memory(setup, workers)
     kept = "finished cells are kept: run the same command again"
-    needs = Needs(cpus=setup.threads, memory=setup.memory, gpus=0 if setup.device == "cpu" else 1)
-    with open_pool(workers, threads=setup.threads, tick=tick, kept=kept, needs=needs) as pool:
+    with open_pool(workers, threads=setup.threads, tick=tick, kept=kept, needs=needs_of(setup)) as pool:
+        setup = share_node(setup, pool.memory_each())
         for work in encoders:
             pool.submit(work, try_pretraining, setup, work)
         for cell in cells:
@@ -71,6 +71,20 @@ def share_memory(setup: Setup, workers: int) -> Setup:
     """The setup of each of several workers: pictures of them all together stay inside the one limit."""
     memory = default_memory(setup.device) if setup.memory is None else setup.memory
     return dataclasses.replace(setup, memory=memory // workers)
+
+
+def needs_of(setup: Setup) -> Needs:
+    """What a cell takes on a cluster; no bytes of memory: its share of a node."""
+    if setup.device == "cpu":
+        return Needs(cpus=setup.threads, memory=setup.memory)
+    return Needs(cpus=setup.threads, gpus=1)  # the bound is of the accelerator's memory, which a cell has alone
+
+
+def share_node(setup: Setup, memory: int | None) -> Setup:
+    """The setup of cells that have `memory` bytes each; pictures take half of them, as they do where one is alone."""
+    if setup.memory is not None or memory is None or setup.device != "cpu":
+        return setup
+    return dataclasses.replace(setup, memory=memory // 2)
 
 
 def try_cell(setup: Setup, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:

@@ -40,7 +40,8 @@ class Setup:
       root: the release's folder. out: the report's folder.
       device: "cpu" or "cuda". threads: of torch and physics in one process.
       compile: torch.compile the losses.
-      memory: bytes of pictures held at most, over all workers; None: half of what is free.
+      memory: bytes of pictures held at most, over all workers (on a cluster: by each cell); None: half of what is free
+        (on a cluster: of a cell's share of its node).
     """
 
     root: str

@@ -29,7 +29,7 @@ from dmcvb_gen.cli.common import json_option, print_json
 @click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True)
 @click.option("--compile", is_flag=True, help="torch.compile the losses (pays on CUDA and in long runs).")
-@click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Held by all workers.  [default: half free]")
+@click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Of all workers; ray: of each.  [default: half]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
 @click.option("--dino-weights", type=click.Path(path_type=Path), help="A safetensors file, for dino+bc.")
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")

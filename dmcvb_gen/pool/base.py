@@ -56,6 +56,10 @@ class Pool(abc.ABC):
           StoreError: a worker was killed.
         """
 
+    def memory_each(self) -> int | None:
+        """Bytes of memory for each piece of work at a time, where the pool places work by it; else None."""
+        return None
+
     def close(self, at_once: bool = False) -> None:  # noqa: B027 (nothing to end by default)
         """End the workers; with `at_once`, also what they are doing."""
 

@@ -6,10 +6,12 @@ Only the results travel back (commit records, not data), so the work must leave 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import os
 import socket
 from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
@@ -69,6 +71,12 @@ class RayPool(Pool):
                     self._tick(*facts)
                 yield key, result
 
+    def memory_each(self):
+        if self._needs.memory is None:
+            share = share_of_node(self._ray.nodes(), self._needs)
+            self._needs = dataclasses.replace(self._needs, memory=share)
+        return self._needs.memory
+
     def _bound(self) -> int:
         """Pieces of work that may be handed out to the nodes that there are now."""
         cpus = self._ray.cluster_resources().get("CPU", 1.0)
@@ -81,6 +89,26 @@ class RayPool(Pool):
         self._running.clear()
         if self._ours:
             self._ray.shutdown()
+
+
+def share_of_node(nodes: Sequence[Mapping[str, Any]], needs: Needs) -> int | None:
+    """Bytes of memory that a piece of work may take on any node, all those beside it taking as much.
+
+    Args:
+      nodes: as `ray.nodes()` lists them.
+      needs: the cores and the share of a GPU that it takes.
+
+    Returns:
+      The least share of all nodes where it can be placed; None where there is no such node yet.
+    """
+    shares = []
+    for resources in (node["Resources"] for node in nodes if node["Alive"]):
+        beside = [resources.get("CPU", 0) / needs.cpus]
+        if needs.gpus:
+            beside.append(resources.get("GPU", 0) / needs.gpus)
+        if min(beside) >= 1 and "memory" in resources:
+            shares.append(int(resources["memory"] / int(min(beside))))
+    return min(shares, default=None)
 
 
 def _check_answers(address: str | None) -> None:
