@@ -13,6 +13,7 @@ from dmcvb_gen.files import copy_file
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
+from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.plan import make_plan, prepare
@@ -88,6 +89,25 @@ def test_arrays_grow_whole_wherever_growing_was_interrupted(grown, tmp_path, mon
         prepare(make_plan(recipe, tmp_path / str(files)))
         again = {path.relative_to(tmp_path / str(files)): path for path in (tmp_path / str(files)).rglob("zarr.json")}
         assert {path: file.read_bytes() for path, file in again.items()} == wanted
+
+
+@pytest.mark.parametrize("name", ["none.zarr/state/zarr.json", "static.zarr/zarr.json", "hidden.zarr/zarr.json"])
+@pytest.mark.parametrize("damage", ["changed", "deleted"])
+def test_damage_never_becomes_what_is_right(grown, tmp_path, name, damage):
+    shutil.copytree(grown, tmp_path / "copy")
+    [path] = (tmp_path / "copy").rglob(name)
+    was, manifest = path.read_bytes(), (tmp_path / "copy/manifest.json").read_bytes()
+    if damage == "changed":
+        path.write_bytes(was.replace(b'"zarr_format": 3', b'"zarr_format":  3', 1))
+    else:
+        path.unlink()
+    roll_out(walker(), tmp_path / "copy")  # nothing to do, and nothing done
+    assert (tmp_path / "copy/manifest.json").read_bytes() == manifest and not verify(tmp_path / "copy").sound
+    with pytest.raises(StoreError, match=f"{path.name}.*(damaged|missing); mend it first: dmcvb-gen regenerate"):
+        prepare(make_plan(walker({"episodes": 3}), tmp_path / "copy"))
+    Regeneration(tmp_path / "copy").repair()
+    assert path.read_bytes() == was and verify(tmp_path / "copy").sound
+    prepare(make_plan(walker({"episodes": 3}), tmp_path / "copy"))
 
 
 def test_an_old_recipe_run_again_changes_nothing(grown):

@@ -30,7 +30,7 @@ from dmcvb_gen.rollout.painting import paint, renderers
 from dmcvb_gen.rollout.plan import painting_facts, subset_attributes
 from dmcvb_gen.rollout.recipe import check_size
 from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.index import INDEX
+from dmcvb_gen.store.index import INDEX, refuse_altered_folder
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     Manifest,
@@ -329,8 +329,9 @@ def _make_room(
     facts: dict[str, Any] = {"subsets": subsets, "digest": None}
     if changed:
         facts |= _derived(root, manifest, subsets, changed, look)
-    manifest = manifest.model_copy(update=facts)
     with storage_errors(root, "write to"):
+        refuse_altered_folder(root, manifest)
+        manifest = manifest.model_copy(update=facts)
         (root / INDEX).unlink(missing_ok=True)  # written again at the end
         for record in subsets:
             if record.name in new:

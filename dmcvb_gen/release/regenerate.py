@@ -32,7 +32,7 @@ from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
 from dmcvb_gen.rollout.plan import copy_inputs, create_groups
 from dmcvb_gen.rollout.site import FolderSite
-from dmcvb_gen.store.index import restore_index, restored_commit, trusted_index
+from dmcvb_gen.store.index import ZARR_JSON, restore_index, restored_commit, trusted_index
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import load_manifest
 from dmcvb_gen.store.remote import storage_errors
@@ -359,14 +359,17 @@ class _Metadata:
 
     def take(self, folder: Path, record: SubsetRecord) -> None:
         """Use the release's own array metadata in `folder`: codecs of today's code may not be the release's."""
-        for target in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
+        group = folder / subset_path(record.name)
+        for target in sorted(group.rglob(ZARR_JSON), key=lambda file: len(file.parts)):
             path = target.relative_to(folder).as_posix()
             if source := self._source(path):
                 copy_file(source, target)
+        if not self._source(f"{subset_path(record.name)}/{ZARR_JSON}"):
+            zarr.consolidate_metadata(str(group))  # with what its arrays were given
 
     def restore(self, folder: Path, record: SubsetRecord) -> None:
         """Put back what is missing or damaged, from `folder`, where it was made or taken."""
-        for source in sorted((folder / subset_path(record.name)).rglob("zarr.json")):
+        for source in sorted((folder / subset_path(record.name)).rglob(ZARR_JSON)):
             path = source.relative_to(folder).as_posix()
             if self.sound(path):
                 continue

@@ -21,7 +21,7 @@ from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
-from dmcvb_gen.store.index import INDEX
+from dmcvb_gen.store.index import INDEX, POLICIES, parse_index, refuse_altered
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment, subset_path
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
@@ -175,7 +175,7 @@ def _policy_record(path: Path, task: Task) -> PolicyRecord:
 
 def policy_path(file: str | Path) -> str:
     """Where a release keeps its copy of a policy file."""
-    return f"policies/{sha256_file(file)[:16]}.safetensors"
+    return f"{POLICIES}{sha256_file(file)[:16]}.safetensors"
 
 
 def painting_facts(record: SubsetRecord, backgrounds: str, device: str) -> dict[str, Any]:
@@ -249,7 +249,8 @@ def check_versions(manifest: Manifest) -> None:
 
 
 def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
-    if there is not None and shared and merged(there, plan.manifest, str(root)) is there:
+    kept = there is not None and merged(there, plan.manifest, str(root)) is there
+    if there is not None and kept and (shared or _is_done(there, plan)):
         manifest = there
     else:
         manifest = start_release(root, plan.manifest)
@@ -314,6 +315,8 @@ def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
         begun = _begun(root, plan, manifest, changed)
         new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
         in_parallel(lambda name: site.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
+    text = site.read(INDEX) if there.digest else None
+    refuse_altered(parse_index(text, f"{site.place}/{INDEX}") if text else None, site.read, site.place)
     if site.manifest() != there:
         raise StoreError(f"{site.place} was grown by somebody else meanwhile; run the same command again")
     site.remove(INDEX)  # written again when the release is finished
@@ -376,13 +379,14 @@ def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord
 def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any]:
     """What a subset's Zarr group says of itself to someone who has nothing else."""
     task = get_task(record.task)
+    version, generator = manifest.origin(record.name)
     return {
         "task": record.task,
         "level": record.level,
         "setting": record.setting,
-        "release": f"{manifest.name} {manifest.version}",
+        "release": f"{manifest.name} {version}",
         "schema_version": manifest.schema_version,
-        "generator": manifest.generator,
+        "generator": generator,
         "state_fields": {name: [part.start, part.stop] for name, part in task.state_slices.items()},
         "views": list(task.views),
         "seconds_per_step": 2 * task.control_timestep,
@@ -393,7 +397,12 @@ def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any
 
 def finish(plan: Plan) -> Manifest:
     """Write the digests of what is whole into the manifest, when all workers are through."""
-    return finish_site(plan.site, plan.manifest)
+    return plan.manifest if _is_done(plan.manifest, plan) else finish_site(plan.site, plan.manifest)
+
+
+def _is_done(manifest: Manifest, plan: Plan) -> bool:
+    """Whether a release has its digests and nothing was to be made: then they stay as they are."""
+    return manifest.complete and manifest.digest is not None and not plan.jobs
 
 
 def finish_site(site: Site, manifest: Manifest) -> Manifest:

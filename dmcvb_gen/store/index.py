@@ -13,7 +13,7 @@ Nor are the card's files, which speak of the root digest::
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -38,6 +38,8 @@ INDEX = "files.json"
 CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
 COMMITS = "commits/"
 """Folder of the shards' records, which name the machine that made them."""
+POLICIES = "policies/"
+"""Folder of a release's own copies of policies."""
 VIDEOS = "backgrounds/"
 """Folder of a release's own copies of videos, one folder a digest."""
 CARD_FOLDER = "card"
@@ -213,6 +215,41 @@ def trusted_index(root: Path, manifest: Manifest) -> Index | None:
     if index is None or index.sha256 is None or root_digest(index.files, manifest) != manifest.digest:
         return None
     return index
+
+
+def refuse_altered(index: Index | None, read: Callable[[str], bytes | None], place: str) -> None:
+    """Keep damage from becoming what is right: a release whose digests are to be made anew must have its old ones.
+
+    Shards apart, whose records hold their digests.
+
+    Args:
+      index: of the release as it is; None: it has none yet.
+      read: bytes of a path in the release, None where nothing is.
+
+    Raises:
+      StoreError: arrays' metadata, a policy or a video is missing, or not what it was.
+    """
+    for file in index.files if index else ():
+        if not (file.path.endswith(f"/{ZARR_JSON}") or file.path.startswith((POLICIES, VIDEOS))):
+            continue
+        data = read(file.path)
+        if data is None or files.sha256_bytes(data) != file.sha256:
+            what = "is missing" if data is None else "is damaged"
+            raise StoreError(f"{file.path} of {place} {what}; mend it first: dmcvb-gen regenerate {place}")
+
+
+def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
+    """See `refuse_altered`; `manifest` is the one in the folder.
+
+    Raises:
+      StoreError: see there, or the index is damaged.
+    """
+    if manifest.digest is None or not (root / INDEX).is_file():
+        return
+    index = trusted_index(root, manifest)
+    if index is None:
+        raise StoreError(f"{root / INDEX} is damaged; mend it first: dmcvb-gen regenerate {root}")
+    refuse_altered(index, lambda path: (root / path).read_bytes() if (root / path).is_file() else None, str(root))
 
 
 def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> None:

@@ -189,6 +189,15 @@ class Manifest(_Model):
                 return addition.recipe
         return self.recipe
 
+    def origin(self, subset: str) -> tuple[str, str]:
+        """The version of the release that a subset's last episodes came with, and what made its first."""
+        version, generator = str(self.recipe.get("version", self.version)), self.generator
+        for addition in self.additions:
+            if subset in addition.subsets:
+                version = addition.version
+                generator = addition.generator if addition.subsets[subset][0] == 0 else generator
+        return version, generator
+
 
 def subset_path(name: str) -> str:
     """Folder of a subset's Zarr group inside the release."""

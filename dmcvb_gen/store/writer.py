@@ -20,7 +20,7 @@ import zarr
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, copy_file, parse_json, remove_partial, sha256_file
 from dmcvb_gen.store.growth import merged
-from dmcvb_gen.store.index import INDEX, ZARR_JSON, metadata_paths, write_release
+from dmcvb_gen.store.index import INDEX, ZARR_JSON, metadata_paths, refuse_altered_folder, write_release
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
@@ -79,7 +79,9 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
     with storage_errors(root, "write to"), contextlib.ExitStack() as stack:
         if path.exists():
             stack.enter_context(only_writer(root, wait=LOCK_SECONDS))
-            old = merged(parse_manifest(path.read_bytes(), str(path)), manifest, str(root))
+            there = parse_manifest(path.read_bytes(), str(path))
+            old = merged(there, manifest, str(root))
+            refuse_altered_folder(root, there)
             environments = old.environments
             for environment in manifest.environments:
                 if environment not in environments:
