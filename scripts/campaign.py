@@ -55,6 +55,14 @@ SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "SIGINT": signa
 NETWORK = {"drops": "drop", "delays": "delay", "truncates": "cut", "corrupts": "corrupt", "503": "503", "403": "403"}
 KILLS = {"die", "ctrl-c", "cut off", "SIGKILL", "SIGTERM", "SIGINT", "worker killed", "all killed"}
 DAMAGE = ("byte flipped", "truncated", "deleted", "swapped")
+GROUPS = {
+    "kills, signals": KILLS,
+    "disk full, quota, read-only": {"disk full", "full disk", "quota", "read-only"},
+    "network": set(NETWORK),
+    "two writers": {"two writers"},
+    "files damaged": set(DAMAGE),
+    "clock set back": {"clock set back"},
+}
 ENDS = {  # fault -> the exit codes that are documented for a command that it strikes (0: it was done all the same)
     **dict.fromkeys(("die", "SIGKILL", "all killed"), {0, -signal.SIGKILL}),
     "cut off": {0, -signal.SIGXFSZ},
@@ -90,8 +98,12 @@ class Table:
     def add(self, operation: str, fault: str, what: str) -> None:
         self.rows[operation, fault, what] += 1
 
-    def sum(self, what: str, faults=None) -> int:
-        return sum(n for (_, f, w), n in self.rows.items() if w == what and (faults is None or f in faults))
+    def sum(self, what: str, faults=None, operations=None) -> int:
+        return sum(
+            count
+            for (operation, fault, w), count in self.rows.items()
+            if w == what and (faults is None or fault in faults) and (operations is None or operation in operations)
+        )
 
     def save(self, path: Path) -> None:
         path.write_text(json.dumps([[*key, count] for key, count in sorted(self.rows.items())], indent=0))
@@ -99,6 +111,19 @@ class Table:
     def load(self, path: Path) -> None:
         if path.exists():
             self.rows.update({tuple(key): count for *key, count in json.loads(path.read_text())})
+
+    def summary(self) -> str:
+        """Markdown: a row an operation, a column a group of faults, "times struck (of these: ended the command)"."""
+        lines = [f"| operation | {' | '.join(GROUPS)} | wrong |", "|---|" + "---|" * (len(GROUPS) + 1)]
+        rows = [[name] for name in sorted({operation for operation, *_ in self.rows})]
+        for names in [*rows, None]:
+            cells = []
+            for faults in GROUPS.values():
+                times, ended = (self.sum(what, faults, names) for what in ("times", "ended"))
+                cells.append(f"{times} ({ended})" if ended else str(times or ""))
+            wrong = self.sum("wrong", None, names)
+            lines.append(f"| {names[0] if names else 'all'} | {' | '.join(cells)} | {wrong} |")
+        return "\n".join(lines)
 
     def text(self) -> str:
         """Markdown: a row an operation and fault."""
@@ -575,7 +600,13 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=10**9, help="at most so many histories")
     parser.add_argument("--steps", type=int, default=9, help="operations a history at most")
     parser.add_argument("--table", type=Path, help="JSON of the counts: read at the start if there, kept up to date")
+    parser.add_argument("--summary", action="store_true", help="print a summary of --table and leave")
     options = parser.parse_args()
+    if options.summary:
+        table = Table()
+        table.load(options.table)
+        print(table.summary())
+        return 0
     os.environ |= {"AWS_ACCESS_KEY_ID": "someone", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}
     table = Table()
     if options.table:

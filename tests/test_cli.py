@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 from click.testing import CliRunner
@@ -180,6 +182,28 @@ def test_a_stop_that_foreign_code_turns_into_its_own_error_is_no_traceback(tmp_p
         except KeyboardInterrupt:
             raise ValueError("argument 1: KeyboardInterrupt") from None  # as ctypes does
 
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # a command that is stopped silences it
     monkeypatch.setattr("dmcvb_gen.rollout.info.describe_release", foreign)
     result = run("info", tmp_path)
     assert result.exit_code == 1 and "Aborted" in result.output and isinstance(result.exception, SystemExit)
+
+
+HALF_BEGUN = """
+import asyncio, os, signal
+from dmcvb_gen.cli import main
+from dmcvb_gen.release import verify
+
+async def never(): ...
+
+def interrupted(*_, **__):
+    loop, coroutine = asyncio.BaseEventLoop.__new__(asyncio.SelectorEventLoop), never()
+    os.kill(os.getpid(), signal.SIGINT)
+
+verify.verify = interrupted
+main(["verify", "."])
+"""
+
+
+def test_nothing_that_was_half_begun_prints_a_traceback_when_a_command_is_stopped():
+    ended = subprocess.run([sys.executable, "-c", HALF_BEGUN], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr.strip()) == (1, "", "Aborted!")

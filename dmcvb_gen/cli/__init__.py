@@ -6,6 +6,7 @@ import importlib
 import signal
 import sys
 import threading
+import warnings
 
 import click
 
@@ -91,6 +92,8 @@ def _stop_on_signals(context: click.Context) -> None:
 
     def stop(*_):
         _asked_to_stop.set()
+        sys.unraisablehook = lambda *_: None  # what is half begun (an event loop, say) has nothing to tell any more
+        warnings.simplefilter("ignore")
         raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():

@@ -1,7 +1,8 @@
 """How long and how big: a plan in, steps, bytes and core-hours out, from short measurements on this machine.
 
-What is measured once serves all that it is true of: episodes of a task and level for all settings that show them,
-pictures of a task, level and kind of distractor; the mazes, whose pictures cost the same, share theirs.
+What is measured once serves all that it is true of: episodes of a task and level for all settings that show them (a
+maze's fixed goals are drawn as its random ones are), pictures of a task, level and kind of distractor; the mazes, whose
+pictures cost the same, share theirs.
 """
 
 from __future__ import annotations
@@ -134,7 +135,7 @@ def estimate(plan: Plan) -> Estimate:
         for record in job.subsets:
             if record.name in rates:
                 continue
-            trajectory = (record.task, record.level, record.deterministic, record.max_steps, bool(record.fixed_goals))
+            trajectory = (record.task, record.level, record.deterministic, record.max_steps)
             if trajectory not in samples:
                 samples[trajectory] = _simulate(job)
             sample, key = samples[trajectory], _painting_key(record)
