@@ -5,4 +5,5 @@ extras=test
 ruff check .
 ruff format --check .
 mypy
-exec python -m pytest "$@"
+# Two processes, a file of tests each at a time: more would want more memory than small machines have.
+exec python -m pytest -n "$(python -c 'import os; print(min(2, os.cpu_count() or 1))')" --dist loadfile "$@"
