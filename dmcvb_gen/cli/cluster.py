@@ -22,8 +22,17 @@ ray_option = click.option(
 
 
 def crew(workers: int, executor: str, address: str | None) -> Workers:
-    """Who works, as the options say."""
+    """Who works, as the options say.
+
+    Raises:
+      click.UsageError: an option that says nothing about this kind of workers.
+    """
     if executor == "ray":
+        context = click.get_current_context(silent=True)
+        if context and context.get_parameter_source("workers") == ParameterSource.COMMANDLINE:
+            raise click.UsageError(
+                "--workers are processes; a Ray cluster has as many as it has cores, so leave it out."
+            )
         return Ray(address)
     if address:
         raise click.UsageError("--ray-address is for --executor ray.")
@@ -73,7 +82,7 @@ exec {work} --part "$SLURM_ARRAY_TASK_ID/{count}"
 
 def slurm_script(context, count: int, workers: int) -> str:
     """A script for sbatch that makes a release in `count` tasks; each task does its part of the jobs."""
-    base = ["dmcvb-gen", "rollout", *_given(context, without=("slurm_script", "as_json", "dry_run"))]
+    base = ["dmcvb-gen", "rollout", *_given(context, without=("slurm_script",))]
     name = "dmcvb-gen"
     return SLURM.format(
         count=count,

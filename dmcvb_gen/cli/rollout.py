@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import click
-from click.core import ParameterSource
 from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
@@ -21,6 +20,7 @@ from dmcvb_gen.cli.common import (
     print_json,
     remote_option,
 )
+from dmcvb_gen.cli.unheard import check_maze_options, check_way, given_options, is_given, rewarded
 from dmcvb_gen.names import ANT_MAZE, DIFFICULTIES, FIXED, SPLITS, DistractorSetting, family_of, task_folder
 from dmcvb_gen.store.remote import public
 
@@ -97,9 +97,9 @@ def rollout(
     from dmcvb_gen.rollout.plan import finish_site, make_plan, prepare
     from dmcvb_gen.rollout.site import site_of
 
-    if sum((init, bool(part), finishing)) > 1:
-        raise click.UsageError("Give one of --init, --part and --finish.")
-    by_warp = device != "cpu" and not options["recipe"] and not _is_given(context, "renderer")
+    check_way(context)
+    team = crew(workers, options["executor"], options["ray_address"])
+    by_warp = device != "cpu" and not options["recipe"] and not is_given(context, "renderer")
     options["renderer"] = "warp" if by_warp else options["renderer"]
     chosen = _recipe(context, options, going_on=bool(out))
     if options["slurm_script"]:
@@ -116,8 +116,14 @@ def rollout(
     shared = init or bool(part)
     plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
     if init:
-        return click.echo(f"{site.place}: begun, {len(plan.jobs)} jobs to do; make them with --part 1/N to N/N")
-    _run(plan, crew(workers, options["executor"], options["ray_address"]), as_json, whole=not part)
+        return _tell_begun(plan, as_json)
+    _run(plan, team, as_json, whole=not part)
+
+
+def _tell_begun(plan, as_json):
+    if as_json:
+        return print_json({"out": plan.site.place, "jobs": len(plan.jobs), "already_done": plan.done})
+    click.echo(f"{plan.site.place}: begun, {len(plan.jobs)} jobs to do; make them with --part 1/N to N/N")
 
 
 def _finish(site, finish_site, as_json):
@@ -188,23 +194,22 @@ def parse_range(text: str | None) -> tuple[int, int] | None:
 
 def _recipe(context, options, going_on):
     """The recipe that a command line asks for; None where a release is to go on from its manifest."""
-    from dmcvb_gen.rollout.recipe import load_recipe
+    from dmcvb_gen.rollout.recipe import check_heard, load_recipe
 
+    given = given_options(context)
     tasks = (*options["tasks"], *(_layout_task(layout) for layout in options["layouts"]))
     if not options["recipe"] and not tasks:
-        if going_on and not {n for n in RECIPE_OPTIONS if _is_given(context, n)}:
+        if going_on and not RECIPE_OPTIONS & given:
             return None
         raise click.UsageError("Give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes.")
     if options["steps"] and options["episodes"]:
         raise click.UsageError("Give --episodes or --steps, not both.")
-    given = {name for name in options if _is_given(context, name)}
     if options["recipe"]:
-        return _changed_recipe(load_recipe(options["recipe"]), tasks, options, given)
-    return _recipe_from_options(tasks, options)
-
-
-def _is_given(context, name):
-    return context.get_parameter_source(name) == ParameterSource.COMMANDLINE
+        recipe = _changed_recipe(load_recipe(options["recipe"]), tasks, options, given)
+    else:
+        recipe = _recipe_from_options(tasks, options, given)
+    check_heard(recipe, given)
+    return recipe
 
 
 NOT_WITH_RECIPE = {
@@ -254,29 +259,19 @@ def _translated(options):
     return {"behaviour": behaviour, "backgrounds": background_source(options["backgrounds"])}
 
 
-def _recipe_from_options(tasks, options):
+def _recipe_from_options(tasks, options, given):
     from dmcvb_gen.rollout.recipe import single_recipe
 
-    if options["reward"] == "geodesic":
-        tasks = tuple(f"{task}@geodesic" if family_of(task) == ANT_MAZE else task for task in tasks)
     levels = options["levels"] or ("random",)
-    families = {family_of(task) for task in tasks}
-    if len(families) > 1:
+    if len({family_of(task) for task in tasks}) > 1:
         raise click.UsageError("Mazes and locomotion tasks take different settings; roll them out by a --recipe.")
-    if families == {ANT_MAZE}:
-        if options["settings"]:
-            raise click.UsageError("Mazes vary in style, not by --distractor; use --goal visible|hidden.")
-        settings = (*options["goals"], *([FIXED] if options["fixed_goals"] else [])) or None
-        if settings == (FIXED,) and (options["episodes"] or options["steps"]):
-            raise click.UsageError("Of fixed goals there are --episodes-per-goal; --episodes, --steps are for --goal.")
+    check_maze_options(tasks, options, given)
+    tasks = tuple(rewarded(task, options["reward"]) for task in tasks)
+    if family_of(tasks[0]) == ANT_MAZE:
+        settings = tuple(dict.fromkeys([*options["goals"], *([FIXED] if options["fixed_goals"] else [])]))
     else:
-        if options["goals"] or options["fixed_goals"]:
-            raise click.UsageError("--goal and --fixed-goals are for ant-maze tasks.")
         difficulty = options["difficulty"]
-        settings = [
-            name if "_" in name else DistractorSetting(name, difficulty).name
-            for name in options["settings"] or ("none",)
-        ]
+        settings = [name if "_" in name else DistractorSetting(name, difficulty).name for name in options["settings"]]
     subset_fields = {name: options[name] for name in ("steps", "episodes_per_shard", "max_steps")}
     subset_fields["episodes"] = options["episodes"] or (None if options["steps"] else 20)
     subset_fields["deterministic"] = not options["sample"]
@@ -287,8 +282,7 @@ def _recipe_from_options(tasks, options):
         settings,
         name=name[:80].rstrip("-."),
         subset_fields=subset_fields,
-        fixed_goals=options["fixed_goals"],
-        episodes_per_goal=options["episodes_per_goal"],
+        goals={name: options[name] for name in ("fixed_goals", "episodes_per_goal") if name in given},
         seed=options["seed"],
         size=options["size"],
         renderer={"backend": options["renderer"], "samples": options["samples"]},

@@ -86,6 +86,7 @@ def make_plan(
     if recipe is not None:
         manifest, inputs = describe(recipe, device, pixels)
     elif there is not None:
+        _check_goes_on(there, site, device, pixels)
         manifest, inputs = there, None
     else:
         raise StoreError(f"{site.place} holds no release to go on with; give TASKs or --recipe")
@@ -98,6 +99,20 @@ def make_plan(
     jobs = part_of(make_jobs(grown, shards, site, None if site.slow else inputs, device), part)
     left = left_to_do(jobs, done)
     return Plan(site, manifest, inputs, left, _count(jobs) - _count(left))
+
+
+def _check_goes_on(there: Manifest, site: Site, device: str, pixels: bool) -> None:
+    """Raises StoreError where a release that goes on from its manifest cannot be as the options want it."""
+    painted = any(record.pixels for record in there.subsets)
+    if not pixels and painted:
+        raise StoreError(
+            f"{site.place} was begun with pictures and goes on with them; leave out --no-pixels, or give TASKs or "
+            "--recipe with another --out"
+        )
+    if device != "cpu" and not painted:
+        raise StoreError(
+            f"{site.place} was begun without pictures, so none are painted on {device}; leave out --device"
+        )
 
 
 def _count(jobs: Sequence[Job]) -> int:

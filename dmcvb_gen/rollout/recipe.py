@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,6 +34,7 @@ from dmcvb_gen.names import (
     VISIBLE,
     DistractorSetting,
     check_level,
+    distractor_of,
     family_of,
     normalize_setting,
     subset_name,
@@ -295,15 +296,15 @@ def single_recipe(
     *,
     name: str,
     behaviour: str | None = None,
-    fixed_goals: int | None = None,
-    episodes_per_goal: int = 10,
+    goals: dict[str, int] | None = None,
     subset_fields: dict[str, Any],
     **fields: Any,
 ) -> Recipe:
     """The recipe of a command line without --recipe: every task x level x setting.
 
     Args:
-      settings: of the tasks' families; by default "none", and "visible" (or "fixed") for mazes.
+      settings: of the tasks' families; by default "none", and "visible" for mazes.
+      goals: fixed_goals and episodes_per_goal, where they are not the pattern's own.
       subset_fields: of each `SubsetPattern`.
       fields: of the `Recipe`.
 
@@ -315,13 +316,31 @@ def single_recipe(
         chosen = [task for task in tasks if family_of(task) == family]
         if not chosen:
             continue
-        default = "none" if family == LOCOMOTION else FIXED if fixed_goals else VISIBLE
+        default = "none" if family == LOCOMOTION else VISIBLE
         pattern = {"tasks": chosen, "levels": list(levels), "settings": list(settings or (default,)), **subset_fields}
-        if fixed_goals:
-            pattern |= {"fixed_goals": fixed_goals, "episodes_per_goal": episodes_per_goal}
-        patterns.append(pattern)
+        patterns.append(pattern | (goals or {}))
     made = make_recipe({"name": name, "subsets": patterns, **fields}, "command line")
     return override(made, behaviour=behaviour) if behaviour else made
+
+
+def check_heard(recipe: Recipe, given: Collection[str]) -> None:
+    """Raises RecipeError where an option was given that changes nothing in any subset of a recipe.
+
+    Args:
+      given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".
+    """
+    subsets = [(t, level, s) for p in recipe.subsets for t in p.tasks for level in p.levels for s in p.settings]
+    videos = any(distractor_of(task, setting).kind != "none" for task, _, setting in subsets)
+    families = {family_of(task) for task, _, _ in subsets}
+    cures = {
+        "backgrounds": (videos, "no subset shows videos; ask for --distractor static or dynamic"),
+        "split": (videos or ANT_MAZE in families, "no subset shows videos; ask for --distractor static or dynamic"),
+        "sample": (any(level != "random" for _, level, _ in subsets), "level random is always drawn; ask for another"),
+        "independent": (LOCOMOTION in families, "subsets of mazes always have their own episodes"),
+    }
+    for name, (heard, cure) in cures.items():
+        if name in given and not heard:
+            raise RecipeError(f"--{name} changes nothing here: {cure}, or leave it out")
 
 
 # -- recipes in files -----------------------------------------------------------------------------

@@ -1,0 +1,136 @@
+"""No option of `rollout` goes unheard: what would change nothing is refused by its name."""
+
+from __future__ import annotations
+
+import json
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.names import LEVELS
+from dmcvb_gen.rollout.plan import make_plan, prepare
+from dmcvb_gen.rollout.recipe import expand
+from tests.conftest import small_recipe
+
+MAZE, WALKER = "ant-maze-empty7x7", "walker-walk"
+
+
+def rollout(*arguments):
+    return CliRunner().invoke(main, ["rollout", *map(str, arguments)])
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Subsets that a command line asks for; nothing is planned."""
+    recipes = []
+
+    def stop(recipe, *_):
+        recipes.append(recipe)
+        raise click.Abort()
+
+    def ask(*arguments):
+        monkeypatch.setattr("dmcvb_gen.rollout.plan.make_plan", stop)
+        result = rollout(*arguments)
+        assert result.exit_code == 1, result.output
+        return {request.name: request for request in expand(recipes[-1])}
+
+    return ask
+
+
+def assert_refused(result, options, cure):
+    """One line, which names one of the options and the cure."""
+    said = next(line for line in result.stderr.splitlines() if line.lower().startswith("error: "))
+    assert result.exit_code == 2 and cure in said and any(option in said for option in options), said
+
+
+@pytest.mark.parametrize(
+    "arguments, cure",
+    [
+        ([MAZE, "--difficulty", "hard"], "leave it out"),
+        ([WALKER, "--difficulty", "hard"], "--distractor static or dynamic"),
+        ([WALKER, "--distractor", "none", "--difficulty", "hard"], "--distractor static or dynamic"),
+        ([WALKER, "--distractor", "static_easy", "--difficulty", "hard"], "--distractor static or dynamic"),
+        ([WALKER, "--reward", "geodesic"], "ant-maze"),
+        ([f"{MAZE}@geodesic", "--reward", "saturated"], "@geodesic"),
+        ([MAZE, "--episodes-per-goal", "3"], "--fixed-goals"),
+        ([WALKER, "--episodes-per-goal", "3"], "ant-maze"),
+        ([MAZE, "--fixed-goals", "2", "--episodes", "3"], "--episodes-per-goal"),
+        ([WALKER, "--backgrounds", "builtin"], "--distractor static or dynamic"),
+        ([MAZE, "--backgrounds", "builtin"], "no subset shows videos"),
+        ([WALKER, "--split", "val"], "--distractor static or dynamic"),
+        ([WALKER, "--sample"], "level random is always drawn"),
+        ([MAZE, "--independent"], "always have their own episodes"),
+        ([WALKER, "--scratch", "x"], "--out is no URL"),
+        ([WALKER, "--scratch-size", "1GB"], "--out is no URL"),
+        ([WALKER, "--option", "a=b"], "--out is no URL"),
+        ([WALKER, "--no-pixels", "--device", "cuda"], "--no-pixels paints nothing"),
+        ([WALKER, "--workers", "2", "--executor", "ray"], "leave it out"),
+        ([WALKER, "--ray-address", "x:1"], "--executor ray"),
+        ([WALKER, "--behaviour", ""], "is empty"),
+        (["--recipe", ""], "is empty"),
+        ([WALKER, "--finish", "--dry-run"], "--finish plans nothing"),
+        ([WALKER, "--slurm-script", "3", "--part", "1/2"], "only prints a script"),
+        ([WALKER, "--slurm-script", "3", "--json"], "only prints a script"),
+    ],
+)
+def test_an_option_that_would_change_nothing_is_refused_with_the_cure(tmp_path, monkeypatch, arguments, cure):
+    monkeypatch.chdir(tmp_path)
+    options = [word for word in arguments if word.startswith("--")]
+    assert_refused(rollout(*arguments), options, cure)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "options, cure",
+    [
+        (["--distractor", "none", "--backgrounds", "builtin"], "--distractor static or dynamic"),
+        (["--distractor", "none", "--split", "val"], "--distractor static or dynamic"),
+        (["--level", "random", "--sample"], "level random is always drawn"),
+    ],
+)
+def test_also_beside_a_recipe(options, cure):
+    result = rollout("--recipe", "dmcvb-mini", WALKER, *options, "--dry-run")
+    assert_refused(result, [word for word in options[2:] if word.startswith("--")], cure)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--no-pixels"], "leave out --no-pixels"),
+        (["--seed", "5"], "TASKs or --recipe"),
+        (["--independent"], "TASKs or --recipe"),
+    ],
+)
+def test_a_release_that_goes_on_from_its_manifest_says_what_it_cannot_take(tmp_path, arguments, words):
+    prepare(make_plan(small_recipe(), tmp_path / "r"))
+    result = rollout("--out", tmp_path / "r", *arguments)
+    assert result.exit_code == 2 and words in result.output + result.stderr
+
+
+def test_a_release_without_pictures_goes_on_without_and_takes_no_device(tmp_path):
+    prepare(make_plan(small_recipe(), tmp_path / "r", pixels=False))
+    assert rollout("--out", tmp_path / "r", "--no-pixels", "--init").exit_code == 0
+    assert_refused(rollout("--out", tmp_path / "r", "--device", "cuda"), ["--device"], "leave out")
+
+
+def test_what_some_subsets_take_up_is_heard(asked):
+    levels = [word for level in LEVELS for word in ("--level", level)]
+    drawn = asked(WALKER, *levels, "--sample")
+    assert len(drawn) == 4 and not any(request.deterministic for request in drawn.values())
+    settings = ["--distractor", "none", "--distractor", "static", "--difficulty", "hard", "--split", "val"]
+    assert set(asked(WALKER, *settings)) == {f"{WALKER}/random/none", f"{WALKER}/random/static_hard"}
+    assert asked(MAZE, "--goal", "fixed", "--episodes-per-goal", "3")[f"{MAZE}/random/fixed"].episodes == 5 * 3
+    both = ["--goal", "visible", "--goal", "fixed", "--fixed-goals", "2", "--episodes-per-goal", "3", "--episodes", "4"]
+    assert [request.episodes for request in asked(MAZE, *both).values()] == [4, 2 * 3]
+    assert set(asked(f"{MAZE}@geodesic", "--reward", "geodesic", "--split", "val")) == {
+        f"{MAZE}-geodesic/random/visible"
+    }
+
+
+def test_a_begun_release_is_told_to_programs_too(tmp_path):
+    result = rollout(
+        WALKER, "--episodes", "1", "--max-steps", "3", "--size", "8", "--init", "--json", "--out", tmp_path
+    )
+    assert json.loads(result.stdout) == {"out": str(tmp_path), "jobs": 1, "already_done": 0}
