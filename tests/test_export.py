@@ -19,13 +19,16 @@ from PIL import Image
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.export import FORMATS, STAMP, export, format_table
 from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
+from dmcvb_gen.release.statistics import level_statistics
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
+from dmcvb_gen.tasks import get_task
 
 NAME = "walker-walk/random/static"
 
@@ -238,6 +241,43 @@ def test_dmc_vbs_folders_are_imported_whole(imported, episodes):
         Regeneration(imported).check()
     with pytest.raises(StoreError, match="was imported"):
         repaint(Repainting(imported, imported.parent / "x", size=8))
+
+
+def test_an_imported_release_keeps_its_pictures(imported, tmp_path):
+    """Nobody could paint them again."""
+    command = ["publish", str(imported), f"file:{tmp_path / 'there'}", "--no-pixels"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2 and "publish it with them, without --no-pixels" in result.output
+    assert len(result.output.strip().splitlines()) == 1 and not (tmp_path / "there").exists()
+    assert not list(imported.parent.glob(".*-light-*"))
+    with pytest.raises(StoreError, match="was imported.*without paint"):
+        dmcvb_gen.open(str(imported), paint=True)
+
+
+def check_imported_card(folder):
+    """Its card is written, fits, and claims nothing that it has not."""
+    write_card(folder)
+    assert check_card(folder) == []
+    text, metadata = (folder / "README.md").read_text(), (folder / "croissant.json").read_text()
+    assert "Imported by dmcvb-gen" in text and "those of the imported data" in text
+    for claim in ("regenerate", "full physics states", "`exogenous/`", "`physics`", "None samples", "seed None"):
+        assert claim not in text, claim
+    assert "can be made again from them" not in metadata and "roll out" not in metadata
+    return level_statistics(open_release(folder))
+
+
+def test_the_card_of_imported_locomotion(imported, small_release, tmp_path):
+    shutil.copytree(imported, tmp_path / "r")
+    [found], [made] = check_imported_card(tmp_path / "r"), level_statistics(open_release(small_release))
+    assert found.speed == pytest.approx(made.speed, rel=0.2) and found.height == pytest.approx(made.height, rel=0.1)
+
+
+def test_the_card_of_imported_mazes(dmcvb_mazes, small_mazes, tmp_path):
+    import_tfds(dmcvb_mazes, tmp_path / "r")
+    [found], ours = check_imported_card(tmp_path / "r"), open_release(small_mazes)["ant-maze-tiny/random/fixed"]
+    place = get_task(ours.task).state_slices["walker_position"]
+    walked = [np.diff(ours.episode(int(e))["state"][:, place][:, :2], axis=0) for e in ours.episodes]
+    assert found.speed == pytest.approx(np.linalg.norm(np.concatenate(walked), axis=1).mean() / 0.05)
 
 
 def test_damaged_or_foreign_folders_are_not_imported(exported, tmp_path):

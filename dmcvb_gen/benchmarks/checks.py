@@ -17,7 +17,6 @@ import numpy as np
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
 from dmcvb_gen.readers.painted import PaintedSubset
-from dmcvb_gen.release.contents import is_imported
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.paint import drift
 from dmcvb_gen.release.verify import verify
@@ -105,7 +104,7 @@ def check_paper_returns(subset: Subset) -> Iterator[Finding]:
 
 def check_labels(subset: Subset) -> Iterator[Finding]:
     """The distractors' labels are what the setting's name says; imported data have none."""
-    if is_imported(subset):
+    if subset.record.imported:
         return
     task, kind = get_task(subset.task), distractor_of(subset.task, subset.setting).kind
     looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]

@@ -19,7 +19,6 @@ from dmcvb_gen.agents.data import Normalization, normalize_pixels
 from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.distractors import ExogenousWalk, load_backgrounds
 from dmcvb_gen.names import distractor_of
-from dmcvb_gen.release.contents import is_imported
 from dmcvb_gen.rollout.jobs import video_source
 from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.rollout.recipe import RendererChoice
@@ -91,7 +90,7 @@ def protocol(
 
 def renderer_choice(subset: Subset) -> dict[str, Any]:
     """Name and samples of the renderer: the data's own, or the default one where they were painted elsewhere."""
-    if is_imported(subset):
+    if subset.record.imported:
         default = RendererChoice()
         return {"name": default.backend, "samples": default.samples}
     return {"name": subset.record.renderer["name"], "samples": subset.record.renderer.get("samples")}

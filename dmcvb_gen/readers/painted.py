@@ -194,7 +194,11 @@ class PaintedSubset(SubsetReader):
 
 
 def open_painted(path: str, storage_options: dict | None = None, **painting: Any) -> ReleaseReader:
-    """A release whose pictures are painted when they are read; see `dmcvb_gen.open` and `Painting`."""
+    """A release whose pictures are painted when they are read; see `dmcvb_gen.open` and `Painting`.
+
+    Raises:
+      StoreError: there is no release, it cannot be read, or it was imported.
+    """
     return painted_release(open_release(path, storage_options), Painting(**painting))
 
 
@@ -203,10 +207,15 @@ def painted_release(release: Release, painting: Painting, missing: bool = False)
 
     Args:
       missing: only those of subsets that lack some of them; the others are read as they are stored.
+
+    Raises:
+      StoreError: the release was imported, and not only missing pictures are to be painted.
     """
+    if release.manifest.imported and not missing:
+        raise StoreError(f"{release.root} was imported and has no physics states to paint from; open it without paint")
     subsets = {
         name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
-        if missing and subset.record.pixels and not subset.unpainted.any()
+        if subset.record.imported or (missing and subset.record.pixels and not subset.unpainted.any())
         else PaintedSubset(
             subset.root, subset.record, subset.commits, subset._storage_options, release.manifest, painting
         )

@@ -170,9 +170,12 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
 
 def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
     tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
+    held = "pixels and states"
+    if not manifest.imported:
+        held = "pixels, states, full physics states and the labels of every visual distractor"
     text = (
-        f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with pixels, states, full physics "
-        f"states and the labels of every visual distractor: {len(facts['subsets'])} subsets, "
+        f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with {held}: "
+        f"{len(facts['subsets'])} subsets, "
         f"{sum(subset['episodes'] for subset in facts['subsets']):,} episodes, {facts['steps']:,} steps."
     )
     return text.strip()
@@ -209,15 +212,19 @@ def card_text(
     lines += ["## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
     lines += ["## Known limits", "", *(f"- {limit}" for limit in limits), ""]
     lines += ["## Load it", "", *_loading(manifest, first.name), ""]
-    lines += ["## Check it, make it again", "", "```bash", f"dmcvb-gen verify {manifest.name}"]
-    lines += [f"# digest {manifest.digest or 'not finished'}"]
-    lines += [f"dmcvb-gen regenerate {manifest.name} --check      # simulates and paints everything again"]
-    lines += ["```", "", "## License and citation", ""]
+    lines += [*_checking(manifest), "", "## License and citation", ""]
     lines += [
         f"Data: {manifest.license}. Authors: {', '.join(manifest.authors) or 'not named'}. "
         "The benchmark that this data follows:"
     ]
     return "\n".join([*lines, "", "```bibtex", CITATION, "```", ""])
+
+
+def _checking(manifest: Manifest) -> list[str]:
+    again = [] if manifest.imported else ["simulates and paints everything again"]
+    lines = ["## Check it, make it again" if again else "## Check it", "", "```bash"]
+    lines += [f"dmcvb-gen verify {manifest.name}", f"# digest {manifest.digest or 'not finished'}"]
+    return [*lines, *(f"dmcvb-gen regenerate {manifest.name} --check      # {what}" for what in again), "```"]
 
 
 def _composition(facts: dict[str, Any]) -> list[str]:
@@ -249,12 +256,13 @@ def _arrays(release: Release) -> list[str]:
             lines += [f"{', '.join(f'`{name}`' for name in names)}:", ""]
         shown = [(f"`{name}`", *facts) for name, *facts in rows]
         lines += [*_table(("array", "type", "dimensions", "sizes past the episodes"), shown), ""]
-    lines.append(
+    rows_are = (
         "Row t of an episode holds observation t, the action taken there and the reward it earned; row `length` holds "
-        "the last observation alone. `exogenous/` are the distractors' labels: every picture is a function of "
-        "`physics` and these."
+        "the last observation alone."
     )
-    return lines
+    if not release.manifest.imported:
+        rows_are += " `exogenous/` are the distractors' labels: every picture is a function of `physics` and these."
+    return [*lines, rows_are]
 
 
 def _sizes(shape: Sequence[int]) -> str:
@@ -343,10 +351,13 @@ def _distractors(manifest: Manifest) -> list[str]:
 
 def _making(manifest: Manifest) -> list[str]:
     records = manifest.subsets
-    seeds = sorted({str(manifest.recipe_of(record.name).get("seed")) for record in records})
-    lines = [f"Made by {manifest.generator} from the recipe in `manifest.json` (seed {', '.join(seeds)})."]
-    renderers = sorted({f"{r.renderer.get('name')} ({r.renderer.get('samples')} samples a pixel)" for r in records})
-    lines.append(f"Renderer: {', '.join(renderers)}.")
+    if manifest.imported:
+        lines = [f"Imported by {manifest.generator}; nothing was simulated or painted again."]
+    else:
+        seeds = sorted({str(manifest.recipe_of(record.name).get("seed")) for record in records})
+        lines = [f"Made by {manifest.generator} from the recipe in `manifest.json` (seed {', '.join(seeds)})."]
+        painted = sorted({f"{r.renderer.get('name')} ({r.renderer.get('samples')} samples a pixel)" for r in records})
+        lines.append(f"Renderer: {', '.join(painted)}.")
     videos = sorted({f"`{r.backgrounds['digest'][:12]}` ({r.backgrounds['split']})" for r in records if r.backgrounds})
     if videos:
         lines.append(f"Background videos: digest {', '.join(videos)}.")
@@ -359,7 +370,8 @@ def _making(manifest: Manifest) -> list[str]:
     rows = []
     for record in {(r.task, r.level): r for r in records}.values():
         policies = ", ".join(f"{policy.name} `{policy.digest[:12]}`" for policy in record.policies)
-        rows.append((record.task, record.level, policies or "uniform random actions"))
+        unnamed = "those of the imported data" if record.imported else "uniform random actions"
+        rows.append((record.task, record.level, policies or unnamed))
     return [*lines, "", *_table(("task", "level", "behaviour policies"), rows)]
 
 
@@ -391,7 +403,10 @@ def _limits(release: Release) -> list[str]:
         limits.append(f"{len(small)} of {len(steps)} subsets have fewer steps than the paper's million.")
     seconds = {ACTION_REPEAT * get_task(record.task).control_timestep for record in manifest.subsets}
     limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
-    limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")
+    if manifest.imported:
+        limits.append("Imported data have no physics states and no labels: nothing of them can be made again.")
+    else:
+        limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")
     return limits
 
 

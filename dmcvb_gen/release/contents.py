@@ -40,7 +40,7 @@ def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[F
     """
     found = list(check_values(subset))
     yield from found
-    if any(finding.check in ("shapes", "lengths") for finding in found) or is_imported(subset):
+    if any(finding.check in ("shapes", "lengths") for finding in found) or subset.record.imported:
         return  # no values to go by, or nothing to simulate or paint from
     yield from check_physics(subset)
     if subset.pixel_arrays:
@@ -51,17 +51,12 @@ def _sample(count: int, wanted: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
 
 
-def is_imported(subset: Subset) -> bool:
-    """Whether a subset came from DMC-VB's published data, which have no physics states and no labels."""
-    return subset.record.renderer.get("name") == "imported"
-
-
 def check_values(subset: Subset) -> Iterator[Finding]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
     episodes = subset.episodes
     specs = subset_specs(EpisodeShape.of(task), subset.record)
-    for spec in imported_specs(subset.record) if is_imported(subset) else specs:
+    for spec in imported_specs(subset.record) if subset.record.imported else specs:
         if spec.name not in subset.arrays:
             yield Finding("shapes", subset.name, f"array {spec.name} is missing")
             return

@@ -43,6 +43,8 @@ CONTEXT: dict[str, Any] = {
     "name": {"@container": "@language"},
 }
 """The vocabulary's JSON-LD context."""
+COLLECTED_BY = ["Synthetic", "Software Collection"]
+"""Terms of Croissant's vocabulary for responsible AI."""
 TYPES = {"string": "sc:Text", "bool": "sc:Boolean", "double": "sc:Float"}
 """Types of the table of episodes that are no integers."""
 FIELDS = {
@@ -125,14 +127,9 @@ def croissant(
 
 def _responsible(manifest: Manifest, limits: Sequence[str]) -> dict[str, Any]:
     """What Croissant's vocabulary for responsible AI asks."""
-    tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
     return {
         "rai:hasSyntheticData": True,
-        "rai:dataCollection": f"Simulated in MuJoCo by {manifest.generator}: behaviour policies act in {tasks}; every "
-        "picture is painted from the simulated state and from distractors drawn from seeded streams.",
-        "rai:dataCollectionType": ["Synthetic", "Software Collection"],
-        "rai:dataCollectionRawData": "Physics states in full precision and the labels of all distractors are part of "
-        "the data: every picture and reward can be made again from them.",
+        **_collection(manifest),
         "rai:dataPreprocessingProtocol": "None after the simulation; pictures are compressed without loss.",
         "rai:dataAnnotationProtocol": "None by people: states, rewards and labels are the simulator's own.",
         "rai:dataLimitations": list(limits),
@@ -152,11 +149,32 @@ def _responsible(manifest: Manifest, limits: Sequence[str]) -> dict[str, Any]:
     }
 
 
+def _collection(manifest: Manifest) -> dict[str, Any]:
+    """How the data came to be, and what of that is kept."""
+    tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
+    if manifest.imported:
+        return {
+            "rai:dataCollection": f"Published episodes of {tasks}, simulated in MuJoCo, imported by "
+            f"{manifest.generator}; pictures, states, actions and rewards are those published.",
+            "rai:dataCollectionType": COLLECTED_BY,
+            "rai:dataCollectionRawData": "Physics states and labels of distractors were not published.",
+        }
+    return {
+        "rai:dataCollection": f"Simulated in MuJoCo by {manifest.generator}: behaviour policies act in {tasks}; every "
+        "picture is painted from the simulated state and from distractors drawn from seeded streams.",
+        "rai:dataCollectionType": COLLECTED_BY,
+        "rai:dataCollectionRawData": "Physics states in full precision and the labels of all distractors are part of "
+        "the data: every picture and reward can be made again from them.",
+    }
+
+
 def _provenance(manifest: Manifest) -> dict[str, Any]:
     """What made it, and from what."""
     activity: dict[str, Any] = {
         "@type": "prov:Activity",
-        "prov:label": "roll out behaviour policies and paint what they did",
+        "prov:label": "import published episodes"
+        if manifest.imported
+        else "roll out behaviour policies and paint what they did",
         "prov:wasAssociatedWith": {"@type": "prov:SoftwareAgent", "prov:label": manifest.generator},
         "prov:used": [{"@type": "prov:Entity", "prov:label": "the recipe in manifest.json"}],
     }

@@ -19,7 +19,6 @@ from PIL import Image
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.release.contents import is_imported
 from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.store import Release, Subset
@@ -112,8 +111,9 @@ def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     """Every column but the pictures."""
     policies = [policy.name for policy in subset.record.policies] or ["random"]
     values = {name: subset.read(name, episodes) for name in ("return", "length", "terminated")}
-    if is_imported(subset):
-        seeds, behaviour = np.zeros(len(episodes), np.uint64), np.full(len(episodes), -1)
+    seeds: Any
+    if subset.record.imported:
+        seeds, behaviour = [None] * len(episodes), np.full(len(episodes), -1)
     else:
         seeds, behaviour = subset.read("seed", episodes), subset.read("behaviour", episodes)
     return values | {
@@ -132,7 +132,7 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     for episode in episodes[~without] if name in subset.arrays else ():
         frames[int(episode)] = subset.array(name)[int(episode), 0]
     lacking = np.array([episode for episode in episodes if int(episode) not in frames], int)
-    if len(lacking) and not is_imported(subset):
+    if len(lacking) and not subset.record.imported:
         frames |= dict(zip(lacking.tolist(), _painted(subset, lacking), strict=True))
     return {"first_frame": [_picture(frames.get(int(episode))) for episode in episodes]}
 

@@ -23,7 +23,7 @@ from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_f
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD
-from dmcvb_gen.store.manifest import Manifest, SubsetRecord, environment
+from dmcvb_gen.store.manifest import IMPORTED, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.pictures import picture_arrays, picture_of
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
@@ -179,7 +179,7 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         episodes=sum(counts),
         episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD[family], sum(counts)),
         size=size,
-        renderer={"name": "imported"},
+        renderer={"name": IMPORTED},
         family=family,
         views=views,
         hidden_goal=hidden,

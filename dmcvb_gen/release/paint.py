@@ -213,7 +213,7 @@ class Studio:
           DmcvbError: see `paint_release`.
         """
         root, manifest, look = release.path, release.manifest, painter.look
-        if any(entry.get("kind") == "import" for entry in manifest.lineage):
+        if manifest.imported:
             raise StoreError(f"{root} was imported and has no physics states to paint from")
         old = {record.name: record for record in manifest.subsets}
         asked = [record for name, record in old.items() if name in names]
@@ -411,9 +411,14 @@ def without_pictures(root: str | Path, out: str | Path) -> Manifest:
       out: an empty or new folder.
 
     Raises:
-      StoreError: `out` is in use, or cannot be written.
+      StoreError: `out` is in use, or cannot be written; the release was imported, and nobody could paint it again.
     """
     release, out = open_release(root), Path(out)
+    if release.manifest.imported:
+        raise StoreError(
+            f"{root} was imported and has no physics states, so pictures that it leaves behind could not be painted "
+            "again; publish it with them, without --no-pixels"
+        )
     if out.exists() and any(out.iterdir()):
         raise StoreError(f"{out} is not empty; choose an empty or new folder")
     with storage_errors(out, "write to"):

@@ -292,9 +292,9 @@ class Regeneration:
 
 def check_makeable(manifest: Manifest) -> None:
     """Raises StoreError for a release whose shards cannot be made from its manifest."""
+    if manifest.imported:
+        raise StoreError(f"{manifest.name} was imported, so there is nothing to make it from; import it again")
     for entry in manifest.lineage:
-        if entry.get("kind") == "import":
-            raise StoreError(f"{manifest.name} was imported, so there is nothing to make it from; import it again")
         if entry.get("labels"):
             raise StoreError(
                 f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "

@@ -161,7 +161,7 @@ def _source(request: Repainting) -> Release:
         raise DmcvbError(f"unknown label {unknown[0]!r}; known: {', '.join(LABELS)}")
     if not release.subsets:
         raise StoreError(f"{request.root} has no committed episodes yet; run the rollout first")
-    if any(entry.get("kind") == "import" for entry in release.manifest.lineage):
+    if release.manifest.imported:
         raise StoreError(f"{request.root} was imported and has no physics states to paint from")
     if request.size is not None:
         check_size(request.size)

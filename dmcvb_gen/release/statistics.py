@@ -17,6 +17,8 @@ EPISODES = 20
 """First episodes of a task and level that are looked at: states take no more of the memory, however large a release."""
 HEIGHTS = ("height", "head_height", "body_height")
 """State fields that say how high a body is, where a task has one."""
+POSITION, VELOCITY = "walker_position", "velocity"
+"""State fields of where a root is (mazes), and of all joints' velocities, MuJoCo's qvel (the others)."""
 
 
 @dataclass(frozen=True)
@@ -117,19 +119,33 @@ def level_statistics(release: Release) -> list[LevelStatistics]:
 
 
 def _speed(task: Task, subset: Subset) -> float:
-    """Mean horizontal speed of the root over all steps, m/s."""
-    columns = 1 + _root_columns(task.model)  # time comes first
-    seconds = ACTION_REPEAT * task.control_timestep
-    moved = [np.diff(rows[:, columns], axis=0) for rows in _episodes(subset, "physics") if len(rows) > 1]
-    return float(np.sqrt((np.concatenate(moved) ** 2).sum(axis=1)).mean() / seconds)
+    """Mean horizontal speed of the root over all steps, m/s; by the states where there are no physics states."""
+    (position, velocity), states = _root_columns(task.model), task.state_slices
+    if "physics" in subset.arrays:
+        moved = _moved(subset, "physics", 1 + position)  # time comes first
+    elif POSITION in states:
+        moved = _moved(subset, "state", states[POSITION].start + np.arange(2))
+    else:
+        columns = states[VELOCITY].start + velocity
+        return _mean_length([rows[:, columns] for rows in _episodes(subset, "state")])
+    return _mean_length(moved) / (ACTION_REPEAT * task.control_timestep)
 
 
-def _root_columns(model: mujoco.MjModel) -> np.ndarray:
-    """Where the root's horizontal position lies in qpos: x and y of a free joint, or the slide along x."""
+def _moved(subset: Subset, name: str, columns: np.ndarray) -> list[np.ndarray]:
+    """How far columns of an array move in each step, episode by episode: (length, column)."""
+    return [np.diff(rows[:, columns], axis=0) for rows in _episodes(subset, name) if len(rows) > 1]
+
+
+def _mean_length(vectors: list[np.ndarray]) -> float:
+    return float(np.sqrt((np.concatenate(vectors) ** 2).sum(axis=1)).mean())
+
+
+def _root_columns(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Where the root's horizontal motion lies in qpos and in qvel: x and y of a free joint, or the slide along x."""
     for joint in range(model.njnt):
-        address = int(model.jnt_qposadr[joint])
+        position, velocity = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            return np.array([address, address + 1])
+            return position + np.arange(2), velocity + np.arange(2)
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and model.jnt_axis[joint][0]:
-            return np.array([address])
+            return np.array([position]), np.array([velocity])
     raise ValueError("the model has no root that moves")

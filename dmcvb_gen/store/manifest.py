@@ -23,6 +23,9 @@ MANIFEST = "manifest.json"
 MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
 """More than any release has; what asks for more is damaged or hostile, and would keep a reader busy for hours."""
 
+IMPORTED = "imported"
+"""Name of the renderer of subsets that came from DMC-VB's published data."""
+
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
 
 
@@ -125,6 +128,12 @@ class SubsetRecord(_Model):
     digest: Digest | None = None
     only_shown: bool = False
 
+    @property
+    def imported(self) -> bool:
+        """Whether it came from DMC-VB's published data, which have no physics states and no labels: nothing of it can
+        be simulated or painted again."""
+        return self.renderer.get("name") == IMPORTED
+
     @pydantic.model_serializer(mode="wrap")
     def _bare(self, dump: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         data = dump(self)
@@ -181,6 +190,11 @@ class Manifest(_Model):
     complete: bool = False
     digest: Digest | None = None
     format: Literal["dmcvb-gen release"] = "dmcvb-gen release"
+
+    @property
+    def imported(self) -> bool:
+        """Whether any of its subsets was, see `SubsetRecord.imported`."""
+        return any(record.imported for record in self.subsets)
 
     def recipe_of(self, subset: str) -> dict[str, Any]:
         """The recipe that a subset's first episode was made by; those added later agree with it."""

@@ -78,7 +78,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
         "samples": record.renderer.get("samples"),
         "split": split,
     }
-    if record.renderer.get("name") not in (None, "imported"):
+    if record.renderer.get("name") and not record.imported:
         options["renderer"] = record.renderer["name"]
     if not maze:
         options["difficulty"] = DistractorSetting.parse(record.setting).difficulty
