@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.readers.register import register_with_gymnasium
+from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
     from dmcvb_gen.readers.release import ReleaseReader
-
-__version__ = "0.2.0"
+__all__ = ["__version__", "open"]
 
 
 def open(path: str, storage_options: dict | None = None, *, paint: bool = False, **painting: Any) -> ReleaseReader:

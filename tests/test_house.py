@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import dmcvb_gen
 
 ROOT = Path(dmcvb_gen.__file__).parent
 FLOORS = (
-    ("names", "seeding", "extras", "errors", "files", "pool", "labels", "arithmetic"),  # the ground
+    ("version", "names", "seeding", "extras", "errors", "files", "pool", "labels", "arithmetic"),  # the ground
     ("tasks",),
     ("store",),
     ("rendering",),
@@ -63,7 +65,7 @@ def imports_of(name: str, path: Path, known: dict[str, Path]) -> set[str]:
 
 
 def floor_of(name: str) -> tuple[int, str]:
-    """(height, floor) of a module; the package itself, which holds the version and the front door, is the roof."""
+    """(height, floor) of a module; the package itself, which is the front door, is the roof."""
     inside = name.removeprefix("dmcvb_gen").lstrip(".")
     for height, floor in enumerate(FLOORS):
         for room in floor:
@@ -75,7 +77,7 @@ def floor_of(name: str) -> tuple[int, str]:
 
 def arrows() -> dict[str, set[str]]:
     known = modules()
-    return {name: imports_of(name, path, known) - {"dmcvb_gen"} for name, path in known.items()}
+    return {name: imports_of(name, path, known) for name, path in known.items()}
 
 
 def test_every_module_can_be_imported():
@@ -118,6 +120,14 @@ def _in_circles(arrows: dict[str, set[str]]) -> set[str]:
         if start in seen:
             found.add(start)
     return found
+
+
+def test_the_package_and_its_metadata_say_one_version():
+    declared = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())
+    place = declared["tool"]["setuptools"]["dynamic"]["version"]["attr"]
+    module, _, name = place.rpartition(".")
+    assert getattr(importlib.import_module(module), name) == dmcvb_gen.__version__
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*", dmcvb_gen.__version__)
 
 
 def test_reading_a_store_needs_no_simulator():

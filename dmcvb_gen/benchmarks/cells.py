@@ -17,7 +17,6 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from dmcvb_gen import __version__
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
 from dmcvb_gen.agents.data import Source, TrainingData, load_data
 from dmcvb_gen.agents.learners import ObservationReadout, Policy, StateReadout
@@ -33,6 +32,7 @@ from dmcvb_gen.files import replacing, write_json
 from dmcvb_gen.pool import ignore
 from dmcvb_gen.store import Release, Subset
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.version import __version__
 
 Tick = Callable[[str, int], None]
 """Told what is being done and how many Adam steps were made since the last call."""

@@ -15,7 +15,6 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from dmcvb_gen import __version__
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
 from dmcvb_gen.benchmarks.figures import curve_figure, data_url, figure_url, label_of, place_of, return_figure
@@ -29,6 +28,7 @@ from dmcvb_gen.rollout.info import return_statistics
 from dmcvb_gen.store import Release
 from dmcvb_gen.store.manifest import environment
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.version import __version__
 
 CHECKS = {
     "files": "every file has its bytes and digest",

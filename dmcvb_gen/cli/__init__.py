@@ -10,9 +10,9 @@ import warnings
 
 import click
 
-from dmcvb_gen import __version__
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import cure
+from dmcvb_gen.version import __version__
 
 COMMANDS = {
     "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of painted episodes."),

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen import __version__
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import DIFFICULTIES, DISTRACTOR_KINDS, GOAL_MODES, LEVELS
 from dmcvb_gen.store import open_release
+from dmcvb_gen.version import __version__
 
 
 def return_statistics(returns: np.ndarray) -> dict[str, float]:

@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from dmcvb_gen import __version__
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
 from dmcvb_gen.store.schema import SCHEMA_VERSION
+from dmcvb_gen.version import __version__
 
 __all__ = ["write_json_atomically"]
 MANIFEST = "manifest.json"

@@ -15,12 +15,13 @@ from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
-from dmcvb_gen import __version__, files
+from dmcvb_gen import files
 from dmcvb_gen.names import ANT_MAZE, FIXED, DistractorSetting
 from dmcvb_gen.readers.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.readers.release import ReleaseReader
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.references import reference_returns
+from dmcvb_gen.version import __version__
 
 
 def folder_name(release: ReleaseReader, subset: str) -> str:
