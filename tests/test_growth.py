@@ -18,7 +18,8 @@ from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.plan import make_plan, prepare
 from dmcvb_gen.store import open_release
-from dmcvb_gen.store.growth import next_version
+from dmcvb_gen.store.growth import merged, next_version
+from dmcvb_gen.store.manifest import PolicyRecord
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 
 WALKER = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "episodes_per_shard": 1}
@@ -132,6 +133,21 @@ def test_what_contradicts_is_refused_by_name_before_any_work(grown, recipe, word
         make_plan(recipe(), grown)
     assert "walker-walk/random/" in str(caught.value) and "delete" not in str(caught.value)
     assert before == {path: path.read_bytes() for path in grown.rglob("*") if path.is_file()}
+
+
+def test_a_policy_is_the_same_whatever_its_record_says_of_its_training(grown):
+    old = open_release(grown).manifest
+    policy = PolicyRecord(name="own", digest="0" * 64, header={"training": {"init_from": "/home/somebody/x"}})
+    bare = policy.model_copy(update={"header": {"training": {"init_from": "x"}}})
+    other = policy.model_copy(update={"digest": "1" * 64})
+
+    def given(policy):
+        subsets = [old.subsets[0].model_copy(update={"policies": (policy,)}), *old.subsets[1:]]
+        return old.model_copy(update={"subsets": tuple(subsets)})
+
+    assert merged(given(policy), given(bare), "here") == given(policy)
+    with pytest.raises(StoreError, match="with policies"):
+        merged(given(policy), given(other), "here")
 
 
 def test_a_shard_that_is_not_full_or_fixed_goals_cannot_grow(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 import tracemalloc
@@ -15,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from dmcvb_gen import arithmetic
 from dmcvb_gen.behaviours.learning.networks import Actor, as_arrays
 from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies, resolve_policies
+from dmcvb_gen.behaviours.policies.bundled import bundled_folder, bundled_policies, resolve_policies
 from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader, weight_shapes
 from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.behaviours.policies.simulate import simulate
@@ -226,6 +227,37 @@ def test_a_missing_level_says_how_to_get_it(tmp_path):
         bundled_policies("walker-walk", "grandmaster")
     with pytest.raises(PolicyFileError, match="select-checkpoints"):
         resolve_policies("walker-walk", "expert", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "path, name",
+    [
+        ("/home/alice/my runs/stand", "stand"),
+        ("~/runs/stand/", "stand"),
+        ("../../alice/stand.safetensors", "stand.safetensors"),
+        ("C:\\Users\\alice\\stand", "stand"),
+        ("runs/stand", "runs/stand"),
+        (None, None),
+    ],
+)
+def test_a_placeless_header_has_the_last_names_of_paths_alone(path, name):
+    command = "dmcvb-gen train-behaviour x" + (f" --init-from {shlex.quote(path)}" if path else "")
+    settings = {"learning_rate": 0.1, "hidden": [8, 8], "compile": False}
+    header = header_of(
+        training={"init_from": path, "settings": settings, "seed": 0}, command=f"{command} --set 'a=\"b\"'"
+    )
+    bare = header.placeless()
+    assert bare.training == {"init_from": name, "settings": settings, "seed": 0}
+    words = shlex.split(bare.command)
+    assert words[-2:] == ["--set", 'a="b"'] and (words[4] if path else None) == name
+    assert "alice" not in bare.model_dump_json() and (bare == header) == (path == name)
+    unreadable = header_of(command="x 'unclosed /home/alice/y").placeless()
+    assert "alice" not in unreadable.command
+
+
+def test_no_bundled_policy_names_a_place():
+    files = sorted(bundled_folder().rglob("*.safetensors"))
+    assert files and all(read_header(path).placeless() == read_header(path) for path in files)
 
 
 @pytest.mark.parametrize("level, count", [("expert", 1), ("medium", 1), ("mixed", 8)])

@@ -143,6 +143,18 @@ def test_a_part_moves_only_its_shards_verifies_and_can_be_completed(s3, small_re
     assert open_release(part).manifest == open_release(small_release).manifest and verify(part).sound
 
 
+def test_a_part_of_a_local_folder_names_no_place_of_this_machine(tiny, tmp_path):
+    publish(tiny, f"file://{tmp_path}/there")
+    for number, url in enumerate([f"file://{tmp_path}/there", str(tmp_path / "there")]):
+        part = tmp_path / str(number)
+        fetch(url, part, episodes=(0, 1))
+        text = (part / "manifest.json").read_text()
+        assert str(tmp_path) not in text and json.loads(text)["lineage"][0]["from"] == "tiny 1.0.0"
+        (part / "manifest.json").write_text(text.replace("tiny 1.0.0", str(tmp_path / "there")))  # as before
+        fetch(str(tmp_path / "there"), part, episodes=(0, 1))
+        assert (part / "manifest.json").read_text() == text
+
+
 def test_behavior_cloning_trains_on_a_fetched_part(s3, tmp_path):
     import torch
 

@@ -18,6 +18,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.behaviours.policies.actor import random_policy
 from dmcvb_gen.behaviours.policies.bundled import bundled_policies
+from dmcvb_gen.behaviours.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
@@ -293,8 +294,9 @@ def test_options_that_mean_nothing_beside_a_recipe_are_refused_by_name(tmp_path,
 
 def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_this_machine(tmp_path):
     shutil.copytree(builtin_folder(), tmp_path / "mine/videos")
-    policy = bundled_policies("walker-walk", "expert")[0]
-    shutil.copy(policy, tmp_path / "mine/own.safetensors")
+    policy, place = load_policy(bundled_policies("walker-walk", "expert")[0]), tmp_path / "mine/before"
+    said = {"training": {"init_from": str(place)}, "command": f"dmcvb-gen train-behaviour x --init-from {place}"}
+    save_policy(tmp_path / "mine/own.safetensors", policy.header.model_copy(update=said), policy.weights)  # as 0.1 did
     pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "dynamic", "episodes": 1, "max_steps": 3}
     pattern["policies"] = {"expert": str(tmp_path / "mine/own.safetensors")}
     recipe = small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "mine/videos"), size=8)
@@ -304,6 +306,8 @@ def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_thi
     outcome = Regeneration(tmp_path / "r").check()
     assert outcome.sound and [shard.equal for shard in outcome.shards] == [True]
     [subset] = manifest.subsets
+    assert subset.policies[0].header["training"] == {"init_from": "before"}
+    assert subset.policies[0].header["command"].endswith(" --init-from before")
     copies = load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "train")
     assert copies.digest == load_backgrounds("builtin", "train").digest == subset.backgrounds["digest"]
     assert load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "val").digest == (

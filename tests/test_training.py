@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
@@ -250,6 +252,22 @@ def test_the_class_and_the_config_name_the_same_run(tmp_path):
     assert SacRun(tmp_path, config()).header.command.startswith(
         "dmcvb-gen train-behaviour cheetah-run --algo sac --steps 160"
     )
+
+
+def test_a_policy_says_what_it_started_from_but_not_where_that_lay(tmp_path):
+    source = tmp_path / "home of somebody" / "own.safetensors"
+    source.parent.mkdir()
+    source.write_bytes(b"weights")
+    run = open_run(tmp_path / "run", config(init_from=str(source)), resume=False)
+    assert run.header.training["init_from"] == "own.safetensors" and "--init-from own.safetensors" in run.header.command
+    assert run.header.training["init_sha256"] == hashlib.sha256(b"weights").hexdigest()
+    assert str(tmp_path) not in run.header.model_dump_json() and "home of somebody" not in run.header.model_dump_json()
+    source.write_bytes(b"other weights")  # what lies there later is not what the run began with
+    again = open_run(tmp_path / "run", config(init_from=str(source)), resume=True)
+    assert again.header == run.header
+    folder = open_run(tmp_path / "second", config(init_from=f"{tmp_path / 'run'}/"), resume=False).header
+    assert folder.training["init_from"] == "run" and "init_sha256" not in folder.training
+    assert "--init-from run " in folder.command
 
 
 @pytest.mark.parametrize("task_id", ["walker-walk", "ant-maze-empty7x7"])

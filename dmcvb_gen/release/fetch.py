@@ -37,7 +37,7 @@ from dmcvb_gen.store.manifest import (
 )
 from dmcvb_gen.store.remote import file_system, local_path, public, storage_errors
 from dmcvb_gen.store.shards import ShardKey, chosen_shards
-from dmcvb_gen.store.transfer import download, in_parallel, read_object, retry
+from dmcvb_gen.store.transfer import download, in_parallel, protocol, read_object, retry
 from dmcvb_gen.store.writer import LOCK, finish_release, mark_created, only_writer, read_commits
 
 Tick = Callable[[int], None]
@@ -167,6 +167,12 @@ class Source:
         if index.manifest_sha256 != files.sha256_bytes(text):
             raise StoreError(f"{place}: {MANIFEST} does not have the digest that {INDEX} says; publish it again")
         return cls(url, filesystem, base, place, text, listing, manifest, index)
+
+    @property
+    def public_name(self) -> str:
+        """What others are told that the release came from: the URL; of a folder of this machine, what lay in it."""
+        local = protocol(self.filesystem) in ("file", "local")
+        return f"{self.manifest.name} {self.manifest.version}" if local else self.place
 
     @functools.cached_property
     def _by_path(self) -> dict[str, FileRecord]:
@@ -427,13 +433,14 @@ def _write_part(out: Path, source: Source, local: Manifest | None, only, episode
     base = local or source.manifest
     entry = {
         "kind": "fetch",
-        "from": source.place,
+        "from": source.public_name,
         "manifest_sha256": source.index.manifest_sha256,
         "digest": source.manifest.digest,
         "only": list(only),
         "episodes": list(episodes) if episodes else None,
     }
-    lineage = base.lineage if entry in base.lineage else (*base.lineage, entry)
+    before = tuple(e | {"from": source.public_name} if e.get("from") == source.place else e for e in base.lineage)
+    lineage = before if entry in before else (*before, entry)
     (out / INDEX).unlink(missing_ok=True)
     facts = {"lineage": lineage, "complete": False, "digest": None}
     files.write_json(out / MANIFEST, base.model_copy(update=facts))

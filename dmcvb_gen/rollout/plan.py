@@ -23,6 +23,7 @@ from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX, POLICIES, parse_index, refuse_altered
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment, subset_path
+from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
@@ -81,7 +82,7 @@ def make_plan(
     Raises:
       DmcvbError: anything that would fail later, found before any work.
     """
-    site = out if isinstance(out, Site) else FolderSite(Path(out))
+    site = out if isinstance(out, Site) else FolderSite(local_path(out))
     there = site.manifest()
     if recipe is not None:
         manifest, inputs = describe(recipe, device, pixels)
@@ -184,7 +185,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
 
 def _policy_record(path: Path, task: Task) -> PolicyRecord:
     policy = load_policy(path, task)
-    header = policy.header if isinstance(policy.header, dict) else policy.header.model_dump(mode="json")
+    header = policy.header.placeless().model_dump(mode="json")
     return PolicyRecord(name=path.stem, digest=policy.digest, path=policy_path(path), header=header)
 
 

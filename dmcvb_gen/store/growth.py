@@ -78,9 +78,16 @@ def _check_same(old: Manifest, there: SubsetRecord, asked: Manifest, record: Sub
         if one != other:
             refuse(field, one, other)
     for field in SubsetRecord.model_fields:
-        one, other = getattr(there, field), getattr(record, field)
+        one, other = _value(there, field), _value(record, field)
         if field not in GROWS and one != other:
             refuse(field, one, other)
+
+
+def _value(record: SubsetRecord, field: str) -> Any:
+    """A field as releases are compared by it: of policies, what they are; a copy of the header may leave places out."""
+    if field == "policies":
+        return tuple((policy.name, policy.digest, policy.path) for policy in record.policies)
+    return getattr(record, field)
 
 
 def _check_can_grow(there: SubsetRecord, record: SubsetRecord, place: str) -> None:
@@ -121,7 +128,7 @@ def is_grown_from(new: Manifest, old: Manifest) -> bool:
         now = records.get(before.name)
         if now is None or now.episodes < before.episodes:
             return False
-        if any(getattr(before, f) != getattr(now, f) for f in SubsetRecord.model_fields if f not in GROWS):
+        if any(_value(before, f) != _value(now, f) for f in SubsetRecord.model_fields if f not in GROWS):
             return False
         if before.episodes_per_shard != now.episodes_per_shard:
             return False

@@ -21,6 +21,7 @@ import abc
 import contextlib
 import dataclasses
 import json
+import os
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -60,6 +61,9 @@ RISEN = 5
 SAVE_SECONDS = 240
 """Seconds after which the next evaluation also saves the state to resume from."""
 
+FREE = ("steps", "settings", "init_sha256")
+"""Fields of a run's configuration in which one that goes on need not be written as it was."""
+
 Report = Callable[["Progress"], None]
 Tick = Callable[[int], Any]
 
@@ -74,6 +78,7 @@ class RunConfig:
         mixed checkpoints are picked from.
       evaluate_sparse: the same once a fifth of the way from the paper's medium return to its expert's is behind.
       init_from: policy file or run whose actor, critics and normalization it starts from.
+      init_sha256: of that file as it was when the run began, where it is a file.
     """
 
     task: str
@@ -84,6 +89,12 @@ class RunConfig:
     evaluate_every: int = 2_000
     evaluate_sparse: int = 10_000
     init_from: str | None = None
+    init_sha256: str | None = None
+
+    @property
+    def init_name(self) -> str | None:
+        """What a policy file says that it started from: the path's last name, for the rest is nobody's business."""
+        return self.init_from and Path(os.path.abspath(self.init_from)).name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,10 +137,11 @@ def read_config(folder: str | Path) -> RunConfig | None:
 def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:
     """Refuse to mix two configurations in one folder; only `steps` may differ.
 
-    Settings are compared with their defaults filled in, so that naming a default is no difference.
+    What the run started from is as it was then, whatever lies there by now. Settings are compared with their defaults
+    filled in, so that naming a default is no difference.
     """
     was, now = (
-        {name: value for name, value in vars(config).items() if name not in ("steps", "settings")}
+        {name: value for name, value in vars(config).items() if name not in FREE}
         | dataclasses.asdict(check_settings(config.algorithm, config.settings))
         for config in (found, asked)
     )
@@ -165,11 +177,12 @@ class Run(abc.ABC):
             training={
                 "settings": dataclasses.asdict(self.settings),
                 "seed": config.seed,
-                "init_from": config.init_from,
+                "init_from": config.init_name,
                 "environment": environment(),
             }
+            | ({"init_sha256": config.init_sha256} if config.init_sha256 else {})
             | self.describe(),
-            command=command_of(config),
+            command=command_of(dataclasses.replace(config, init_from=config.init_name)),
             **self.network(),
         )
         self.step, self.seconds = 0, 0.0

@@ -311,7 +311,8 @@ def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies:
     for level, picks in selection.picks.items():
         for pick in picks:
             policy = policies[pick.path]
-            header: PolicyHeader = policy.header.model_copy(update={"level": level, "evaluation": pick.evaluation})
+            facts = {"level": level, "evaluation": pick.evaluation}
+            header: PolicyHeader = policy.header.placeless().model_copy(update=facts)
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
     write_json_atomically(folder / "selection.json", selection_json(selection))
     plot_selection(curve, selection, folder / "curve.png")

@@ -33,7 +33,9 @@ from dmcvb_gen.behaviours.learning.settings import check_settings
 from dmcvb_gen.behaviours.learning.state_file import read_state
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.store.manifest import write_json_atomically
+from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.tasks import get_task
 
 __all__ = ["Progress", "Run", "RunConfig", "SacRun", "command_of", "open_run", "read_config"]
@@ -197,6 +199,11 @@ def run_class(algorithm: str) -> type[Run]:
     return Sb3Run
 
 
+def _digest(path: str | None) -> str | None:
+    """Of the policy file that a run starts from, None where it starts from none."""
+    return sha256_file(path) if path and Path(path).is_file() else None
+
+
 def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
     """A run in a folder: a new one, or the one that is there with `resume`.
 
@@ -204,7 +211,7 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
       DmcvbError: the folder holds another configuration, or a run and `resume` was not asked for; settings are
         unknown or wrong; there is too little room on the disk.
     """
-    folder = Path(folder)
+    folder = local_path(folder)
     check_settings(config.algorithm, config.settings)
     get_task(config.task)
     found = read_config(folder)
@@ -216,6 +223,7 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         raise DmcvbError(f"{folder} is not empty and holds no run; choose another --out")
     if config.init_from and not Path(config.init_from).is_file() and not read_config(config.init_from):
         raise DmcvbError(f"--init-from {config.init_from} is neither a run folder nor a policy file")
+    config = dataclasses.replace(config, init_sha256=found.init_sha256 if found else _digest(config.init_from))
     run = run_class(config.algorithm)(folder, config)
     if config.steps <= run.warmup():
         raise DmcvbError(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import re
+import shlex
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -30,6 +32,8 @@ ORIGINS = {
 }
 """Algorithm -> how a policy of it was trained, after "trained ..."."""
 Width = Annotated[int, pydantic.Field(gt=0, le=MAX_WIDTH)]
+_PLACE = re.compile(r"[/\\~]|\.\.[/\\]|[A-Za-z]:[/\\]|file:")
+"""How a path begins that says where somebody keeps their files."""
 
 
 class _Model(pydantic.BaseModel):
@@ -98,10 +102,38 @@ class PolicyHeader(_Model):
         """How the policy came to be, in a few words for people."""
         return origin_of(self.algorithm)
 
+    def placeless(self) -> PolicyHeader:
+        """The header with the last names alone of paths that name a place on some machine, fit for manifests.
+
+        Files that older versions wrote say where the policy or run lay that their training started from.
+        """
+        facts = {"training": _placeless(self.training), "command": _placeless_command(self.command)}
+        return self.model_copy(update=facts)
+
 
 def origin_of(algorithm: str) -> str:
     """How policies of an algorithm come to be, in a few words for people, after "trained ..."."""
     return ORIGINS.get(algorithm, f"by {algorithm}")
+
+
+def _placeless(value: Any) -> Any:
+    """Plain values, with the last names alone of the paths among them."""
+    if isinstance(value, dict):
+        return {name: _placeless(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_placeless(inner) for inner in value]
+    if isinstance(value, str) and _PLACE.match(value):
+        return re.split(r"[/\\]", value.rstrip("/\\"))[-1]
+    return value
+
+
+def _placeless_command(command: str) -> str:
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        words = command.split()  # no command that a shell would take
+    bare = ["=".join(map(_placeless, word.split("="))) for word in words]
+    return command if bare == words else shlex.join(bare)
 
 
 def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
