@@ -20,6 +20,7 @@ from dmcvb_gen.names import select
 from dmcvb_gen.pool import Workers
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.store import Release
+from dmcvb_gen.store.remote import local_path
 
 STATE_BC_SHARE = 0.9
 """Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
@@ -170,8 +171,9 @@ def check_writable(folder: str | Path) -> None:
     Raises:
       DmcvbError: it does not.
     """
+    folder = local_path(folder)
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:

@@ -7,14 +7,14 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import json_option, print_json
+from dmcvb_gen.cli.common import OutPath, json_option, print_json
 
 
 @click.command()
 @click.option("--videos", type=click.IntRange(1), default=8, show_default=True, help="Clips for each of train and val.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), default=Path("data/backgrounds"), show_default=True)
-@click.option("--sheet", type=click.Path(path_type=Path), help="Also write a contact sheet of them, a PNG.")
+@click.option("--out", type=OutPath(path_type=Path), default=Path("data/backgrounds"), show_default=True)
+@click.option("--sheet", type=OutPath(path_type=Path), help="Also write a contact sheet of them, a PNG.")
 @json_option
 def backgrounds(videos, seed, out, sheet, as_json):
     """Make background clips: objects that fall and collide, 24 frames each (needs OpenGL).

@@ -9,12 +9,12 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import json_option, print_json
+from dmcvb_gen.cli.common import OutPath, json_option, print_json
 
 
 @click.command("train-behaviour")
 @click.argument("task")
-@click.option("--out", type=click.Path(path_type=Path), help="The run's folder.  [default: runs/TASK]")
+@click.option("--out", type=OutPath(path_type=Path), help="The run's folder.  [default: runs/TASK]")
 @click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
 @click.option("--seed", type=click.IntRange(0), help="[default: 0]")
 @click.option("--algo", help="sac, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac]")
@@ -123,7 +123,7 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @click.option("--sample", is_flag=True, help="Draw actions instead of taking mean ones.")
-@click.option("--pictures", type=click.Path(path_type=Path), help="A folder for pictures of ten paths a maze.")
+@click.option("--pictures", type=OutPath(path_type=Path), help="A folder for pictures of ten paths a maze.")
 @json_option
 def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, pictures, as_json):
     """Returns of behaviour policies over fresh episodes, beside the paper's.

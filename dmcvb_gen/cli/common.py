@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from dmcvb_gen.errors import DmcvbError
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
 
 
@@ -20,18 +22,17 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def local_folder(given: str) -> Path:
-    """A folder of this machine.
+class OutPath(click.Path):
+    """A folder or file of this machine to write to; refuses URLs."""
 
-    Raises:
-      click.UsageError: it is a URL, which the command cannot write to.
-    """
-    if "://" in given:
-        raise click.UsageError(
-            f"--out {given} is a URL and this command writes to folders; make the release in a folder, then "
-            "`dmcvb-gen publish FOLDER URL`."
-        )
-    return Path(given)
+    def convert(self, value, param, ctx):
+        from dmcvb_gen.store.remote import local_path
+
+        try:
+            local_path(value)
+        except DmcvbError as error:
+            self.fail(f"{error}.", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 def background_source(given: str) -> str:

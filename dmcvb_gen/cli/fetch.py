@@ -8,9 +8,9 @@ import os
 import click
 from tqdm import tqdm
 
-from dmcvb_gen.cli.common import format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import OutPath, format_bytes, json_option, print_json, remote_option
 from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
-from dmcvb_gen.cli.release import episodes_option, only_option, parse_folder, transfers_option
+from dmcvb_gen.cli.release import episodes_option, only_option, transfers_option
 
 
 @click.command()
@@ -19,7 +19,7 @@ from dmcvb_gen.cli.release import episodes_option, only_option, parse_folder, tr
 @episodes_option
 @click.option("--paint", "painting", is_flag=True, help="Fill in pictures that travelled without, a shard as it comes.")
 @look_options
-@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the release here.")
+@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the release here.")
 @remote_option
 @transfers_option
 @json_option

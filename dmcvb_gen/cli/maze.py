@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import json_option, print_json
+from dmcvb_gen.cli.common import OutPath, json_option, print_json
 
 
 def _cell(context, parameter, value):
@@ -22,7 +22,7 @@ def _cell(context, parameter, value):
 @click.argument("layout")
 @click.option("--start", callback=_cell, metavar="ROW,COLUMN", help="A floor cell.  [default: the farthest]")
 @click.option("--goal", callback=_cell, metavar="ROW,COLUMN", help="A floor cell.  [default: the farthest]")
-@click.option("--out", type=click.Path(path_type=Path), help="The picture.  [default: LAYOUT.png]")
+@click.option("--out", type=OutPath(path_type=Path), help="The picture.  [default: LAYOUT.png]")
 @json_option
 def show_maze(layout, start, goal, out, as_json):
     """Write a picture of a layout, its distances to a goal and the path there.

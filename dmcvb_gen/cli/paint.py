@@ -5,13 +5,13 @@ from __future__ import annotations
 import click
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
-from dmcvb_gen.cli.common import background_source, json_option, local_folder, print_json
+from dmcvb_gen.cli.common import OutPath, background_source, json_option, print_json
 from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
 from dmcvb_gen.cli.release import episodes_option, frames_bar, only_option, workers_option
 
 
 @click.command()
-@click.argument("path")
+@click.argument("path", type=OutPath())
 @only_option
 @episodes_option
 @look_options
@@ -37,14 +37,13 @@ def paint(
     """
     from dmcvb_gen.release.paint import Painter, paint_release
 
-    folder = local_folder(path)
     videos = background_source(backgrounds) if backgrounds else None
     team = crew(workers, executor, ray_address)
     with frames_bar(as_json) as bar:
         painter = Painter(look_of(size, views, goal), team, device, videos, bar.update, tell)
-        done = paint_release(folder, only, episodes, painter)
+        done = paint_release(path, only, episodes, painter)
     if as_json:
-        print_json({"out": str(folder)} | painted_facts(done))
+        print_json({"out": path} | painted_facts(done))
     else:
-        show_painted(folder, done)
+        show_painted(path, done)
     context.exit(1 if done.differing else 0)

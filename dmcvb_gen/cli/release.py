@@ -11,12 +11,7 @@ import click
 from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
-from dmcvb_gen.cli.common import background_source, format_bytes, json_option, local_folder, print_json, remote_option
-
-
-def parse_folder(context, parameter, text):
-    """A folder here, or None; a click callback that takes no URL."""
-    return None if text is None else str(local_folder(text))
+from dmcvb_gen.cli.common import OutPath, background_source, format_bytes, json_option, print_json, remote_option
 
 
 @click.command()
@@ -106,7 +101,7 @@ def frames_bar(as_json):
 @only_option
 @episodes_option
 @click.option("--check", is_flag=True, help="Only compare digests; change nothing.")
-@click.option("--out", metavar="FOLDER", callback=parse_folder, help="Make the shards beside, in this folder.")
+@click.option("--out", metavar="FOLDER", type=OutPath(), help="Make the shards beside, in this folder.")
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
 @click.option("--device", help="Paint on cpu or cuda instead of where the manifest says.")
 @workers_option
@@ -173,7 +168,7 @@ def regenerate(
 @click.option("--label", "labels", multiple=True, type=click.Choice(["depth", "segmentation"]), help="Store these too.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
 @click.option("--name", help="Name of the new release.  [default: NAME-repainted]")
-@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the new release.")
+@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
 @workers_option
 @executor_option
 @ray_option
@@ -188,7 +183,7 @@ def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **o
     from dmcvb_gen.release.repaint import Repainting
     from dmcvb_gen.release.repaint import repaint as run
 
-    request = Repainting(path, local_folder(out), backgrounds=backgrounds and background_source(backgrounds), **options)
+    request = Repainting(path, out, backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
         manifest = run(request, crew(workers, executor, ray_address), bar.update)
     if as_json:
@@ -257,7 +252,7 @@ def _left_behind(path):
 @click.command()
 @click.argument("path", metavar="RELEASE")
 @click.option("--check", is_flag=True, help="Only compare the card with the release; write nothing.")
-@click.option("--out", metavar="FOLDER", callback=parse_folder, help="Folder of the card.  [default: the release]")
+@click.option("--out", metavar="FOLDER", type=OutPath(), help="Folder of the card.  [default: the release]")
 @click.option("--url", help="Where the release is (or will be) published.  [default: as the card there says]")
 @json_option
 @click.pass_context
@@ -299,7 +294,7 @@ def card(context, path, check, out, url, as_json):
 @executor_option
 @ray_option
 @click.option(
-    "--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the exports, a folder a subset."
+    "--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the exports, a folder a subset."
 )
 @remote_option
 @json_option
@@ -328,7 +323,7 @@ def export(path, to, only, episodes, merge, video, workers, executor, ray_addres
 @click.option("--level", help="Likewise.")
 @click.option("--setting", help="Likewise: none, static_medium, dynamic_medium, ...")
 @click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
-@click.option("--out", metavar="FOLDER", callback=parse_folder, required=True, help="Folder of the new release.")
+@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
 @json_option
 def import_command(folder, task, level, setting, name, out, as_json):
     """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.

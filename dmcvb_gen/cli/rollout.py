@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, parse_bytes, parse_part, ray_option, slurm_script
 from dmcvb_gen.cli.common import (
+    OutPath,
     background_source,
     format_bytes,
     format_duration,
@@ -66,7 +67,7 @@ def _out_default(name: str) -> str:
 @click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
 @click.option("--out", help="The release's folder, or a URL: s3://bucket/name, gs://, ...  [default: releases/NAME]")
 @remote_option
-@click.option("--scratch", type=click.Path(), help="With a URL: where shards are made.  [default: the system's]")
+@click.option("--scratch", type=OutPath(), help="With a URL: where shards are made.  [default: the system's]")
 @click.option("--scratch-size", metavar="BYTES", callback=parse_bytes, help="Bound of it, e.g. 20GB.  [default: half]")
 @click.option("--init", is_flag=True, help="Only begin the release; make nothing.")
 @click.option("--part", metavar="K/N", callback=parse_part, help="Make only every N-th job, from the K-th on.")
@@ -415,7 +416,7 @@ def info(path, options, as_json):
 @click.command()
 @click.argument("path")
 @click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the files.  [default: PATH/preview]")
+@click.option("--out", type=OutPath(path_type=Path), help="Folder of the files.  [default: PATH/preview]")
 @click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes of each subset.")
 @click.option("--scale", type=click.IntRange(1, 8), default=2, show_default=True, help="Enlarge the pictures.")
 @click.option("--frames", type=click.IntRange(1), default=200, show_default=True, help="Of the video, 20 a second.")

@@ -9,7 +9,7 @@ import click
 from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
-from dmcvb_gen.cli.common import json_option, print_json
+from dmcvb_gen.cli.common import OutPath, json_option, print_json
 
 
 @click.command()
@@ -19,7 +19,7 @@ from dmcvb_gen.cli.common import json_option, print_json
 @click.option("--benchmark", "benchmarks", multiple=True, help="b1, b2, b3, ablations. Repeatable.  [default: b1]")
 @click.option("--agents", default="", metavar="A,B", help="Names such as bc,state-bc,id+bc instead of all.")
 @click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/expert/*'.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder.  [default: reports/NAME]")
+@click.option("--out", type=OutPath(path_type=Path, file_okay=False), help="Folder.  [default: reports/NAME]")
 @click.option("--checks-only", is_flag=True, help="Structure checks and report, no training.")
 @click.option("--strict", is_flag=True, help="Exit with 1 on warnings too (data unlike the paper's).")
 @click.option("--train-unsound", is_flag=True, help="Run the benchmarks even where a structure check fails.")

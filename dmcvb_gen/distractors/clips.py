@@ -18,6 +18,7 @@ from PIL import Image
 from dmcvb_gen.distractors.backgrounds import FRAME_SIZE
 from dmcvb_gen.distractors.textures import FLOORS, surroundings, texture
 from dmcvb_gen.errors import BackgroundError
+from dmcvb_gen.store.remote import local_path
 
 GENERATOR = 2
 """Version of what a seed means; clips of another version or seed are not mixed."""
@@ -272,12 +273,14 @@ def make_clips(
 
     Raises:
       BackgroundError: OpenGL cannot start, the folder cannot be written or holds other videos.
+      StoreError: the folder is a URL.
     """
-    _claim(Path(out), seed)
+    out = local_path(out)
+    _claim(out, seed)
     made: dict[str, list[Path]] = {"train": [], "val": []}
     for split, paths in made.items():
         for index in range(videos):
-            path = Path(out) / split / f"clip_{index:03d}.webp"
+            path = out / split / f"clip_{index:03d}.webp"
             if not path.exists():
                 save_clip(path, make_clip(seed, split, index))
             paths.append(path)

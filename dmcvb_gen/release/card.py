@@ -31,6 +31,7 @@ from dmcvb_gen.rollout.preview import contact_sheet
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.store.manifest import Manifest
+from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import stored_name
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
@@ -59,8 +60,9 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     Raises:
       StoreError: there is no release, it has no episodes, or the folder cannot be written.
     """
+    target = local_path(out) if out else None
     release = _open(root)
-    folder = Path(out) if out else release.path
+    folder = target or release.path
     told = _told(folder, release.manifest)
     published = Publication(page_of(url) if url else told.url, told.date)
     try:

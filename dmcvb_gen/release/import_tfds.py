@@ -25,6 +25,7 @@ from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD
 from dmcvb_gen.store.manifest import IMPORTED, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.pictures import picture_arrays, picture_of
+from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
 from dmcvb_gen.store.writer import (
     create_subset,
@@ -80,7 +81,7 @@ def import_tfds(
     Raises:
       StoreError: no TFDS folder is there, it is damaged or has other features, or `out` cannot be used.
     """
-    folder, out = Path(folder), Path(out)
+    folder, out = Path(folder), local_path(out)
     found = sorted(path.parent for path in folder.rglob("features.json"))
     if not found:
         raise StoreError(f"{folder} holds no TFDS folder (no features.json); give the folder of a data set")

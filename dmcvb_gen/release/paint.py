@@ -41,7 +41,7 @@ from dmcvb_gen.store.manifest import (
 )
 from dmcvb_gen.store.pictures import Pictures, picture_of, stored_pictures
 from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.remote import storage_errors
+from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import ShardKey, chosen_shards
 from dmcvb_gen.store.writer import add_arrays, finish_release, only_writer, write_pictures
@@ -413,7 +413,7 @@ def without_pictures(root: str | Path, out: str | Path) -> Manifest:
     Raises:
       StoreError: `out` is in use, or cannot be written; the release was imported, and nobody could paint it again.
     """
-    release, out = open_release(root), Path(out)
+    release, out = open_release(root), local_path(out)
     if release.manifest.imported:
         raise StoreError(
             f"{root} was imported and has no physics states, so pictures that it leaves behind could not be painted "

@@ -35,7 +35,7 @@ from dmcvb_gen.rollout.site import FolderSite
 from dmcvb_gen.store.index import ZARR_JSON, restore_index, restored_commit, trusted_index
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.reader import load_manifest
-from dmcvb_gen.store.remote import storage_errors
+from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import (
@@ -251,7 +251,7 @@ class Regeneration:
         Raises: see `check`.
         """
         root, manifest = load_manifest(self.root)
-        out = Path(out)
+        out = local_path(out)
         if out.resolve() == root.resolve():
             raise StoreError(f"--out {out} is the release itself; leave --out away to repair it in place")
         shards = chosen_shards(manifest, self.only, self.episodes)

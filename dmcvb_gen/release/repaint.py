@@ -30,6 +30,7 @@ from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.manifest import MANIFEST, Addition, CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.pictures import stored_pictures
 from dmcvb_gen.store.reader import Subset
+from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
 from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
 from dmcvb_gen.tasks import get_task
@@ -119,7 +120,8 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
     Raises:
       DmcvbError: nothing fits, two subsets would become one, a source shard is damaged, or `out` cannot be used.
     """
-    release, out, site = _source(request), Path(request.out), FolderSite(Path(request.out))
+    out = local_path(request.out)
+    release, site = _source(request), FolderSite(out)
     pairs: dict[str, Pair] = {}
     for name in select(list(release.subsets), list(request.only)):
         pair = _pair(release, release[name], request)

@@ -14,7 +14,7 @@ from dmcvb_gen.extras import installed
 from dmcvb_gen.names import ANT_MAZE, select
 from dmcvb_gen.store import Subset, open_release
 from dmcvb_gen.store.pictures import shown
-from dmcvb_gen.store.remote import storage_errors
+from dmcvb_gen.store.remote import local_path, storage_errors
 
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
@@ -181,12 +181,13 @@ def write_preview(
     kind = video or ("mp4" if installed("imageio_ffmpeg") else "webp")
     if kind not in FORMATS:
         raise UnknownNameError("kind of video", kind, FORMATS)
+    target = local_path(out) if out else None
     release = open_release(path)
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:
         raise StoreError(f"{path} has no committed episodes with pictures; run the rollout first, or `dmcvb-gen paint`")
-    folder = Path(out) if out else release.path / "preview"
+    folder = target or release.path / "preview"
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         sheet = folder / "contact_sheet.png"

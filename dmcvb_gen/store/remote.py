@@ -40,13 +40,16 @@ def is_url(path: str) -> bool:
 
 
 def local_path(path: str | Path) -> Path:
-    """A folder here.
+    """A folder or file here, to be written to: what takes no URLs checks its `out` with this.
 
     Raises:
-      StoreError: it is a URL; a `Path` would silently make a folder of that name.
+      StoreError: it is a URL; a `Path` would silently make a folder "s3:".
     """
-    if is_url(str(path)):
-        raise StoreError(f"{public(str(path))} is a URL; give a local folder, and `dmcvb-gen publish` it from there")
+    if is_url(str(path)) or re.match(r"[A-Za-z][\w+.-]+:/", str(path)):  # `Path` makes s3:/x of s3://x
+        raise StoreError(
+            f"{public(str(path))} is a URL, and this is written to folders; give a local one and copy it there (a "
+            "release: `dmcvb-gen publish FOLDER URL`)"
+        )
     return Path(path)
 
 

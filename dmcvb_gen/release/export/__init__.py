@@ -16,7 +16,7 @@ from dmcvb_gen.pool import Workers, ignore, open_pool
 from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.store.manifest import Manifest
-from dmcvb_gen.store.remote import is_url, public, storage_errors
+from dmcvb_gen.store.remote import local_path, storage_errors
 
 
 @dataclass(frozen=True)
@@ -155,8 +155,7 @@ def export(
     """
     if to not in FORMATS:
         raise UnknownNameError("format", to, FORMATS)
-    if is_url(str(out)):
-        raise StoreError(f"exports are written to folders; {public(str(out))} is none: export to one and copy it there")
+    out = local_path(out)
     options = {name: True for name, given in (("video", video),) if given}
     for name in (*options, *["merge"] * merge):
         if name not in FORMATS[to].options:

@@ -1,0 +1,133 @@
+"""What writes to folders takes no URL: one line that says what to do instead, and no folder named "s3:"."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.store.remote import local_path
+
+URL = "s3://bucket/x"
+COMMANDS = {
+    "backgrounds": ["backgrounds", "--out", URL],
+    "backgrounds, sheet": ["backgrounds", "--sheet", f"{URL}.png"],
+    "show-maze": ["show-maze", "empty7x7", "--out", f"{URL}.png"],
+    "train-behaviour": ["train-behaviour", "walker-walk", "--out", URL],
+    "evaluate-behaviour": ["evaluate-behaviour", "walker-walk", "--pictures", URL],
+    "validate": ["validate", "RELEASE", "--out", URL],
+    "preview": ["preview", "RELEASE", "--out", URL],
+    "card": ["card", "RELEASE", "--out", URL],
+    "export": ["export", "RELEASE", "--to", "hdf5", "--out", URL],
+    "import": ["import", ".", "--out", URL],
+    "fetch": ["fetch", "memory://x", "--out", URL],
+    "repaint": ["repaint", "RELEASE", "--out", URL],
+    "regenerate": ["regenerate", "RELEASE", "--out", URL],
+    "paint": ["paint", URL],
+    "scratch": ["rollout", "walker-walk", "--out", URL, "--scratch", URL],
+}
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_command_makes_a_folder_of_a_url(small_release, elsewhere, name):
+    words = [str(small_release) if word == "RELEASE" else word for word in COMMANDS[name]]
+    result = CliRunner().invoke(main, words)
+    said = result.output.splitlines()[-1]
+    assert result.exit_code == 2 and "s3://bucket/x" in said and "give a local one" in said, result.output
+    assert not list(elsewhere.iterdir())
+
+
+def _plan(root):
+    from dmcvb_gen.rollout.plan import make_plan
+    from tests.conftest import small_recipe
+
+    make_plan(small_recipe(), URL)
+
+
+def _repaint(root):
+    from dmcvb_gen.release.repaint import Repainting, repaint
+
+    repaint(Repainting(root, Path(URL), size=8))
+
+
+def _remake(root):
+    from dmcvb_gen.release.regenerate import Regeneration
+
+    Regeneration(root).remake(URL)
+
+
+def _import(root):
+    from dmcvb_gen.release.import_tfds import import_tfds
+
+    import_tfds(root, URL)
+
+
+def _card(root):
+    from dmcvb_gen.release.card import write_card
+
+    write_card(root, Path(URL))
+
+
+def _preview(root):
+    from dmcvb_gen.rollout.preview import write_preview
+
+    write_preview(root, URL)
+
+
+def _export(root):
+    from dmcvb_gen.release.export import export
+
+    export(root, "hdf5", Path(URL))
+
+
+def _light(root):
+    from dmcvb_gen.release.paint import without_pictures
+
+    without_pictures(root, URL)
+
+
+def _clips(root):
+    from dmcvb_gen.distractors.clips import make_clips
+
+    make_clips(1, 0, URL)
+
+
+def _report(root):
+    from dmcvb_gen.benchmarks.validate import check_writable
+
+    check_writable(URL)
+
+
+def _train(root):
+    from dmcvb_gen.behaviours.learning.runs import RunConfig
+    from dmcvb_gen.behaviours.learning.training import open_run
+
+    open_run(URL, RunConfig("walker-walk", "sac", 1, 0, {}), resume=False)
+
+
+CALLS = (_plan, _repaint, _remake, _import, _card, _preview, _export, _light, _clips, _report, _train)
+
+
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__.strip("_"))
+def test_no_function_makes_a_folder_of_a_url(small_release, elsewhere, call):
+    with pytest.raises(StoreError, match="s3:/+bucket/x is a URL.*give a local one"):
+        call(small_release)
+    assert not list(elsewhere.iterdir())
+
+
+def test_what_is_no_url_is_a_path():
+    for given in ("x", "/x/y", "C:/x", "./s3:/x", "a:b/c"):
+        assert local_path(given) == Path(given)
+    for given in ("s3://user:secret@bucket/x", "file:/tmp/x", "simplecache::s3://b/x", Path("s3://bucket")):
+        with pytest.raises(StoreError, match="is a URL") as caught:
+            local_path(given)
+        assert "secret" not in str(caught.value)
