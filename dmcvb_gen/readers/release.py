@@ -11,6 +11,7 @@ from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.readers.blocks import choose, stream
 from dmcvb_gen.readers.source import StepSource
 from dmcvb_gen.store import Release, Subset, open_release
+from dmcvb_gen.store.remote import storage_errors
 
 if TYPE_CHECKING:
     import xarray
@@ -30,17 +31,26 @@ class SubsetReader(Subset):
         Returns:
           Dimensions episode and step (and height, width, ...), coordinates `episode` and `step`, variables by the
           store's names with "/" as "_" ("exogenous_camera_position"); read when used.
+
+        Raises:
+          StoreError: an episode is not there; also where values are used that are damaged or cannot be read.
         """
         import xarray
+
+        from dmcvb_gen.readers.lazy import guarded
 
         chosen = choose(self, episodes)
         options = self._storage_options if "://" in self.root else None
         path = f"{self.root}/{self.name}.zarr"
         parts = []
         for folder in sorted({path.rpartition("/")[0] for path in self.paths.values()}):
-            part = xarray.open_zarr(path, group=folder or None, consolidated=None, chunks=None, storage_options=options)
+            with storage_errors(path, decoding=True):
+                part = xarray.open_zarr(
+                    path, group=folder or None, consolidated=None, chunks=None, storage_options=options
+                )
+            part = guarded(part.reset_coords(), f"{path}/{folder}".rstrip("/"))
             # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
-            part = part.reset_coords().rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
+            part = part.rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
             parts.append(part.rename({name: f"{folder}_{name}".replace("/", "_") for name in part} if folder else {}))
         merged = xarray.merge(parts, combine_attrs="override")
         merged = merged.isel(episode=chosen).assign_coords(episode=chosen, step=np.arange(merged.sizes["step"]))

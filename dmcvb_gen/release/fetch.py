@@ -35,6 +35,7 @@ from dmcvb_gen.store.manifest import (
     shard_count,
     subset_path,
 )
+from dmcvb_gen.store.reader import local_manifest
 from dmcvb_gen.store.remote import file_system, local_path, public, storage_errors
 from dmcvb_gen.store.shards import ShardKey, chosen_shards
 from dmcvb_gen.store.transfer import download, in_parallel, protocol, read_object, retry
@@ -347,7 +348,7 @@ class Arrival:
     def finish(self) -> Manifest:
         """The release's own manifest and index where everything is here, as it was published; else digests."""
         out, source = self.out, self.source
-        manifest = parse_manifest((out / MANIFEST).read_bytes(), str(out / MANIFEST))
+        manifest = local_manifest(out)
         commits = {record.name: read_commits(out, record) for record in source.manifest.subsets}
         whole = all(len(commits[record.name]) == shard_count(record) for record in source.manifest.subsets)
         if whole and [*map(_bare, manifest.subsets)] == [*map(_bare, source.manifest.subsets)]:
@@ -374,7 +375,7 @@ def _fetch_commits(
                 raise OSError(f"{file.path} does not have its digest")
             return data
 
-        text = retry(source.place, file.path, attempt)
+        text = retry(source.place, file.path, attempt, "read")
         return text, checked_commit(text, f"{source.place}/{file.path}", shards[key], key[1])
 
     found = in_parallel(one, list(zip(shards, listed, strict=True)), workers, lambda _: 0)
@@ -391,15 +392,17 @@ def taken_up(out: Path, source: Source) -> Manifest | None:
     Raises:
       StoreError: `out` holds anything but a part of this release, painted or not.
     """
-    if (out / MANIFEST).is_file():
-        old = parse_manifest((out / MANIFEST).read_bytes(), str(out / MANIFEST))
+    with storage_errors(out):
+        begun, strange = (out / MANIFEST).is_file(), _is_strange(out, source.manifest)
+    if begun:
+        old = local_manifest(out)
         if not _same_release(old, source):
             raise StoreError(
                 f"{out} holds {old.name} {old.version} and not the {source.manifest.name} {source.manifest.version} of "
                 "the URL; choose another --out"
             )
         return old
-    if out.exists() and (not out.is_dir() or any(p.suffix != files.PARTIAL for p in _strangers(out, source.manifest))):
+    if strange:
         raise StoreError(f"{out} is not empty and holds no release; choose an empty or new folder for --out")
     return None
 
@@ -416,8 +419,8 @@ def _same_release(old: Manifest, source: Source) -> bool:
     return (old.name, old.version, old.recipe, before) == (new.name, new.version, new.recipe, now)
 
 
-def _strangers(out: Path, manifest: Manifest) -> Iterable[Path]:
-    """What lies in a folder and is no part of an interrupted fetch."""
+def _is_strange(out: Path, manifest: Manifest) -> bool:
+    """Whether a folder holds what is no part of an interrupted fetch, or is none."""
     ours = {record.name.split("/")[0] for record in manifest.subsets} | {
         "policies",
         "commits",
@@ -425,7 +428,9 @@ def _strangers(out: Path, manifest: Manifest) -> Iterable[Path]:
         CARD_FOLDER,
         LOCK,
     }
-    return (path for path in out.iterdir() if path.name not in ours | set(CARD_FILES))
+    if not out.is_dir():
+        return out.exists()
+    return any(path.name not in ours | set(CARD_FILES) and path.suffix != files.PARTIAL for path in out.iterdir())
 
 
 def _write_part(out: Path, source: Source, local: Manifest | None, only, episodes) -> None:

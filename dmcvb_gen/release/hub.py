@@ -21,7 +21,7 @@ from dmcvb_gen.files import PARTIAL, sha256_file
 from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import INDEX, Index, is_replaced, keeps, parse_index
 from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest, parse_manifest, subset_path
-from dmcvb_gen.store.remote import is_refusal, reason, refused
+from dmcvb_gen.store.remote import is_refusal, reason, refused, storage_errors
 from dmcvb_gen.store.shards import ShardKey
 
 BATCH = 90
@@ -201,7 +201,9 @@ def snapshot(url: str, out: Path, wanted: Sequence[FileRecord], shards: Sequence
 
 
 def _check_local(root: Path, file: FileRecord) -> None:
-    if sha256_file(root / file.path) != file.sha256:
+    with storage_errors(root / file.path):
+        digest = sha256_file(root / file.path)
+    if digest != file.sha256:
         raise StoreError(
             f"{root / file.path} does not have its digest; run `dmcvb-gen regenerate` on the release first"
         )

@@ -34,7 +34,7 @@ from dmcvb_gen.store.manifest import (
     shard_count,
 )
 from dmcvb_gen.store.reader import load_manifest
-from dmcvb_gen.store.remote import file_system, public, reason
+from dmcvb_gen.store.remote import file_system, public, reason, storage_errors
 from dmcvb_gen.store.transfer import (
     create_object,
     in_parallel,
@@ -59,7 +59,9 @@ def index_of(root: Path, manifest: Manifest) -> Index:
     for record in manifest.subsets:
         if len(commits[record.name]) != shard_count(record):
             raise StoreError(f"{record.name} has damaged or missing shards; run `dmcvb-gen regenerate {root}` first")
-    digest, index = files.sha256_file(root / MANIFEST), read_index(root)
+    with storage_errors(root / MANIFEST):
+        digest = files.sha256_file(root / MANIFEST)
+    index = read_index(root)
     if index is None:
         listed = sorted([*data_files(root, manifest, commits), *card_files(root)], key=lambda file: file.path)
         return Index(manifest_sha256=digest, files=tuple(listed)).sealed()
@@ -118,7 +120,8 @@ def publish(
             lambda result: tick(1),
         )
     retry(place, INDEX, lambda: put_object(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
-    text = (root / MANIFEST).read_bytes()
+    with storage_errors(root / MANIFEST):
+        text = (root / MANIFEST).read_bytes()
     if before is not None:
         retry(place, MANIFEST, lambda: put_object(filesystem, f"{base}/{MANIFEST}", text))
     else:

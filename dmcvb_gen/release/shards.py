@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, parse_commit
+from dmcvb_gen.store.manifest import CommitRecord, FileRecord, SubsetRecord, parse_commit
 from dmcvb_gen.store.writer import commit_path, shard_episodes
 
 
@@ -27,11 +27,19 @@ def damage(root: Path, record: SubsetRecord, shard: int) -> str | None:
     if commit is None:
         return "has no commit record"
     for file in commit.files:
-        path = root / file.path
-        if not path.is_file():
-            return f"{file.path} is missing"
-        if path.stat().st_size != file.bytes:
-            return f"{file.path} has {path.stat().st_size} bytes instead of {file.bytes}"
-        if sha256_file(path) != file.sha256:
-            return f"{file.path} does not have its digest"
+        if wrong := wrong_bytes(root, file):
+            return f"{file.path} {wrong}"
     return None
+
+
+def wrong_bytes(root: Path, file: FileRecord) -> str | None:
+    """What is wrong with a file of a release, in words that follow its name; None where every byte is as recorded."""
+    path = root / file.path
+    try:
+        if not path.is_file():
+            return "is missing"
+        if path.stat().st_size != file.bytes:
+            return f"has {path.stat().st_size} bytes instead of {file.bytes}"
+        return None if sha256_file(path) == file.sha256 else "does not have its digest"
+    except OSError as error:
+        return f"cannot be read: {error.strerror or error}"

@@ -16,6 +16,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.pool import Workers, run_all
 from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.store import Subset, open_release
 from dmcvb_gen.store.index import INDEX, Index, read_index, root_digest
 from dmcvb_gen.store.manifest import (
@@ -78,7 +79,8 @@ def check_files(root: Path, workers: Workers = 1) -> Iterator[Finding]:
       workers: processes, or a Ray cluster that sees the folder.
     """
     try:
-        manifest = parse_manifest((root / MANIFEST).read_bytes(), MANIFEST)
+        with storage_errors(root / MANIFEST):
+            manifest = parse_manifest((root / MANIFEST).read_bytes(), MANIFEST)
     except StoreError as error:
         yield Finding("files", MANIFEST, f"is damaged: {error}")
         return
@@ -137,14 +139,8 @@ def subset_of(manifest: Manifest, path: str) -> str:
 
 
 def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Iterator[Finding]:
-    path, name = root / file.path, file.path + what
-    with storage_errors(path):
-        if not path.is_file():
-            yield Finding("files", where, f"{name} is missing")
-        elif path.stat().st_size != file.bytes:
-            yield Finding("files", where, f"{name} has {path.stat().st_size} bytes instead of {file.bytes}")
-        elif sha256_file(path) != file.sha256:
-            yield Finding("files", where, f"{name} does not have its digest")
+    if wrong := wrong_bytes(root, file):
+        yield Finding("files", where, f"{file.path}{what} {wrong}")
 
 
 @dataclass(frozen=True)
@@ -185,7 +181,8 @@ def _check_shards(work: _Shards, tick: Callable[[str], None] = lambda subset: No
                 findings.append(Finding("files", record.name, f"shard {shard} is missing: no {path}"))
             continue
         try:
-            commit = commits[shard] = checked_commit((root / path).read_bytes(), path, record, shard)
+            with storage_errors(root / path):
+                commit = commits[shard] = checked_commit((root / path).read_bytes(), path, record, shard)
         except StoreError as error:
             findings.append(Finding("files", record.name, f"{path} is damaged: {error}"))
             continue
@@ -229,7 +226,9 @@ def verify(
       DmcvbError: there is no release, or nothing is committed.
     """
     root = Path(path)
-    if not (root / MANIFEST).is_file():
+    with storage_errors(root / MANIFEST):
+        there = (root / MANIFEST).is_file()
+    if not there:
         open_release(path)  # says what is the matter
     findings = list(check_files(root, workers))
     damaged = {finding.subset for finding in findings}

@@ -55,7 +55,7 @@ def verify_url(
     def look(file: FileRecord) -> Finding | None:
         path = f"{source.base}/{file.path}"
         try:
-            digest = retry(source.place, file.path, lambda: remote_sha256(source.filesystem, path, file.bytes))
+            digest = retry(source.place, file.path, lambda: remote_sha256(source.filesystem, path, file.bytes), "read")
         except StoreError as error:
             return Finding("files", subset_of(source.manifest, file.path), str(error))
         if digest == file.sha256:

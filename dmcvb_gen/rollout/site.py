@@ -281,7 +281,7 @@ class BucketSite(Site):
                 return {}
             return {path[len(base) + 1 :]: Listed(facts["size"], _time_of(facts)) for path, facts in found.items()}
 
-        return retry(self.place, "the list of files", attempt)
+        return retry(self.place, "the list of files", attempt, "read")
 
     def metadata(self, record, folder):
         path = f"{subset_path(record.name)}/zarr.json"

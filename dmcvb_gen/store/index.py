@@ -249,7 +249,12 @@ def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
     index = trusted_index(root, manifest)
     if index is None:
         raise StoreError(f"{root / INDEX} is damaged; mend it first: dmcvb-gen regenerate {root}")
-    refuse_altered(index, lambda path: (root / path).read_bytes() if (root / path).is_file() else None, str(root))
+
+    def read(path: str) -> bytes | None:
+        with storage_errors(root / path):
+            return (root / path).read_bytes() if (root / path).is_file() else None
+
+    refuse_altered(index, read, str(root))
 
 
 def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> None:

@@ -315,10 +315,7 @@ def open_release(path: str | Path, storage_options: dict | None = None, skip: Co
 
     if not is_url(path):
         root = Path(path)
-        if not (root / MANIFEST).is_file():
-            raise StoreError(f"{path} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
-        with storage_errors(root):
-            manifest = parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
+        manifest = local_manifest(root)
         commits = {subset.name: read_commits(root, subset) for subset in wanted(manifest)}
     else:
         if path.startswith("file:") and "://" not in path:
@@ -343,14 +340,25 @@ def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
       root: the folder, or a manifest's file, whose folder may hold nothing else.
 
     Raises:
-      StoreError: there is none.
+      StoreError: there is none, it is damaged or cannot be read.
     """
     root = Path(root)
-    if root.is_file():
-        return root.parent, parse_manifest(root.read_bytes(), str(root))
-    if not (root / MANIFEST).is_file():
-        raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
-    return root, parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
+    with storage_errors(root):
+        if root.is_file():
+            return root.parent, parse_manifest(root.read_bytes(), str(root))
+    return root, local_manifest(root)
+
+
+def local_manifest(root: Path) -> Manifest:
+    """The manifest in a release's folder.
+
+    Raises:
+      StoreError: there is none, it is damaged or cannot be read.
+    """
+    with storage_errors(root / MANIFEST):
+        if not (root / MANIFEST).is_file():
+            raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
+        return parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
 
 
 def _remote_commits(filesystem: Any, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:

@@ -14,7 +14,7 @@ import fsspec
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.store.manifest import FileRecord
-from dmcvb_gen.store.remote import NO_ROOM, is_refusal, reason, refused
+from dmcvb_gen.store.remote import NO_ROOM, is_refusal, reason, refused, storage_errors
 
 ATTEMPTS = 4
 """Tries of a file before giving up."""
@@ -38,8 +38,11 @@ def protocol(filesystem: fsspec.AbstractFileSystem) -> str:
     return filesystem.protocol if isinstance(filesystem.protocol, str) else filesystem.protocol[0]
 
 
-def retry(place: str, path: str, attempt):
+def retry(place: str, path: str, attempt, doing: str = "move"):
     """Call `attempt` until it succeeds, at most ATTEMPTS times.
+
+    Args:
+      doing: what it does to `path`, in a word; "read" where nothing is written, here or there.
 
     Raises:
       StoreError: access is refused, the disk is full, or it never succeeded.
@@ -68,8 +71,9 @@ def retry(place: str, path: str, attempt):
             raise StoreError(
                 f"no room for {path} ({error.strerror}); what was moved stays, make room and run the same command again"
             ) from None
+        cure = "check the place and the network" if doing == "read" else "what was moved stays"
         raise StoreError(
-            f"cannot move {path} after {ATTEMPTS} tries ({reason(error)}); what was moved stays, run the same command "
+            f"cannot {doing} {path} of {place} after {ATTEMPTS} tries ({reason(error)}); {cure}, run the same command "
             "again"
         ) from None
 
@@ -128,7 +132,9 @@ def upload(
     Raises:
       StoreError: the local file is not the recorded one, or it cannot be put there.
     """
-    if not local.is_file() or local.stat().st_size != record.bytes or sha256_file(local) != record.sha256:
+    with storage_errors(local):
+        sound = local.is_file() and local.stat().st_size == record.bytes and sha256_file(local) == record.sha256
+    if not sound:
         raise StoreError(f"{local} does not have its digest; run `dmcvb-gen regenerate` on the release first")
     options: dict[str, Any] = {"chunksize": PART} if protocol(filesystem) in ("s3", "s3a") else {}
 
@@ -159,7 +165,7 @@ def read_object(filesystem: fsspec.AbstractFileSystem, place: str, path: str) ->
         except FileNotFoundError:
             return None
 
-    return retry(place, path.rsplit("/", 1)[-1], attempt)
+    return retry(place, path.rsplit("/", 1)[-1], attempt, "read")
 
 
 def put_object(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) -> None:

@@ -79,7 +79,8 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
     with storage_errors(root, "write to"), contextlib.ExitStack() as stack:
         if path.exists():
             stack.enter_context(only_writer(root, wait=LOCK_SECONDS))
-            there = parse_manifest(path.read_bytes(), str(path))
+            with storage_errors(path):
+                there = parse_manifest(path.read_bytes(), str(path))
             old = merged(there, manifest, str(root))
             refuse_altered_folder(root, there)
             environments = old.environments
@@ -130,10 +131,11 @@ def _grow(root: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> No
     was interrupted is done again.
     """
     path = root / subset_path(subset.name)
-    node = parse_json((path / ZARR_JSON).read_bytes())
-    known = (node.get("consolidated_metadata") or {}).get("metadata", {}).values()
-    if all(array["shape"][0] >= subset.episodes for array in known if "shape" in array) and known:
-        return
+    with storage_errors(path / ZARR_JSON, decoding=True):
+        node = parse_json((path / ZARR_JSON).read_bytes())
+        known = (node.get("consolidated_metadata") or {}).get("metadata", {}).values()
+        if all(array["shape"][0] >= subset.episodes for array in known if "shape" in array) and known:
+            return
     with tempfile.TemporaryDirectory() as folder:
         for name in metadata_paths(root, subset):
             copy_file(root / name, Path(folder) / (root / name).relative_to(path))

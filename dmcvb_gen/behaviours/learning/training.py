@@ -35,7 +35,7 @@ from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.store.manifest import write_json_atomically
-from dmcvb_gen.store.remote import local_path
+from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 
 __all__ = ["Progress", "Run", "RunConfig", "SacRun", "command_of", "open_run", "read_config"]
@@ -231,8 +231,9 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         )
     if problem := run.problem():
         raise DmcvbError(problem)
-    folder.mkdir(parents=True, exist_ok=True)
-    if shutil.disk_usage(folder).free < 1e9:
-        raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")
-    write_json_atomically(folder / "run.json", json.loads(json.dumps(dataclasses.asdict(config))))
+    with storage_errors(folder, "write to"):
+        folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < 1e9:
+            raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")
+        write_json_atomically(folder / "run.json", json.loads(json.dumps(dataclasses.asdict(config))))
     return run

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 from importlib import resources
 from pathlib import Path
 
 from dmcvb_gen.behaviours.policies.policy_file import read_header
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.files import parse_json
 
 LEVELS = ("expert", "medium", "mixed")
 """Levels that policies have ("random" needs none)."""
@@ -88,8 +89,8 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
             return files
     selection = path / "selection.json"
     why = ""
-    if selection.exists():
-        why = json.loads(selection.read_text()).get("levels", {}).get(level, {}).get("reason") or ""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # what is damaged gives no reason
+        why = parse_json(selection.read_bytes()).get("levels", {}).get(level, {}).get("reason") or ""
     raise PolicyFileError(
         f"{behaviour} has no {level} policy selected{f' ({why})' if why else ''}; run `dmcvb-gen select-checkpoints "
         f"{behaviour}` first"
