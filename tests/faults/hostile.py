@@ -40,6 +40,8 @@ from tests.faults import store_ops
 
 MEMORY, SECONDS = 10**9, 10.0
 """What refusing a case may take."""
+ROUND, ROUNDS = 500, 10**6
+"""Cases from one seed (hypothesis keeps all that it made), and seeds kept free for the rounds of each seed."""
 TOP = Path(__file__).parents[2]
 Files = dict[str, bytes]
 
@@ -723,6 +725,14 @@ class Outcome:
 def run_kind(taker: Taker, kind: str, examples: int, seed: int = 0) -> Outcome:
     """Give `examples` cases of a kind to a taker, the same ones for the same seed."""
     outcome = Outcome()
+    for first in range(0, examples, ROUND):
+        _run_round(taker, kind, min(ROUND, examples - first), ROUNDS * seed + first // ROUND, outcome)
+        if examples > ROUND:
+            print(f"{kind}, {first + ROUND} of {examples}: {outcome}", file=sys.stderr, flush=True)
+    return outcome
+
+
+def _run_round(taker: Taker, kind: str, examples: int, seed: int, outcome: Outcome) -> None:
 
     @hypothesis.seed(seed)
     @settings(
@@ -745,7 +755,6 @@ def run_kind(taker: Taker, kind: str, examples: int, seed: int = 0) -> Outcome:
             outcome.wrong.setdefault(answer["text"].strip().splitlines()[-1][:100], f"{answer['text']}\nof {shown}")
 
     every()
-    return outcome
 
 
 def main() -> int:
