@@ -1,0 +1,115 @@
+"""Behavior cloning from pictures in a few minutes: the score of several networks, batch sizes and rates beside quick's.
+
+    python scripts/bench_profiles.py RELEASE --subset walker-walk/expert/none --minutes 2
+    python scripts/bench_profiles.py RELEASE --subset ant-maze-empty7x7/expert/visible --only quick,paper
+
+Each variant trains as many Adam steps as it makes in the given minutes of one thread (measured first; data are
+held in memory), at a rate that falls to zero, then 30 fresh episodes are scored. Printed is the score, and its share of
+quick's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import torch
+
+from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
+from dmcvb_gen.agents.data import Source, load_data
+from dmcvb_gen.agents.networks import NARROW, PAPER, Architecture
+from dmcvb_gen.agents.trainer import TrainSettings, train
+from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.store import open_release
+
+WARM, TIMED = 5, 40
+"""Adam steps before those that are timed, and these."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is otherwise than in the profile quick."""
+
+    network: Architecture = NARROW
+    batch: int = 64
+    rate: float = 1.0
+    half: bool = True
+    compiled: bool = False
+
+
+VARIANTS = {
+    "quick": Variant(),
+    "batch 32": Variant(batch=32),
+    "batch 128": Variant(batch=128),
+    "half the rate": Variant(rate=0.5),
+    "twice the rate": Variant(rate=2.0),
+    "half as wide": Variant(Architecture((8, 16, 16, 32), (2, 2, 2, 1))),
+    "twice as wide": Variant(Architecture((32, 64, 64, 128), (2, 2, 2, 1))),
+    "four strides": Variant(Architecture((16, 32, 64, 64), (2, 2, 2, 2))),
+    "float32": Variant(half=False),
+    "compiled": Variant(compiled=True),
+    "paper": Variant(PAPER),
+}
+
+
+def make(variant: Variant, data, agent):
+    """A policy with the same random start for the same sizes."""
+    torch.manual_seed(0)
+    return make_policy(agent, make_encoder(agent, data, None, variant.network), data, variant.network)
+
+
+def settings(variant: Variant, steps: int) -> TrainSettings:
+    return TrainSettings(
+        steps=steps,
+        batch_size=variant.batch,
+        evaluate_every=steps,
+        half=variant.half,
+        compile=variant.compiled,
+        rate=variant.rate,
+        decay=True,
+    )
+
+
+def steps_in(seconds: float, variant: Variant, data, agent) -> int:
+    """Adam steps that a variant makes in so many seconds."""
+    learner = make(variant, data, agent)
+    train(learner, data, settings(variant, WARM))
+    started = time.perf_counter()
+    train(learner, data, settings(variant, TIMED))
+    return max(1, round(TIMED * seconds / (time.perf_counter() - started)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("release")
+    parser.add_argument("--subset", required=True)
+    parser.add_argument("--minutes", type=float, default=2.0)
+    parser.add_argument("--only", default=",".join(VARIANTS), help=", ".join(VARIANTS))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    agent, subset = parse_agent("bc"), open_release(options.release)[options.subset]
+    data, quick = load_data([Source(subset)], seed=0), None
+    evaluator = Evaluator(subset, normalization=data.normalization, stack=agent.stack)
+    print(f"{options.subset}, {subset.returns.mean():.1f} in the data, {options.minutes:g} minutes each")
+    for name in options.only.split(","):
+        variant = VARIANTS[name]
+        steps = steps_in(60 * options.minutes, variant, data, agent)
+        learner = make(variant, data, agent)
+        started = time.process_time()
+        train(learner, data, settings(variant, steps))
+        cpu = time.process_time() - started
+        score = evaluator(learner)
+        quick = score.mean if name == "quick" else quick
+        share = "" if quick is None else f", {score.mean / quick:.0%} of quick's"
+        success = "" if score.success is None else f", success {score.success:.0%}"
+        print(
+            f"{name:>15}: {score.mean:7.1f} +- {score.stderr:5.1f}{share}{success}; {steps} steps, "
+            f"{steps * variant.batch / cpu:.0f} samples/s of processor time",
+            flush=True,
+        )
+    evaluator.close()
+
+
+if __name__ == "__main__":
+    main()
