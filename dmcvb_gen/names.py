@@ -33,8 +33,17 @@ GOAL_MODES = (VISIBLE, HIDDEN, FIXED)
 """Settings of mazes: a random goal that is seen (B1) or left out of the pictures (B3's pre-training), and fixed
 pairs of start and goal, left out too (B3)."""
 
+GOAL_PICTURES = (VISIBLE, HIDDEN)
+"""The two kinds of a maze's pictures: with the goal, and without it."""
+
+REWARDS = ("saturated", "geodesic")
+"""How a maze's reward measures the distance to the goal: DMC-VB's way first, then the shortest path's length."""
+
 SPLITS = ("train", "val")
 """Which videos and maze styles: for data, or kept for evaluation."""
+
+LABEL_TYPES = {"depth": "float32", "segmentation": "int16"}
+"""Labels that can be painted a pixel each -> the type of their arrays."""
 
 _MAZE_ID = re.compile(rf"{ANT_MAZE}-(?P<layout>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?(@(?P<reward>\w+))?")
 
@@ -49,7 +58,7 @@ class MazeName:
     Attributes:
       layout: the layout's name.
       rows: a layout of the user's own, its rows joined by "/"; None for one that the package has.
-      reward: how the distance to the goal is measured; None for DMC-VB's.
+      reward: how the distance to the goal is measured, of `REWARDS`; None for DMC-VB's.
     """
 
     layout: str

@@ -219,3 +219,5 @@ def test_show_maze(tmp_path):
     assert result.exit_code == 0, result.output
     assert json.loads(result.output)["path_m"] > 10 and out.read_bytes()[:4] == b"\x89PNG"
     assert CliRunner().invoke(main, ["show-maze", "easy7x7c", "--goal", "0,0"]).exit_code == 2
+    own = CliRunner().invoke(main, ["show-maze", "ant-maze-mine:*****/*...*/*****", "--out", str(out), "--json"])
+    assert own.exit_code == 0 and json.loads(own.stdout)["rows"] == ["*****", "*...*", "*****"], own.output

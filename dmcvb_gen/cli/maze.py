@@ -27,19 +27,22 @@ def _cell(context, parameter, value):
 def show_maze(layout, start, goal, out, as_json):
     """Write a picture of a layout, its distances to a goal and the path there.
 
-    LAYOUT is a name (empty7x7, medium7x7a, ...) or a text file of '*' and spaces.
+    LAYOUT is a name (empty7x7, medium7x7a, ...), a maze's task id, or a text file of '*' and spaces.
 
     \b
     dmcvb-gen show-maze medium7x7a
     dmcvb-gen show-maze my_maze.txt --start 1,1 --goal 3,5 --out my_maze.png
     """
     from dmcvb_gen.errors import UnknownNameError
-    from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, get_layout, load_layout
+    from dmcvb_gen.names import MazeName
+    from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, get_layout, load_layout, make_layout
     from dmcvb_gen.tasks.ant_maze.picture import save_maze_picture
 
-    name = layout.removeprefix("ant-maze-")
-    if name in LAYOUTS:
-        chosen = get_layout(name)
+    name = MazeName.parse(layout) or MazeName(layout)
+    if name.rows:
+        chosen = make_layout(name.layout, name.rows)
+    elif name.layout in LAYOUTS:
+        chosen = get_layout(name.layout)
     elif Path(layout).suffix or Path(layout).exists():
         chosen = load_layout(layout)
     else:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
+from dmcvb_gen.names import GOAL_PICTURES
+
 _OPTIONS = (
     click.option("--size", type=click.IntRange(1), help="Pixels a side.  [default: the manifest's]"),
     click.option("--views", metavar="A,B", help="Mazes: only these views, e.g. egocentric.  [default: all]"),
-    click.option(
-        "--goal", type=click.Choice(["visible", "hidden"]), help="Mazes: only such pictures.  [default: both]"
-    ),
+    click.option("--goal", type=click.Choice(GOAL_PICTURES), help="Mazes: only such pictures.  [default: both]"),
 )
 
 

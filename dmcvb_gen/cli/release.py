@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import OutPath, background_source, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS
 
 
 @click.command()
@@ -159,13 +160,13 @@ def regenerate(
 @click.argument("path", metavar="RELEASE")
 @only_option
 @click.option("--distractor", help="none, static or dynamic.  [default: as each subset has]")
-@click.option("--difficulty", type=click.Choice(["easy", "medium", "hard"]), help="[default: as each subset has]")
+@click.option("--difficulty", type=click.Choice(DIFFICULTIES), help="[default: as each subset has]")
 @click.option("--size", type=int, help="Pixels a side.  [default: as each subset has]")
 @click.option("--renderer", help="native, warp or opengl.  [default: as each subset has]")
 @click.option("--samples", type=click.IntRange(1, 8), help="Samples a pixel: 1, 2, 4 or 8.")
 @click.option("--backgrounds", metavar="FOLDER", help="builtin, or a folder of videos.  [default: the recipe's]")
-@click.option("--split", type=click.Choice(["train", "val"]), help="Videos and styles.  [default: the recipe's]")
-@click.option("--label", "labels", multiple=True, type=click.Choice(["depth", "segmentation"]), help="Store these too.")
+@click.option("--split", type=click.Choice(SPLITS), help="Videos and styles.  [default: the recipe's]")
+@click.option("--label", "labels", multiple=True, type=click.Choice(list(LABEL_TYPES)), help="Store these too.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
 @click.option("--name", help="Name of the new release.  [default: NAME-repainted]")
 @click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")

@@ -22,7 +22,17 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.cli.unheard import check_maze_options, check_way, given_options, is_given, rewarded
-from dmcvb_gen.names import ANT_MAZE, DIFFICULTIES, FIXED, SPLITS, DistractorSetting, family_of, task_folder
+from dmcvb_gen.names import (
+    ANT_MAZE,
+    DIFFICULTIES,
+    FIXED,
+    REWARDS,
+    SPLITS,
+    DistractorSetting,
+    MazeName,
+    family_of,
+    task_folder,
+)
 from dmcvb_gen.store.remote import public
 
 
@@ -41,7 +51,7 @@ def _out_default(name: str) -> str:
 @click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
 @click.option("--episodes-per-goal", type=click.IntRange(1), default=10, show_default=True, help="With --fixed-goals.")
 @click.option("--layout", "layouts", multiple=True, help="Mazes: a layout's name or text file, instead of TASK.")
-@click.option("--reward", type=click.Choice(["saturated", "geodesic"]), help="Mazes: DMC-VB's distance, or the path's.")
+@click.option("--reward", type=click.Choice(REWARDS), help="Mazes: DMC-VB's distance, or the path's.")
 @click.option("--episodes", type=click.IntRange(1), help="Episodes a subset.  [default: 20]")
 @click.option("--steps", type=click.IntRange(1), help="Steps a subset, instead of --episodes.")
 @click.option("--max-steps", type=click.IntRange(1), help="Time limit of an episode.  [default: 500, mazes 600]")
@@ -296,7 +306,7 @@ def _recipe_from_options(tasks, options, given):
 def _layout_task(layout: str) -> str:
     from dmcvb_gen.tasks.ant_maze import layout_task_id
 
-    return layout_task_id(layout) if Path(layout).suffix or Path(layout).exists() else f"ant-maze-{layout}"
+    return layout_task_id(layout) if Path(layout).suffix or Path(layout).exists() else str(MazeName(layout))
 
 
 def _progress(plan, as_json):

@@ -18,6 +18,7 @@ from PIL import Image
 from dmcvb_gen.distractors.backgrounds import FRAME_SIZE
 from dmcvb_gen.distractors.textures import FLOORS, surroundings, texture
 from dmcvb_gen.errors import BackgroundError
+from dmcvb_gen.names import SPLITS
 from dmcvb_gen.store.remote import local_path
 
 GENERATOR = 2
@@ -255,7 +256,7 @@ def _claim(out: Path, seed: int) -> None:
             found = json.loads(note.read_text())
             if found != facts:
                 raise BackgroundError(f"{out} holds clips of {found}, asked for are {facts}; give another --out")
-        elif any((out / split).is_dir() and any((out / split).iterdir()) for split in ("train", "val")):
+        elif any((out / split).is_dir() and any((out / split).iterdir()) for split in SPLITS):
             raise BackgroundError(f"{out} holds videos of another origin; give another --out")
         else:
             out.mkdir(parents=True, exist_ok=True)
@@ -277,7 +278,7 @@ def make_clips(
     """
     out = local_path(out)
     _claim(out, seed)
-    made: dict[str, list[Path]] = {"train": [], "val": []}
+    made: dict[str, list[Path]] = {split: [] for split in SPLITS}
     for split, paths in made.items():
         for index in range(videos):
             path = out / split / f"clip_{index:03d}.webp"
@@ -293,7 +294,7 @@ def clip_sheet(source: str | Path, columns: int = 6) -> np.ndarray:
     from dmcvb_gen.distractors.backgrounds import load_backgrounds
 
     rows = []
-    for split in ("train", "val"):
+    for split in SPLITS:
         backgrounds = load_backgrounds(source, split)
         for video in range(len(backgrounds)):
             frames = backgrounds.frames(video)

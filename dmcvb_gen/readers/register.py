@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.names import DISTRACTOR_KINDS, GOAL_MODES
+from dmcvb_gen.names import DISTRACTOR_KINDS, GOAL_MODES, MazeName
 
 if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 TASKS = ("walker-walk", "cheetah-run", "humanoid-walk")
 """Locomotion tasks (a test holds these lists equal to the tasks' own, which would import MuJoCo)."""
 _LAYOUTS = ("empty7x7", "easy7x7a", "easy7x7b", "easy7x7c", "medium7x7a", "medium7x7b", "medium7x7c")
-MAZES = tuple(f"ant-maze-{layout}" for layout in _LAYOUTS)
+MAZES = tuple(str(MazeName(layout)) for layout in _LAYOUTS)
 NAMESPACE = "dmcvb_gen"
 ENTRY_POINT = "dmcvb_gen.readers.envs:DistractedEnv"
 VECTOR_ENTRY_POINT = "dmcvb_gen.readers.envs:DistractedVectorEnv"

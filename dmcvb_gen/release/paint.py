@@ -22,6 +22,7 @@ import numpy as np
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import copy_file, sha256_file, write_json
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
+from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.pool import Tick, Workers, ignore, open_pool
 from dmcvb_gen.release.regenerate import environment_difference
 from dmcvb_gen.release.shards import damage, read_commit
@@ -49,7 +50,6 @@ from dmcvb_gen.tasks import get_task
 
 ABOUT_THE_PLACE = ("device",)
 """What a painter says of itself that decides no pixel on a CPU."""
-GOALS = ("visible", "hidden")
 REPAINTED = "-repainted"
 """What the name of a release ends in that is painted otherwise than it was published."""
 
@@ -71,8 +71,8 @@ class Look:
     def __post_init__(self):
         if self.size is not None:
             check_size(self.size)
-        if self.goal not in (None, *GOALS):
-            raise DmcvbError(f"goal {self.goal!r} is unknown; give one of {', '.join(GOALS)}")
+        if self.goal not in (None, *GOAL_PICTURES):
+            raise DmcvbError(f"goal {self.goal!r} is unknown; give one of {', '.join(GOAL_PICTURES)}")
 
     def of(self, record: SubsetRecord) -> SubsetRecord:
         """The record of a subset that looks so.
@@ -85,7 +85,7 @@ class Look:
             asked = Pictures(record.views).select(self.views).views
             facts["views"] = tuple(view for view in record.views if view in asked)
         if self.goal is not None and get_task(record.task).goal_geoms:
-            facts |= {"hidden_goal": self.goal == "hidden", "only_shown": True}
+            facts |= {"hidden_goal": self.goal == HIDDEN, "only_shown": True}
         return record.model_copy(update=facts)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.names import ANT_MAZE, DistractorSetting, family_of, select
+from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, family_of, select
 from dmcvb_gen.pool import Tick, Workers, ignore, run_all
 from dmcvb_gen.release.shards import damage
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
@@ -28,7 +28,7 @@ from dmcvb_gen.rollout.site import FolderSite, leave
 from dmcvb_gen.rollout.worker import make_shard
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.manifest import MANIFEST, Addition, CommitRecord, Manifest, SubsetRecord, environment
-from dmcvb_gen.store.pictures import stored_pictures
+from dmcvb_gen.store.pictures import stored_pictures, view_arrays
 from dmcvb_gen.store.reader import Subset
 from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
@@ -36,7 +36,6 @@ from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, 
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
-LABELS = {"depth": "float32", "segmentation": "int16"}
 """Pictures beside the colors -> dtype: depth in meters (0: sky), segmentation by geom id (-1: sky)."""
 COPIED = ("state", "action", "reward", "discount", "physics")
 COPIED_PER_EPISODE = ("length", "terminated", "return", "seed", "behaviour", "goal_pair")
@@ -103,8 +102,8 @@ class PaintJob:
 
 def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
     """Specs of depth and segmentation: "depth", or "depth/<view>" where a task has several views."""
-    names = [(label, label if task.views == ("pixels",) else f"{label}/{v}") for label in labels for v in task.views]
-    return tuple(ArraySpec(name, LABELS[label], (size, size), ("height", "width")) for label, name in names)
+    names = [(label, name) for label in labels for name in view_arrays(label, task.views)]
+    return tuple(ArraySpec(name, LABEL_TYPES[label], (size, size), ("height", "width")) for label, name in names)
 
 
 def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> Manifest:
@@ -158,9 +157,9 @@ def _source(request: Repainting) -> Release:
     release = open_release(request.root)
     if Path(request.out).resolve() == release.path.resolve():
         raise StoreError(f"--out {request.out} is the release itself; give another folder")
-    unknown = [label for label in request.labels if label not in LABELS]
+    unknown = [label for label in request.labels if label not in LABEL_TYPES]
     if unknown:
-        raise DmcvbError(f"unknown label {unknown[0]!r}; known: {', '.join(LABELS)}")
+        raise DmcvbError(f"unknown label {unknown[0]!r}; known: {', '.join(LABEL_TYPES)}")
     if not release.subsets:
         raise StoreError(f"{request.root} has no committed episodes yet; run the rollout first")
     if release.manifest.imported:
@@ -335,9 +334,9 @@ def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tup
 def _label_pictures(task, renderer, physics, exogenous, length, rows, label) -> Iterator[tuple[str, np.ndarray]]:
     """(name, (episode, rows, size, size)) of depth or segmentation, a view each."""
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
-    for view in task.views:
-        out = np.zeros((len(physics), rows, renderer.size, renderer.size), LABELS[label])
+    for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
+        out = np.zeros((len(physics), rows, renderer.size, renderer.size), LABEL_TYPES[label])
         for first in range(0, len(episode), LABEL_FRAMES):
             e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
             out[e, r] = renderer.render_labels(physics[e, r], exogenous[e, r], [view])[label][:, 0]
-        yield (label if task.views == ("pixels",) else f"{label}/{view}"), out
+        yield name, out

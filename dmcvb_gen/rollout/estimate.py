@@ -17,7 +17,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.behaviours.policies.simulate import Simulation
-from dmcvb_gen.names import ANT_MAZE, distractor_of
+from dmcvb_gen.names import ANT_MAZE, LOCOMOTION, distractor_of
 from dmcvb_gen.rollout.jobs import Job
 from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.rollout.plan import Plan
@@ -28,7 +28,7 @@ from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, create_array
 from dmcvb_gen.store.writer import find_array
 from dmcvb_gen.tasks import get_task
 
-SAMPLE_EPISODES = {"locomotion": 2, ANT_MAZE: 6}
+SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
 """Whole episodes simulated for a sample; a maze's vary in length."""
 TIMED_STEPS = 16
 """Steps of a job's whole batch that are timed: a batch's cost a step is not that of a few episodes."""

@@ -45,7 +45,7 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
     """(step, h, w, 3): the top view under the distance field, with the path walked so far."""
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.tasks.ant_maze import as_maze
-    from dmcvb_gen.tasks.ant_maze.distance import look_up, make_field
+    from dmcvb_gen.tasks.ant_maze.distance import floor_pixels, look_up, make_field
     from dmcvb_gen.tasks.ant_maze.layouts import CELL
 
     task = as_maze(get_task(subset.task))
@@ -57,7 +57,7 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
     state = values["state"]
     goal = state[0, task.state_slices["target_position"]]
     field = make_field(task.reward, task.layout, goal)
-    floor = np.kron((~task.layout.walls).astype(float), np.ones((10, 10)))
+    floor = floor_pixels(task.layout)[0].astype(float)
     stacked = np.broadcast_to(field.values, (len(where), *field.values.shape))
     distance = look_up("geodesic", task.layout, stacked, where) / field.largest
     open_ = look_up("geodesic", task.layout, np.broadcast_to(floor, stacked.shape), where) > 0.5

@@ -14,6 +14,7 @@ import pydantic
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
+from dmcvb_gen.names import ANT_MAZE, FIXED, LOCOMOTION, family_of, hides_goal
 from dmcvb_gen.store.schema import SCHEMA_VERSION
 from dmcvb_gen.version import __version__
 
@@ -117,7 +118,7 @@ class SubsetRecord(_Model):
     policies: tuple[PolicyRecord, ...] = ()
     renderer: dict[str, Any] = {}
     backgrounds: dict[str, Any] | None = None
-    family: str = "locomotion"
+    family: str = LOCOMOTION
     views: tuple[str, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
     hidden_goal: bool = False
     max_steps: int = pydantic.Field(default=500, gt=0, le=MAX_STEPS)
@@ -340,10 +341,10 @@ def _upgraded(data: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(old, dict):
             return data
         facts: dict[str, Any] = {"split": (old.get("backgrounds") or {}).get("split") or recipe.get("split", "train")}
-        if str(old.get("task")).startswith("ant-maze"):
-            facts |= {"family": "ant-maze", "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 1200}
-            facts["hidden_goal"] = old.get("setting") in ("hidden", "fixed")
-            if old.get("setting") == "fixed":
+        if family_of(str(old.get("task"))) == ANT_MAZE:
+            facts |= {"family": ANT_MAZE, "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 1200}
+            facts["hidden_goal"] = hides_goal(str(old.get("setting")))
+            if old.get("setting") == FIXED:
                 facts |= _goal_pairs_of_version_1(old, patterns)
         upgraded.append(facts | old)
     return {**data, "subsets": upgraded}
@@ -353,6 +354,6 @@ def _goal_pairs_of_version_1(record: dict[str, Any], patterns: list[dict[str, An
     """How many pairs of start and goal a fixed subset has, from the recipe's pattern that asked for it."""
     for pattern in patterns:
         tasks, per_goal = pattern.get("tasks") or (), pattern.get("episodes_per_goal")
-        if record.get("task") in tasks and "fixed" in (pattern.get("settings") or ()) and per_goal:
+        if record.get("task") in tasks and FIXED in (pattern.get("settings") or ()) and per_goal:
             return {"fixed_goals": record.get("episodes", 0) // per_goal, "episodes_per_goal": per_goal}
     return {}

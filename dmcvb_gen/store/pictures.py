@@ -68,10 +68,12 @@ class Pictures:
 
 def picture_arrays(views: Sequence[str], hide_goal: bool = False) -> tuple[str, ...]:
     """Names of the picture arrays of views: ("pixels",), or ("pixels/top", ...), ("pixels_hidden_goal/top", ...)."""
-    if tuple(views) == ONE_VIEW:
-        return ONE_VIEW
-    folder = HIDDEN if hide_goal else SHOWN
-    return tuple(f"{folder}/{view}" for view in views)
+    return view_arrays(HIDDEN if hide_goal and tuple(views) != ONE_VIEW else SHOWN, views)
+
+
+def view_arrays(folder: str, views: Sequence[str]) -> tuple[str, ...]:
+    """Names of arrays that there are of each view: (folder,) for a task with one, or ("<folder>/<view>", ...)."""
+    return (folder,) if tuple(views) == ONE_VIEW else tuple(f"{folder}/{view}" for view in views)
 
 
 def stored_pictures(record: SubsetRecord, goal: bool) -> tuple[str, ...]:

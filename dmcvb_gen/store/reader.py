@@ -184,7 +184,7 @@ class Subset:
 
     @property
     def pixel_arrays(self) -> tuple[str, ...]:
-        return tuple(name for name in self.arrays if name.split("/")[0].startswith("pixels"))
+        return tuple(name for name in self.arrays if picture_of(name) is not None)
 
     @property
     def episodes(self) -> np.ndarray:

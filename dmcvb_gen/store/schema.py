@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Any
 import zarr
 from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
+from dmcvb_gen.names import setting_moves
 from dmcvb_gen.store.pictures import picture_arrays, stored_pictures
 
 if TYPE_CHECKING:
@@ -200,8 +201,7 @@ def picture_layout_for(setting: str) -> str:
     Moving pictures are smaller as differences of neighboring pixels, a color channel at a time; where the camera
     stands still, zstd finds the repeated rows by itself, and is faster to read.
     """
-    moving = setting.startswith("dynamic") or setting in ("visible", "hidden", "fixed")
-    return "channel-delta-zstd" if moving else "zstd"
+    return "channel-delta-zstd" if setting_moves(setting) else "zstd"
 
 
 def create_arrays(

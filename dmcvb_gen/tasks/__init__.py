@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, PREFIX, ant_maze_task
+from dmcvb_gen.names import ANT_MAZE, family_of
+from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
 
@@ -28,7 +29,7 @@ def get_task(task_id: str) -> Task:
     """
     if task_id in _LOCOMOTION:
         return _LOCOMOTION[task_id]()
-    if task_id.startswith(PREFIX):
+    if family_of(task_id) == ANT_MAZE:
         return ant_maze_task(task_id)
     raise UnknownNameError("task", task_id, task_ids())
 

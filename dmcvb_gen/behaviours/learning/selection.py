@@ -27,7 +27,6 @@ from dmcvb_gen.names import ANT_MAZE, MAZE_TRAINED_LEVELS, TRAINED_LEVELS
 from dmcvb_gen.store.manifest import write_json_atomically
 from dmcvb_gen.tasks import get_task
 
-LEVELS = TRAINED_LEVELS
 EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
 MEDIUM_TOLERANCE = 0.1
 """How far (as a share of the way) an accepted medium checkpoint may be from 50 %."""
@@ -164,7 +163,7 @@ def pick_checkpoints(
     convergence: Convergence,
     measure: Callable[[Path], Evaluation],
     task: str = "",
-    levels: Sequence[str] = LEVELS,
+    levels: Sequence[str] = TRAINED_LEVELS,
     medium: float | None = None,
 ) -> Selection:
     """Pick levels from a curve; every pick is measured on fresh episodes before it is accepted.
@@ -173,7 +172,7 @@ def pick_checkpoints(
       curve: (agent step, return, policy file), in order of steps.
       base: return at 0 % of the way.
       measure: evaluates a policy file on fresh episodes.
-      levels: what to pick, of `LEVELS`.
+      levels: what to pick, of `TRAINED_LEVELS`.
       medium: return that medium is to have; None: half of the way.
     """
     way, check = convergence.value - base, functools.cache(measure)
@@ -289,7 +288,7 @@ def select_checkpoints(
         end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
         if converged is not None:
             end = Convergence(converged, 0.0, True)
-        levels = MAZE_TRAINED_LEVELS if mazes else LEVELS
+        levels = MAZE_TRAINED_LEVELS if mazes else TRAINED_LEVELS
         return pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id))
 
     for attempt in range(5):
@@ -321,7 +320,7 @@ def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies:
 def selection_json(selection: Selection) -> dict:
     """A selection as plain values."""
     levels = {}
-    for level in LEVELS:
+    for level in TRAINED_LEVELS:
         picks = [asdict(pick) | {"evaluation": pick.evaluation.model_dump()} for pick in selection.picks.get(level, ())]
         levels[level] = {"picks": picks, "reason": selection.reasons.get(level)}
     return {

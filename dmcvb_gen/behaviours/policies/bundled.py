@@ -9,9 +9,7 @@ from pathlib import Path
 from dmcvb_gen.behaviours.policies.policy_file import read_header
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
-
-LEVELS = ("expert", "medium", "mixed")
-"""Levels that policies have ("random" needs none)."""
+from dmcvb_gen.names import TRAINED_LEVELS
 
 
 def bundled_folder() -> Path:
@@ -29,7 +27,7 @@ def level_files(folder: Path, level: str) -> list[Path]:
 
 def bundled_levels(task_id: str) -> list[str]:
     """Levels that the package has policies for."""
-    return [level for level in LEVELS if level_files(bundled_folder() / task_id, level)]
+    return [level for level in TRAINED_LEVELS if level_files(bundled_folder() / task_id, level)]
 
 
 def bundled_policies(task_id: str, level: str) -> list[Path]:
@@ -58,7 +56,7 @@ def levels_of(behaviour: str | Path) -> list[str]:
     if path.is_file():
         return [read_header(path).level or path.stem]
     for folder in (path / "selected", path):
-        levels = [level for level in LEVELS if level_files(folder, level)]
+        levels = [level for level in TRAINED_LEVELS if level_files(folder, level)]
         if levels:
             return levels
     raise PolicyFileError(

@@ -6,6 +6,8 @@ import csv
 import functools
 from importlib import resources
 
+from dmcvb_gen.names import MazeName
+
 MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "medium": "ant-maze/multi-obstacle"}
 """Layout's difficulty -> the paper's row, which pools the layouts of a difficulty."""
 
@@ -22,9 +24,9 @@ def _table() -> dict[tuple[str, str], dict[str, float]]:
 
 def paper_task(task_id: str) -> str:
     """The name of a task's row: mazes are pooled by difficulty."""
-    layout = task_id.removeprefix("ant-maze-")
+    maze = MazeName.parse(task_id)
     for difficulty, row in MAZE_GROUPS.items():
-        if task_id != layout and layout.startswith(difficulty):
+        if maze and maze.layout.startswith(difficulty):
             return row
     return task_id
 

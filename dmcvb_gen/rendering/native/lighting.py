@@ -73,8 +73,6 @@ SHARP = 64
 """The least of these exponents."""
 GRAIN = 1000.0
 """Steps of the shadow map's coordinates, when the extent of some points is measured."""
-OUTSIDE = 3e9
-"""A coordinate beyond every body's outline in the shadow map."""
 
 
 @leaf

@@ -6,17 +6,13 @@ an ending "@geodesic" takes the shortest path's length for the reward.
 
 from __future__ import annotations
 
-import re
-
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.tasks.ant_maze.distance import REWARDS
+from dmcvb_gen.names import REWARDS, MazeName
 from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, load_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import AntMaze
 from dmcvb_gen.tasks.base import Task
 
-PREFIX = "ant-maze-"
-ANT_MAZE_TASKS = tuple(PREFIX + name for name in LAYOUTS)
-_ID = re.compile(r"^ant-maze-(?P<name>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?(@(?P<reward>\w+))?$")
+ANT_MAZE_TASKS = tuple(str(MazeName(layout)) for layout in LAYOUTS)
 
 
 def ant_maze_task(task_id: str) -> AntMaze:
@@ -25,13 +21,13 @@ def ant_maze_task(task_id: str) -> AntMaze:
     Raises:
       UnknownNameError, LayoutError: no such layout or reward, or a layout that cannot be used.
     """
-    found = _ID.match(task_id)
-    if not found or (not found["rows"] and found["name"] not in LAYOUTS):
+    name = MazeName.parse(task_id)
+    if not name or (not name.rows and name.layout not in LAYOUTS):
         raise UnknownNameError("task", task_id, ANT_MAZE_TASKS)
-    reward = found["reward"] or REWARDS[0]
+    reward = name.reward or REWARDS[0]
     if reward not in REWARDS:
         raise UnknownNameError("reward", reward, REWARDS)
-    layout = make_layout(found["name"], found["rows"]) if found["rows"] else get_layout(found["name"])
+    layout = make_layout(name.layout, name.rows) if name.rows else get_layout(name.layout)
     return AntMaze(layout, reward, task_id)
 
 
@@ -53,7 +49,7 @@ def layout_task_id(path) -> str:
       LayoutError: the file is no layout.
     """
     layout = load_layout(path)
-    return f"{PREFIX}{layout.name}:{layout.text}"
+    return str(MazeName(layout.name, layout.text))
 
 
 __all__ = [

@@ -15,13 +15,13 @@ import skfmm
 from scipy import ndimage
 
 from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.names import REWARDS
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 PIXELS = 10
 """Pixels a cell's side."""
 SATURATION = 5
 """Travel time from the walls, in pixels, from which on the wave is as fast as it gets."""
-REWARDS = ("saturated", "geodesic")
 
 
 class DistanceField:
@@ -46,15 +46,16 @@ def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return floor, np.minimum(from_walls, SATURATION) / SATURATION, nearest
 
 
+def center_pixel(cell: tuple[int, int]) -> tuple[int, int]:
+    """(row, column) of the pixel below and right of a cell's center."""
+    row, column = cell
+    return row * PIXELS + PIXELS // 2, column * PIXELS + PIXELS // 2
+
+
 def floor_pixels(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """(row, column) bool, the floor; (2, row, column) int, row and column of the floor pixel nearest to each."""
     floor, _, nearest = _floor(layout)
     return floor, nearest
-
-
-def floor_speed(layout: Layout) -> np.ndarray:
-    """(row, column) float64 in [0, 1]: how fast the saturated measure's wave is, 0 in walls."""
-    return _floor(layout)[1]
 
 
 def _finish(times: np.ndarray, layout: Layout) -> DistanceField:

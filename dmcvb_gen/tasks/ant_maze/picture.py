@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import REWARDS
 from dmcvb_gen.tasks.ant_maze.arena import GOAL_RADIUS
-from dmcvb_gen.tasks.ant_maze.distance import REWARDS, descend, geodesic_field, make_field
+from dmcvb_gen.tasks.ant_maze.distance import center_pixel, descend, floor_pixels, geodesic_field, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 
@@ -18,7 +19,7 @@ def farthest_cells(layout: Layout) -> tuple[tuple[int, int], tuple[int, int]]:
     for goal in layout.free:
         field = geodesic_field(layout, layout.world(goal))
         for start in layout.free:
-            value = field.values[start[0] * 10 + 5, start[1] * 10 + 5]
+            value = field.values[center_pixel(start)]
             if value > best:
                 best, pair = value, (start, goal)
     return pair
@@ -86,7 +87,7 @@ def save_maze_picture(
     layout.check_cell(goal, "goal")
     rows, columns = layout.shape
     extent = (-columns * CELL / 2, columns * CELL / 2, -rows * CELL / 2, rows * CELL / 2)
-    floor = np.kron(~layout.walls, np.ones((10, 10), bool))
+    floor, _ = floor_pixels(layout)
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     axes = figure.subplots(1, 1 + len(REWARDS))
     axes[0].imshow(np.where(floor, 1.0, 0.3), cmap="gray", vmin=0, vmax=1, extent=extent)
@@ -113,5 +114,5 @@ def save_maze_picture(
     axes[0].set_ylabel("y (m)")
     _write(figure, path)
     geodesic = facts["geodesic"]
-    length = float(geodesic.values[start[0] * 10 + 5, start[1] * 10 + 5])
+    length = float(geodesic.values[center_pixel(start)])
     return {"start": list(start), "goal": list(goal), "path_m": length, "largest_m": geodesic.largest}

@@ -25,7 +25,7 @@ from dmcvb_gen.tasks.ant_maze.arena import (
     build_arena,
     look_numbers,
 )
-from dmcvb_gen.tasks.ant_maze.distance import geodesic_field, look_up, make_field
+from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
 
@@ -105,7 +105,7 @@ class AntMazeBatch(EpisodeBatch):
             "sensors_touch": _sensor_columns(model, "_touch"),
             "sensors_velocimeter": _sensor_columns(model, "torso_vel"),
         }
-        shape = tuple(10 * cells for cells in task.layout.shape)
+        shape = tuple(PIXELS * cells for cells in task.layout.shape)
         self._fields, self._largest = np.zeros((size, *shape)), np.ones(size)
         self._touched = np.zeros(size, bool)
         self._paths: np.ndarray | None = None
