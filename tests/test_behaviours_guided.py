@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.guided import Student, draw_places
+from dmcvb_gen.behaviours.learning.guided import EVALUATION_STEPS, Student, draw_places
 from dmcvb_gen.behaviours.learning.networks import Way, as_arrays
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.training import open_run
 from dmcvb_gen.behaviours.policies.actor import Policy
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
 from dmcvb_gen.behaviours.policies.way import headed, places
 from dmcvb_gen.errors import DmcvbError
@@ -117,6 +118,22 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
         with torch.no_grad():
             errors.append(float(((way(torch.from_numpy(place)) - told) ** 2).sum(1).mean()))
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp_path, monkeypatch):
+    """Counted from outside: agent steps that evaluations were asked to simulate, for those that were trained."""
+    asked, known = [], load_policy(bundled_policies("ant-maze-easy7x7a", "expert")[0]).header.evaluation
+
+    def counted(policy, task, episodes=100, **given):
+        asked.append(episodes * task.max_steps)
+        return known, None
+
+    monkeypatch.setattr(runs, "evaluate", counted)
+    run = open_run(tmp_path / "run", config(steps=192, evaluate_every=64, evaluate_sparse=64), False)
+    run.train()
+    assert asked == [4 * 600] * 3 and sum(asked) <= EVALUATION_STEPS * 192
+    run.step += 100_000
+    assert run.evaluation_episodes() == 60  # however long none was
 
 
 def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):

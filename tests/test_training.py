@@ -15,6 +15,7 @@ from dmcvb_gen.behaviours.learning.episodes import standing_states
 from dmcvb_gen.behaviours.learning.runs import RunConfig, check_same
 from dmcvb_gen.behaviours.learning.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
 from dmcvb_gen.behaviours.learning.training import SacRun, open_run
+from dmcvb_gen.behaviours.policies.bundled import bundled_policies
 from dmcvb_gen.behaviours.policies.header import PolicyHeader
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
@@ -200,6 +201,9 @@ def test_standing_states_stand():
     assert (state[:, task.state_slices["head_height"]] > 1.4).all()
 
 
+POLICY = str(bundled_policies("walker-walk", "expert")[0])
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -213,6 +217,11 @@ def test_standing_states_stand():
         (["walker-walk", "--algo", "td3", "--set", "batch_size=0"], "greater than 0"),
         (["walker-walk", "--steps", "0"], "x>=1"),
         (["walker-walk", "--steps", "100"], "all warm-up (5000 steps)"),
+        (["walker-walk", "--steps", "4000", "--init-from", POLICY], "or less warm-up: --set warmup_steps=N"),
+        (["walker-walk", "--algo", "td3", "--steps", "4000"], "or less warm-up: --set learning_starts=N"),
+        (["walker-walk", "--steps", "5080", "--set", "updates_per_step=0.01"], "come to 0.88 updates"),
+        (["walker-walk", "--steps", "5001", "--set", "simulations=1", "--set", "actor_every=9"], "changes after 9"),
+        (["ant-maze-easy7x7a", "--algo", "guided", "--steps", "9", "--set", "simulations=3"], "come to 0.54 updates"),
         (["walker-walk", "--config", "/nowhere.yaml"], "nowhere"),
         (["walker-walk", "--set", "buffer_size=4000"], "buffer_size 4000 holds fewer steps than warmup_steps 5000"),
     ],

@@ -161,7 +161,10 @@ class Run(abc.ABC):
       header: of its policy files, without evaluation and agent step.
       step: agent steps so far.
       seconds: of training so far, evaluations left out.
+      warmup_setting: the setting that says how long nothing is learned.
     """
+
+    warmup_setting = "warmup_steps"
 
     def __init__(self, folder: Path, config: RunConfig):
         self.folder, self.config = Path(folder), config
@@ -213,6 +216,22 @@ class Run(abc.ABC):
     def problem(self) -> str | None:
         """Why a run with these settings would come to nothing, and the cure; None where nothing is wrong."""
         return None
+
+    def too_few_updates(self, warmup: int, needed: int = 1) -> str | None:
+        """A problem where the updates of all steps come to less than the policy needs to change once.
+
+        Args:
+          warmup: agent steps before the first update; `updates_per_step` come for every one after.
+          needed: updates until the policy changes.
+        """
+        together, rate = self.settings.simulations, self.settings.updates_per_step
+        rounds = -(-self.config.steps // together) - max(-(-warmup // together), 1) + 1
+        if rounds * together * rate >= needed:
+            return None
+        return (
+            f"{self.config.steps} steps come to {rounds * together * rate:.3g} updates and the policy changes after "
+            f"{needed}, so nothing would be learned; give more --steps, or a higher --set updates_per_step"
+        )
 
     @abc.abstractmethod
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:

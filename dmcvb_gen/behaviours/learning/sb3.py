@@ -60,6 +60,8 @@ class _Ticker(BaseCallback):
 class Sb3Run(Run):
     """A run of `sb3-sac`, `tqc`, `td3` or `ppo`."""
 
+    warmup_setting = "learning_starts"
+
     def network(self) -> dict[str, Any]:
         settings, name = self.settings, self.config.algorithm
         fields: dict[str, Any] = {"hidden": tuple(settings.hidden)}

@@ -48,7 +48,7 @@ class SacRun(Run):
         return {"hidden": tuple(self.settings.actor_hidden)}
 
     def warmup(self) -> int:
-        return 0 if self.config.init_from else self.settings.warmup_steps
+        return self.settings.warmup_steps  # also from --init-from: then the policy's own steps fill the buffer
 
     def problem(self) -> str | None:
         settings = self.settings
@@ -57,7 +57,7 @@ class SacRun(Run):
                 f"buffer_size {settings.buffer_size} holds fewer steps than warmup_steps {settings.warmup_steps}, so "
                 "nothing would ever be learned; give --set buffer_size of at least that"
             )
-        return None
+        return self.too_few_updates(settings.warmup_steps, settings.actor_every)
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: Tick) -> None:
         loop, next_evaluation = SacLoop(self, saved), self.config.evaluate_every
@@ -227,7 +227,8 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
     run = run_class(config.algorithm)(folder, config)
     if config.steps <= run.warmup():
         raise DmcvbError(
-            f"{config.steps} steps are all warm-up ({run.warmup()} steps), nothing would be learned; give more --steps"
+            f"{config.steps} steps are all warm-up ({run.warmup()} steps), nothing would be learned; give more "
+            f"--steps, or less warm-up: --set {run.warmup_setting}=N"
         )
     if problem := run.problem():
         raise DmcvbError(problem)
