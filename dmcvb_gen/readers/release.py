@@ -48,9 +48,9 @@ class SubsetReader(Subset):
                 part = xarray.open_zarr(
                     path, group=folder or None, consolidated=None, chunks=None, storage_options=options
                 )
-            part = guarded(part.reset_coords(), f"{path}/{folder}".rstrip("/"))
             # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
-            part = part.rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
+            part = part.reset_coords().rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
+            part = guarded(part, f"{path}/{folder}".rstrip("/"))
             parts.append(part.rename({name: f"{folder}_{name}".replace("/", "_") for name in part} if folder else {}))
         merged = xarray.merge(parts, combine_attrs="override")
         merged = merged.isel(episode=chosen).assign_coords(episode=chosen, step=np.arange(merged.sizes["step"]))
