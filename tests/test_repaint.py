@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -11,12 +17,14 @@ from click.testing import CliRunner
 from dmcvb_gen.behaviours.policies import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
+from dmcvb_gen.files import PARTIAL
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
-from dmcvb_gen.release.verify import verify
+from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.store import open_release
 from tests.conftest import roll_out, small_recipe
+from tests.faults.commands import GRACE, session
 
 
 @pytest.fixture
@@ -55,6 +63,37 @@ def test_two_processes_paint_the_same_bytes_as_one(small_release, dynamic, tmp_p
     assert len(list((dynamic / "commits").rglob("*.json"))) > 1  # else one process does it all
     assert shard_bytes(tmp_path / "r", name) == shard_bytes(dynamic, name) != {}
     assert len(ticks) > 1
+
+
+def test_a_stopped_repaint_leaves_no_process_and_goes_on_to_a_clean_folder(small_release, tmp_path):
+    out, patterns = tmp_path / "r", ["*/*/none", "*/*/dynamic"]
+    words = ["repaint", str(small_release), "--out", str(out), "--size", "48", "--workers", "2"]
+    words += [word for pattern in patterns for word in ("--only", pattern)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dmcvb_gen", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        while process.poll() is None and not any(path.is_file() for path in out.glob("**/c/**/*")):
+            time.sleep(0.01)  # until a shard is being written: the other setting of its job is still to come
+        assert process.poll() is None and len(session(process.pid)) >= 3
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode not in (0, 2) and "Traceback" not in errors and "Exception ignored" not in errors
+        deadline = time.time() + GRACE
+        while session(process.pid) and time.time() < deadline:
+            time.sleep(0.05)
+        assert not session(process.pid)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert len(list(out.glob("commits/**/*.json"))) < 4
+    assert repaint(Repainting(small_release, out, patterns, size=48)).complete
+    assert not [path for path in out.rglob("*") if path.name.endswith(PARTIAL)]
+    assert not list(check_files(out))
 
 
 def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dynamic, small_release):
