@@ -287,6 +287,36 @@ def test_a_ray_cluster_that_loses_a_node_and_gains_one_makes_the_same_release(wh
 
 
 @pytest.mark.slow
+def test_a_ray_cluster_paints_regenerates_and_repaints_as_one_process_does(tmp_path):
+    ray = pytest.importorskip("ray")
+    recipe = quick_recipe(WALKER | {"episodes": 2}, MAZE | {"episodes": 2, "tasks": TINY_MAZE, "levels": "random"})
+    plan = prepare(make_plan(recipe, tmp_path / "light", pixels=False))
+    list(run_jobs(plan.jobs))
+    finish(plan)
+    made = {}
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    try:
+        for name, how in {"ray": ["--executor", "ray"], "here": []}.items():
+            light = tmp_path / name / "light"
+            shutil.copytree(tmp_path / "light", light)
+            for command in (
+                ["paint", light],
+                ["regenerate", light, "--out", tmp_path / name / "again"],
+                ["repaint", light, "--size", "12", "--out", tmp_path / name / "larger"],
+            ):
+                result = CliRunner().invoke(main, [str(word) for word in [*command, *how]])
+                assert result.exit_code == 0, result.output
+            for folder in ("light", "again", "larger"):
+                found = contents(tmp_path / name / folder)  # Ray's workers live on for a moment, their stages with them
+                made[name, folder] = {path: data for path, data in found.items() if not path.startswith(".")}
+    finally:
+        ray.shutdown()
+    for folder in ("light", "again", "larger"):
+        assert made["ray", folder] == made["here", folder], folder
+    assert len(made["ray", "light"]) > len(contents(tmp_path / "light"))
+
+
+@pytest.mark.slow
 def test_a_ray_cluster_verifies_exports_and_validates_as_one_process_does(tmp_path):
     ray = pytest.importorskip("ray")
     few = {"levels": "random", "episodes": 2}
