@@ -14,9 +14,11 @@ from PIL import Image
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import PARTIAL
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.paint import without_pictures
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.index import card_files
 from dmcvb_gen.store.pictures import training_pictures
 from dmcvb_gen.store.writer import sha256_file
 
@@ -144,6 +146,21 @@ def test_a_changelog_of_the_authors_is_kept(copy):
     (copy / "CHANGELOG.md").write_text("# Ours\n\n## 1.0.0\n\n- Much better.\n")
     result = CliRunner().invoke(main, ["card", str(copy)])
     assert result.exit_code == 0 and "Much better" in (copy / "CHANGELOG.md").read_text() and check_card(copy) == []
+
+
+def test_a_card_is_replaced_whole_or_not_at_all(copy, monkeypatch):
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+
+    def killed(frames, *more, **options):
+        (copy / f"card/.episodes.parquet.elsewhere@1.x{PARTIAL}").write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("dmcvb_gen.release.episode_table._frames", killed)
+    with pytest.raises(StoreError, match="No space left on device; give --out"):
+        write_card(copy)
+    kept = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file() and path.suffix != PARTIAL}
+    assert kept == before
+    assert [file.path for file in card_files(copy) if PARTIAL in file.path] == [] and check_card(copy) == []
 
 
 def test_a_card_can_lie_elsewhere(carded, tmp_path):

@@ -21,6 +21,7 @@ from safetensors.torch import save_file
 from dmcvb_gen.agents.data import StoredFrames, TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import remove_partial, replacing
 
 HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
 """At least so many batches, and transitions, of the hold-out are what a test loss is the mean of."""
@@ -205,13 +206,12 @@ def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: 
     for name, optimizer in learner.optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer/{name}/{index}/{key}": value for key, value in state.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".partial")
     facts = {"step": step, "curve": curve, "seconds": seconds}
     # TD3-BC's frozen target shares its body: what is stored once must be stored as two
     tensors = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
-    save_file(tensors, str(temporary), metadata={"facts": json.dumps(facts)})
-    temporary.replace(path)
+    remove_partial(path.parent, below=False)  # of a process that was killed
+    with replacing(path) as temporary:
+        save_file(tensors, str(temporary), metadata={"facts": json.dumps(facts)})
 
 
 def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float]:

@@ -10,6 +10,7 @@ import io
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ from PIL import Image
 from dmcvb_gen.distractors.backgrounds import FRAME_SIZE
 from dmcvb_gen.distractors.textures import FLOORS, surroundings, texture
 from dmcvb_gen.errors import BackgroundError
+from dmcvb_gen.files import replacing, write_text
 from dmcvb_gen.names import SPLITS
 from dmcvb_gen.store.remote import local_path
 
@@ -230,20 +232,11 @@ def make_clip(seed: int, split: str, index: int) -> np.ndarray:
 def save_clip(path: Path, frames: np.ndarray) -> None:
     """Write frames (n, h, w, 3) uint8 as an animated WebP, whole or not at all."""
     pictures = [Image.fromarray(frame) for frame in frames]
-    part = path.with_name(f".{path.name}.part")  # hidden: nobody takes it for a video
+    duration = round(1000 / FRAMES_PER_SECOND)
+    options: dict[str, Any] = dict(save_all=True, duration=duration, loop=0, quality=QUALITY, method=6)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pictures[0].save(
-            part,
-            "WEBP",
-            save_all=True,
-            append_images=pictures[1:],
-            duration=round(1000 / FRAMES_PER_SECOND),
-            loop=0,
-            quality=QUALITY,
-            method=6,
-        )
-        part.replace(path)
+        with replacing(path) as part:
+            pictures[0].save(part, "WEBP", append_images=pictures[1:], **options)
     except OSError as error:
         raise BackgroundError(f"cannot write {path}: {error.strerror or error}; give another --out") from None
 
@@ -259,8 +252,7 @@ def _claim(out: Path, seed: int) -> None:
         elif any((out / split).is_dir() and any((out / split).iterdir()) for split in SPLITS):
             raise BackgroundError(f"{out} holds videos of another origin; give another --out")
         else:
-            out.mkdir(parents=True, exist_ok=True)
-            note.write_text(json.dumps(facts))
+            write_text(note, json.dumps(facts))
     except (OSError, ValueError) as error:
         raise BackgroundError(f"cannot use {out} ({error}); give another --out") from None
 

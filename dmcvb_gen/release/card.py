@@ -20,6 +20,7 @@ from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import remove_partial, replacing, write_text
 from dmcvb_gen.names import ANT_MAZE, distractor_of
 from dmcvb_gen.readers.painted import Painting, painted_release
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
@@ -66,15 +67,20 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     told = _told(folder, release.manifest)
     published = Publication(page_of(url) if url else told.url, told.date)
     try:
-        write_table(release, folder / TABLE)
+        for place in (folder, folder / CARD_FOLDER):
+            remove_partial(place, below=False)  # of a writer that was killed
+        with replacing(folder / TABLE) as part:
+            write_table(release, part)
         texts = _texts(release, folder / TABLE, published)
         if not (folder / CHANGELOG).exists():
             manifest = release.manifest
             texts[CHANGELOG] = f"# Changelog of {manifest.name}\n\n## {manifest.version}\n\n- First release.\n"
         for name, text in texts.items():
-            (folder / name).write_text(text)
-        plot_returns(release, folder / PLOT)
-        Image.fromarray(_sheet(release)).save(folder / SHEET)
+            write_text(folder / name, text)
+        with replacing(folder / PLOT) as part:
+            plot_returns(release, part)
+        with replacing(folder / SHEET) as part:
+            Image.fromarray(_sheet(release)).save(part, "PNG")
     except OSError as error:
         raise StoreError(f"cannot write the card to {folder}: {error.strerror or error}; give --out") from None
     if folder.resolve() == release.path.resolve():
@@ -416,7 +422,7 @@ def _limits(release: Release) -> list[str]:
 
 
 def plot_returns(release: Release, path: Path) -> None:
-    """Box plots of episode returns, a row a task and level, the paper's five numbers beneath each."""
+    """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each."""
     from matplotlib.figure import Figure
 
     groups: dict[tuple[str, str], list[np.ndarray]] = {}
@@ -442,4 +448,4 @@ def plot_returns(release: Release, path: Path) -> None:
         patch.set_facecolor(shade)
     axes.set_yticks(places, labels)
     axes.set_xlabel("episode return (minimum, quartiles, maximum)")
-    figure.savefig(path, dpi=100, metadata={"Software": None})
+    figure.savefig(path, format="png", dpi=100, metadata={"Software": None})

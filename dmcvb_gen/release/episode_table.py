@@ -52,7 +52,6 @@ def write_table(release: Release, path: Path) -> None:
     Raises:
       StoreError: something cannot be read or written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(path, _schema(), compression="zstd") as writer:
         for subset in release.subsets.values():
             for first in range(0, len(subset.episodes), ROWS):

@@ -166,7 +166,8 @@ def video_paths(root: Path, record: SubsetRecord) -> list[str]:
 def card_files(root: Path) -> list[FileRecord]:
     """The files of the card that are there."""
     names = [name for name in CARD_FILES if (root / name).is_file()]
-    names += [f"{CARD_FOLDER}/{path.name}" for path in sorted((root / CARD_FOLDER).glob("*")) if path.is_file()]
+    whole = sorted(path for path in (root / CARD_FOLDER).glob("[!.]*") if path.is_file())  # hidden: in the making
+    names += [f"{CARD_FOLDER}/{path.name}" for path in whole]
     return [_record(root, name) for name in names]
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dmcvb_gen.behaviours.policies.header import Evaluation
+from dmcvb_gen.files import remove_partial, replacing
 
 COLUMNS = ("step", "seconds", "return_mean", "return_std", "success", "speed", "alpha", "updates")
 """Agent steps; seconds of training; returns of the evaluation's episodes; share of episodes that the task ended and
@@ -53,11 +54,10 @@ class RunLog:
         self._path = folder / "progress.csv"
         rows = [row for row in read_rows(folder) if int(row["step"]) <= step]
         self.curve = {int(row["step"]): float(row["return_mean"]) for row in rows}
-        temporary = self._path.with_name(".progress.csv.partial")
-        with temporary.open("w", newline="") as file:
+        remove_partial(folder, below=False)  # of a process that was killed
+        with replacing(self._path) as temporary, temporary.open("w", newline="") as file:
             csv.DictWriter(file, COLUMNS, lineterminator="\n").writeheader()
             _write(file, rows)
-        temporary.replace(self._path)
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
 
     def add(
