@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import dmcvb_gen
@@ -128,6 +129,34 @@ def test_the_package_and_its_metadata_say_one_version():
     module, _, name = place.rpartition(".")
     assert getattr(importlib.import_module(module), name) == dmcvb_gen.__version__
     assert re.fullmatch(r"\d+\.\d+\.\d+\S*", dmcvb_gen.__version__)
+
+
+def test_what_is_imported_is_declared():
+    """Every package that a module imports, anywhere in it, is a dependency or belongs to an extra for users."""
+    project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    lines = project["dependencies"] + [line for name in extras if name not in ("test", "docs") for line in extras[name]]
+    declared = {_plain(re.match(r"[\w.-]+", line)[0]) for line in lines}
+    distributions, missing = packages_distributions(), set()
+    for name, path in modules().items():
+        for module in _modules_named(ast.parse(path.read_text())):
+            top = module.split(".")[0]
+            known = {_plain(package) for package in distributions.get(top, [top])}
+            if top not in {*sys.stdlib_module_names, "dmcvb_gen"} and not known & declared:
+                missing.add(f"{name} imports {module}, of {' or '.join(sorted(known))}")
+    assert not missing, "\n".join(sorted(missing))
+
+
+def _modules_named(tree: ast.AST) -> set[str]:
+    """Modules that import statements name, wherever they stand."""
+    nodes = list(ast.walk(tree))
+    plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    return plain | {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+
+
+def _plain(package: str) -> str:
+    """A package's name as indices compare it."""
+    return re.sub(r"[-_.]+", "-", package).lower()
 
 
 def test_reading_a_store_needs_no_simulator():
