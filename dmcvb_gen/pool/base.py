@@ -17,6 +17,8 @@ IN_FLIGHT = 2
 """Pieces of work handed out for each worker: one at work, one that waits for it."""
 POLL_SECONDS = 0.2
 """How often progress is passed on while no result comes."""
+TIDY: list[Callable[[], None]] = []
+"""What a worker that outlives the command (a cluster's) does after each piece of work: nobody tells it of the end."""
 KEPT = "what was committed is safe: run the same command again"
 
 

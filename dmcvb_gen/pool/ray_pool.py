@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.pool.base import IN_FLIGHT, POLL_SECONDS, Later, Needs, Pool, Tick, ignore, limit_threads
+from dmcvb_gen.pool.base import IN_FLIGHT, POLL_SECONDS, TIDY, Later, Needs, Pool, Tick, ignore, limit_threads
 
 
 class RayPool(Pool):
@@ -140,5 +140,9 @@ def _work(function, arguments, threads: int) -> tuple[list[tuple], Any]:
         else:
             told.append(facts)
 
-    result = function(*arguments, tick=tell)
-    return told, result.wait() if isinstance(result, Later) else result
+    try:
+        result = function(*arguments, tick=tell)
+        return told, result.wait() if isinstance(result, Later) else result
+    finally:
+        for tidy in TIDY:
+            tidy()

@@ -28,6 +28,7 @@ from typing import Any
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.pool import ignore
+from dmcvb_gen.pool.base import TIDY
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, release_inputs
 from dmcvb_gen.store.index import metadata_paths
 from dmcvb_gen.store.manifest import (
@@ -390,6 +391,13 @@ def leave(site: Site) -> None:
     stage = _stages.pop(site, None)
     if stage is not None:
         stage.close()
+
+
+@TIDY.append
+def leave_all() -> None:
+    """Remove this process's stages."""
+    for site in list(_stages):
+        leave(site)
 
 
 class Sender:
