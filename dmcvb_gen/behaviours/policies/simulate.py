@@ -15,7 +15,7 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policies.actor import Policy
 from dmcvb_gen.seeding import episode_seed, episode_stream
-from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.base import EpisodeBatch, Task
 
 
 @dataclass(frozen=True)
@@ -125,25 +125,40 @@ def simulate(
       goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
       max_steps: agent steps at which an episode ends, if not the task's time limit.
     """
-    chosen = np.asarray(episodes, int)
-    size, limit = len(chosen), max_steps or task.max_steps
+    chosen, limit = np.asarray(episodes, int), max_steps or task.max_steps
     starts, noise = (
         [episode_stream(seed, names, int(i), name) for i in chosen] for name in ("initial_state", "policy")
     )
-    behaviour = (chosen % len(policies)).astype(np.int16)
-    pair = np.full(size, -1, np.int16)
-    if goal_pairs is not None:
-        pair[:] = chosen // (episodes_per_goal or 1)
     out = _empty(task, chosen, limit)
-    out.behaviour[:], out.goal_pair[:] = behaviour, pair
+    out.behaviour[:] = chosen % len(policies)
     out.seed[:] = [episode_seed(seed, names, int(i)) for i in chosen]
+    if goal_pairs is not None:
+        out.goal_pair[:] = chosen // (episodes_per_goal or 1)
     started = time.perf_counter()
-    batch = task.batch(size, threads)
-    state = (
-        batch.reset(starts) if goal_pairs is None else batch.reset_fixed(starts, [goal_pairs[k] for k in pair.tolist()])
-    )
+    batch = task.batch(len(chosen), threads)
+    pairs = None if goal_pairs is None else [goal_pairs[k] for k in out.goal_pair.tolist()]
+    state = batch.reset(starts) if pairs is None else batch.reset_fixed(starts, pairs)
     out.seconds["physics"] += time.perf_counter() - started
-    active = np.ones(size, bool)
+    _step_to_the_end(batch, state, policies, noise, deterministic, out)
+    return out
+
+
+def _step_to_the_end(
+    batch: EpisodeBatch,
+    state: np.ndarray,
+    policies: Sequence[Policy],
+    noise: Sequence[np.random.Generator],
+    deterministic: bool,
+    out: Simulation,
+) -> None:
+    """Step episodes that have just started until all have ended, and put what happens into `out`.
+
+    Args:
+      state: (size, state) of the first observations.
+      noise: one generator an episode, of its drawn actions.
+    """
+    limit, action_size = out.state.shape[1] - 1, batch.task.action_size
+    active = np.ones(len(state), bool)
     for step in range(limit + 1):
         out.state[active, step] = state[active]
         out.physics[active, step] = batch.physics()[active]
@@ -152,7 +167,7 @@ def simulate(
             break
         started = time.perf_counter()
         seen = batch.behaviour_observation()
-        actions = _actions(policies, behaviour, noise, seen, active, task.action_size, deterministic)
+        actions = _actions(policies, out.behaviour, noise, seen, active, action_size, deterministic)
         acted = time.perf_counter()
         result = batch.step(actions, active)
         out.seconds["policy"] += acted - started
@@ -163,4 +178,3 @@ def simulate(
         out.discount[active, step] = np.where(ended[active], 0.0, 1.0)
         out.terminated[ended] = True
         out.length[ended] = step + 1
-    return out
