@@ -13,6 +13,7 @@ import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
+from dmcvb_gen.release import paint
 from dmcvb_gen.release.paint import paint_release, without_pictures
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import commit_path
@@ -68,6 +69,34 @@ def test_painting_a_light_release_gives_the_files_of_a_painted_one(made, tmp_pat
     assert told["digest"] == open_release(made / "painted").manifest.digest
     mine, theirs = files(tmp_path / "copy"), files(made / "painted")
     assert {n: v for n, v in mine.items() if n != ".lock"} == {n: v for n, v in theirs.items() if n != ".lock"}
+
+
+@pytest.mark.parametrize("moment", ["only_writer", "paint_shard"])
+def test_two_who_paint_a_release_end_in_what_one_ends_in(made, tmp_path, monkeypatch, moment):
+    """Another one paints all of it before the first has the lock, or while the first is about to paint a shard."""
+    shutil_copy(made / "light", tmp_path / "copy")
+    mine = getattr(paint, moment)
+
+    def meanwhile(*arguments, **options):
+        monkeypatch.setattr(paint, moment, mine)
+        paint_release(tmp_path / "copy")
+        return mine(*arguments, **options)
+
+    monkeypatch.setattr(paint, moment, meanwhile)
+    paint_release(tmp_path / "copy")
+    found, wanted = files(tmp_path / "copy"), files(made / "painted")
+    assert {n: v for n, v in found.items() if n != ".lock"} == {n: v for n, v in wanted.items() if n != ".lock"}
+
+
+def test_painting_goes_on_where_it_was_stopped_before_the_digests(made, tmp_path, monkeypatch):
+    shutil_copy(made / "light", tmp_path / "copy")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(paint, "finish_release", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        paint_release(tmp_path / "copy")
+    assert open_release(tmp_path / "copy").manifest.digest is None
+    paint_release(tmp_path / "copy")
+    found, wanted = files(tmp_path / "copy"), files(made / "painted")
+    assert {n: v for n, v in found.items() if n != ".lock"} == {n: v for n, v in wanted.items() if n != ".lock"}
 
 
 def shutil_copy(source, target):

@@ -167,16 +167,18 @@ def paint_release(
         are there already, or the disk is full.
     """
     root, painter = Path(root), painter or Painter()
-    release = open_release(root)
-    shards = [key for key in chosen_shards(release.manifest, only, episodes) if key[0] in release.subsets]
-    todo = [key for key in shards if (c := release[key[0]].commits.get(key[1])) and not c.painted]
+    open_release(root)  # or says what is wrong with it
     with storage_errors(root, "write to"), only_writer(root, wait=60):
+        release = open_release(root)
+        shards = [key for key in chosen_shards(release.manifest, only, episodes) if key[0] in release.subsets]
+        todo = [key for key in shards if (c := release[key[0]].commits.get(key[1])) and not c.painted]
         studio = Studio.open(release, {name for name, _ in shards}, painter, needed={name for name, _ in todo})
     waiting: queue.SimpleQueue = queue.SimpleQueue()
     for key in [*todo, None]:
         waiting.put(key)
     found = tuple(studio.paint(waiting))
-    manifest = finish_release(root, studio.manifest) if todo else studio.manifest
+    unfinished = todo or studio.manifest.digest is None  # or one who painted it all was stopped before the end
+    manifest = finish_release(root, studio.manifest) if unfinished else studio.manifest
     return studio.report(manifest, found)
 
 
@@ -238,9 +240,9 @@ class Studio:
         """Paint shards as they come; what `paint_shard` gives of each.
 
         Args:
-          arriving: (subset, shard) of committed shards, an exception to raise, or None at the end.
+          arriving: (subset, shard) of committed shards, an exception to raise, or None at the end; what somebody else
+            has painted meanwhile is left alone.
         """
-
         with open_pool(self.painter.workers, tick=self.painter.tick) as pool:
             ended, at_work = False, 0
             results: Iterator[tuple[Any, Any]] = iter(())
@@ -253,8 +255,9 @@ class Studio:
                     if isinstance(key, BaseException):
                         raise key
                     ended = key is None
-                    if not ended:
-                        pool.submit(key, paint_shard, self._work(key))
+                    work = None if key is None else self._work(key)
+                    if work and not work.subset.commits[work.shard].painted:
+                        pool.submit(key, paint_shard, work)
                         at_work += 1
                 if ended and not at_work:
                     return

@@ -245,10 +245,11 @@ def write_pictures(
       StoreError: the disk is full or cannot be written; what was committed stays.
     """
     try:
-        files = _write_arrays(root, subset, commit.shard, arrays)
+        added = _write_arrays(root, subset, commit.shard, arrays)
+        files = {file.path: file for file in (*commit.files, *added)}  # two may have painted it at the same time
         painted = commit.model_copy(
             update={
-                "files": tuple(sorted((*commit.files, *files), key=lambda file: file.path)),
+                "files": tuple(sorted(files.values(), key=lambda file: file.path)),
                 "environment": dict(environment if environment is not None else this_environment()),
                 "painted": True,
                 "pictures": (),
