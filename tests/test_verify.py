@@ -8,7 +8,6 @@ import shutil
 
 import numpy as np
 import pytest
-import zarr
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
@@ -17,9 +16,8 @@ from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import is_card
-from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
-from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
-from tests.conftest import roll_out, small_recipe
+from dmcvb_gen.store.writer import commit_path, finish_release
+from tests.conftest import rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/random/dynamic"
 
@@ -28,22 +26,6 @@ NAME = "walker-walk/random/dynamic"
 def copy(small_release, tmp_path):
     shutil.copytree(small_release, tmp_path / "copy")
     return tmp_path / "copy"
-
-
-def rewrite(folder, change):
-    """Change arrays of a subset and make its digests again, as a careless (or dishonest) hand would."""
-    change(zarr.open_group(str(folder / f"{NAME}.zarr"), mode="r+", use_consolidated=False))
-    for shard in range(2):
-        path = folder / commit_path(NAME, shard)
-        commit = parse_commit(path.read_text())
-        files = [
-            file.model_copy(
-                update={"bytes": (folder / file.path).stat().st_size, "sha256": sha256_file(folder / file.path)}
-            )
-            for file in commit.files
-        ]
-        write_json_atomically(path, commit.model_copy(update={"files": tuple(files)}))
-    finish_release(folder, open_release(folder).manifest)
 
 
 def checks(folder):
@@ -142,7 +124,7 @@ def test_a_swapped_reward_is_found_by_simulating_again(copy):
         rewards[:500] = np.roll(rewards[:500], 7)  # the return stays the same
         group["reward"][0] = rewards
 
-    rewrite(copy, swap)
+    rewrite(copy, NAME, swap)
     found = verify(copy).findings
     assert {finding.check for finding in found} <= {"rewards", "returns"} and any(f.check == "rewards" for f in found)
     assert all(finding.episode == 0 and finding.subset == NAME for finding in found)
@@ -152,7 +134,7 @@ def test_pixels_of_another_episode_are_found_by_painting_again(copy):
     def swap(group):
         group["pixels"][1] = group["pixels"][0]
 
-    rewrite(copy, swap)
+    rewrite(copy, NAME, swap)
     found = verify(copy).findings
     assert {finding.check for finding in found} == {"pixels"} and {finding.episode for finding in found} == {1}
 
@@ -163,7 +145,7 @@ def test_a_nan_state_is_found_with_its_step(copy):
         state[123, 4] = np.nan
         group["state"][2] = state
 
-    rewrite(copy, spoil)
+    rewrite(copy, NAME, spoil)
     found = [finding for finding in verify(copy).findings if finding.check == "finite"]
     assert [(finding.episode, finding.step) for finding in found] == [(2, 123)]
 
@@ -174,7 +156,7 @@ def test_a_return_that_does_not_match_is_found(copy):
         returns[1] += 100
         group["return"][:] = returns
 
-    rewrite(copy, inflate)
+    rewrite(copy, NAME, inflate)
     assert checks(copy) == {("returns", NAME)}
 
 
@@ -183,7 +165,7 @@ def test_a_duplicated_episode_is_found(copy):
         for name in ("state", "action", "reward", "physics", "return"):
             group[name][2] = group[name][0]
 
-    rewrite(copy, duplicate)
+    rewrite(copy, NAME, duplicate)
     assert ("duplicates", NAME) in checks(copy)
 
 
