@@ -134,3 +134,17 @@ def test_a_begun_release_is_told_to_programs_too(tmp_path):
         WALKER, "--episodes", "1", "--max-steps", "3", "--size", "8", "--init", "--json", "--out", tmp_path
     )
     assert json.loads(result.stdout) == {"out": str(tmp_path), "jobs": 1, "already_done": 0}
+
+
+@pytest.mark.parametrize(
+    "words, flag",
+    [
+        (("s3://bucket/r", "--executor", "ray"), "--executor"),
+        (("s3://bucket/r", "--backgrounds", "videos"), "--backgrounds"),
+        ((".", "--all"), "--all"),
+        ((".", "--option", "endpoint_url=http://127.0.0.1:1"), "--option"),
+    ],
+)
+def test_verify_refuses_what_is_for_the_other_kind_of_place(words, flag):
+    result = CliRunner().invoke(main, ["verify", *words])
+    assert result.exit_code == 2 and f"leave out {flag}" in result.output.replace("\n", " ")

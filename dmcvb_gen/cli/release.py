@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import OutPath, background_source, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.unheard import given_options, refuse
 from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS
 
 
@@ -40,10 +41,13 @@ def verify(context, path, everything, backgrounds, workers, executor, ray_addres
     from dmcvb_gen.release.verify_url import WORKERS, verify_url
     from dmcvb_gen.store.remote import is_url
 
+    given = given_options(context)
     if is_url(path):
+        refuse(context, given, ("backgrounds", "executor", "ray_address"), "at a URL nothing is painted or simulated")
         with tqdm(unit=" files", disable=as_json or None) as bar:
             result = verify_url(path, options, everything, lambda name: bar.update(), workers or WORKERS)
     else:
+        refuse(context, given, ("everything", "options"), f"{path} is no URL, and is read whole")
         with tqdm(unit=" subsets", disable=as_json or None) as bar:
             team = crew(workers or 1, executor, ray_address)
             result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()), team)
@@ -52,22 +56,26 @@ def verify(context, path, everything, backgrounds, workers, executor, ray_addres
         facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
         print_json(facts | {"checked": result.checked, "findings": findings, "incomplete": result.incomplete})
     else:
-        for finding in result.findings[:50]:
-            click.echo(f"FAIL {finding}")
-        if len(result.findings) > 50:
-            click.echo(f"... and {len(result.findings) - 50} more")
-        for name, (here, planned) in result.incomplete.items():
-            click.echo(f"{name}: {here:,} of {planned:,} episodes")
-        checked = ", ".join(f"{count:,} {name}" for name, count in result.checked.items())
-        verdict = "sound" if result.sound else f"{len(result.findings)} findings"
-        if result.incomplete:
-            here = result.checked["episodes"]
-            planned = here + sum(planned - count for count, planned in result.incomplete.values())
-            verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
-        click.echo(f"{path}: {verdict} ({checked})")
-        if result.digest:
-            click.echo(f"digest {result.digest}")
+        _tell_verified(path, result)
     context.exit(1 if not result.sound else 3 if result.incomplete else 0)
+
+
+def _tell_verified(path, result):
+    for finding in result.findings[:50]:
+        click.echo(f"FAIL {finding}")
+    if len(result.findings) > 50:
+        click.echo(f"... and {len(result.findings) - 50} more")
+    for name, (here, planned) in result.incomplete.items():
+        click.echo(f"{name}: {here:,} of {planned:,} episodes")
+    checked = ", ".join(f"{count:,} {name}" for name, count in result.checked.items())
+    verdict = "sound" if result.sound else f"{len(result.findings)} findings"
+    if result.incomplete:
+        here = result.checked["episodes"]
+        planned = here + sum(planned - count for count, planned in result.incomplete.values())
+        verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
+    click.echo(f"{path}: {verdict} ({checked})")
+    if result.digest:
+        click.echo(f"digest {result.digest}")
 
 
 def parse_episodes(context, parameter, text):

@@ -1,4 +1,4 @@
-"""Options of `rollout` that would go unheard: a command line in, a refusal that names the option and the cure out.
+"""Options that would go unheard, most of them of `rollout`: a command line in, a refusal that names option and cure out.
 
 What an option means for the subsets of a recipe is checked in `rollout.recipe.check_heard`, once there is one.
 """
@@ -37,18 +37,23 @@ def check_way(context: click.Context) -> None:
     if sum(name in given for name in ("init", "part", "finishing")) > 1:
         raise click.UsageError("Give one of --init, --part and --finish.")
     if "slurm_script" in given:
-        _refuse(
+        refuse(
             context, given, ("init", "part", "finishing", "dry_run", "as_json"), "--slurm-script only prints a script"
         )
     if "finishing" in given:
-        _refuse(context, given, ("dry_run",), "--finish plans nothing, it writes digests")
+        refuse(context, given, ("dry_run",), "--finish plans nothing, it writes digests")
     if not is_url(values["out"] or ""):
-        _refuse(context, given, ("options", "scratch", "scratch_size"), "--out is no URL, so shards are made in place")
+        refuse(context, given, ("options", "scratch", "scratch_size"), "--out is no URL, so shards are made in place")
     if "no_pixels" in given:
-        _refuse(context, given, ("device",), "--no-pixels paints nothing; name the renderer by --renderer")
+        refuse(context, given, ("device",), "--no-pixels paints nothing; name the renderer by --renderer")
 
 
-def _refuse(context: click.Context, given: set[str], names: tuple[str, ...], reason: str) -> None:
+def refuse(context: click.Context, given: set[str], names: tuple[str, ...], reason: str) -> None:
+    """Refuse those of `names` that the command line itself has.
+
+    Raises:
+      click.UsageError: there is one.
+    """
     for name in names:
         if name in given:
             raise click.UsageError(f"{reason}; leave out {_flag(context, name)}.")
