@@ -1,4 +1,4 @@
-"""Options that would go unheard, most of them of `rollout`: a command line in, a refusal that names option and cure out.
+"""Options that would go unheard, most of them of `rollout`: a command line in, a refusal by name out.
 
 What an option means for the subsets of a recipe is checked in `rollout.recipe.check_heard`, once there is one.
 """
