@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.files import write_json
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
@@ -120,6 +121,27 @@ def test_metadata_that_are_still_json_but_not_what_they_were_are_put_back(copy, 
     assert Regeneration(copy, [NAME], (2, 3)).check().sound, "shards are made with the metadata that are meant"
     assert Regeneration(copy).repair().sound and verify(copy).sound
     assert (copy / name).read_bytes() == was
+
+
+@pytest.mark.parametrize(
+    "field, change",
+    [
+        ("sha256", lambda text: text[:10] + ("0" if text[10] != "0" else "1") + text[11:]),
+        ("bytes", lambda size: size + 1),
+        ("steps", lambda steps: steps - 1),
+        ("environment", lambda facts: facts | {"numpy": "0.0"}),
+    ],
+)
+def test_a_commit_record_that_is_not_what_it_was_is_put_back(copy, field, change):
+    path = copy / commit_path(NAME, 1)
+    was, record = path.read_bytes(), json.loads(path.read_bytes())
+    place = record["files"][2] if field in ("sha256", "bytes") else record
+    place[field] = change(place[field])
+    write_json(path, record)
+    assert not verify(copy).sound
+    [shard] = Regeneration(copy).repair().shards
+    assert shard.repaired and "commit record" in shard.was
+    assert path.read_bytes() == was and verify(copy).sound
 
 
 def test_a_release_keeps_its_own_codecs_when_the_code_has_new_ones(copy, monkeypatch):

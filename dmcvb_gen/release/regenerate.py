@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -174,15 +174,16 @@ class Regeneration:
           DmcvbError: the shards cannot be made here (policy, backgrounds or renderer missing).
         """
         root, manifest = load_manifest(self.root)
-        shards = chosen_shards(manifest, self.only, self.episodes)
-        outcomes, held = [], Held(root)
+        shards, known = chosen_shards(manifest, self.only, self.episodes), known_digests(root, manifest)
+        outcomes, held = [], Held(root, known)
         with _Workshop(root, manifest, _unique(shards.values())) as folder:
             for commit in self._make(manifest, shards, folder, tick):
                 record = shards[commit.subset, commit.shard]
-                promised = read_commit(root, record, commit.shard)
+                promised = read_commit(root, record, commit.shard, known)
                 held.add(commit)
                 equal = None if promised is None else promised.same_data(commit)
-                outcomes.append(_outcome(root, folder, record, commit, damage(root, record, commit.shard), equal))
+                was = damage(root, record, commit.shard, known)
+                outcomes.append(_outcome(root, folder, record, commit, was, equal))
                 for file in commit.files:
                     (folder / file.path).unlink(missing_ok=True)  # a checked shard needs no room
         outcomes = [
@@ -202,8 +203,8 @@ class Regeneration:
         Raises: see `check`.
         """
         root, manifest = load_manifest(self.root)
-        wanted = chosen_shards(manifest, self.only, self.episodes)
-        shards = {key: record for key, record in wanted.items() if damage(root, record, key[1]) is not None}
+        wanted, known = chosen_shards(manifest, self.only, self.episodes), known_digests(root, manifest)
+        shards = {key: record for key, record in wanted.items() if damage(root, record, key[1], known) is not None}
         records = _unique(chosen_shards(manifest, self.only).values())
         with _Workshop(root, manifest, records) as folder:
             metadata = _Metadata(root, manifest)
@@ -219,19 +220,21 @@ class Regeneration:
         return Outcome(tuple(outcomes), environment_difference(manifest))
 
     def _repair(self, root, manifest, shards, folder, tick) -> list[ShardOutcome]:
-        outcomes, held = [], Held(root)
+        known = known_digests(root, manifest)
+        outcomes, held = [], Held(root, known)
         waiting: list[tuple[SubsetRecord, CommitRecord, str | None]] = []
 
         def settle(record, commit, was, equal):
             taken = equal is not False
             if taken:
-                kept = read_commit(root, record, commit.shard)
+                kept = read_commit(root, record, commit.shard, known)
                 _move_in(root, folder, kept or restored_commit(root, manifest, commit))
             outcomes.append(_outcome(root, folder, record, commit, was, equal, repaired=taken))
 
         for commit in self._make(manifest, shards, folder, tick):
             record = shards[commit.subset, commit.shard]
-            was, promised = damage(root, record, commit.shard), read_commit(root, record, commit.shard)
+            was = damage(root, record, commit.shard, known)
+            promised = read_commit(root, record, commit.shard, known)
             if promised is None and record.digest is not None:  # the subset's digest decides, once all are there
                 held.add(commit)
                 waiting.append((record, commit, was))
@@ -266,11 +269,11 @@ class Regeneration:
         commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
         commits += self._make(manifest, todo, out, tick, copy=True)
         finished = finish_release(out, fresh)
-        digests = {record.name: record.digest for record in finished.subsets}
+        digests, known = {record.name: record.digest for record in finished.subsets}, known_digests(root, manifest)
         outcomes = []
         for commit in commits:
             record = shards[commit.subset, commit.shard]
-            promised = read_commit(root, record, commit.shard)
+            promised = read_commit(root, record, commit.shard, known)
             equal = promised.same_data(commit) if promised else None
             if promised is None and record.digest and digests[record.name]:
                 equal = digests[record.name] == record.digest
@@ -308,11 +311,17 @@ def _unfinished(manifest: Manifest) -> Manifest:
     return manifest.model_copy(update={"subsets": subsets, "environments": (environment(),), "complete": False})
 
 
+def known_digests(root: Path, manifest: Manifest) -> dict[str, str]:
+    """Path in the release -> SHA-256, by its index; nothing where that cannot be trusted."""
+    index = trusted_index(root, manifest)
+    return {file.path: file.sha256 for file in index.files} if index else {}
+
+
 class Held:
     """Shards made again whose commit record is lost: with the others, they must give their subset's digest."""
 
-    def __init__(self, root: Path):
-        self._root = root
+    def __init__(self, root: Path, known: Mapping[str, str]):
+        self._root, self._known = root, known
         self._commits: dict[tuple[str, int], CommitRecord] = {}
 
     def add(self, commit: CommitRecord) -> None:
@@ -324,7 +333,7 @@ class Held:
             return None
         commits = {}
         for shard in range(shard_count(record)):
-            commit = read_commit(self._root, record, shard) or self._commits.get((record.name, shard))
+            commit = read_commit(self._root, record, shard, self._known) or self._commits.get((record.name, shard))
             if commit is None:
                 return None
             commits[shard] = commit
@@ -345,8 +354,7 @@ class _Metadata:
     """Which of a release's zarr.json files are what they were: by the index; without one, those that are JSON."""
 
     def __init__(self, root: Path, manifest: Manifest):
-        self._root, index = root, trusted_index(root, manifest)
-        self._digests = {file.path: file.sha256 for file in index.files} if index else {}
+        self._root, self._digests = root, known_digests(root, manifest)
 
     def sound(self, path: str) -> bool:
         """Whether a file (a path in the release) can be used."""

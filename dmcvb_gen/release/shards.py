@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import sha256_file
+from dmcvb_gen.files import sha256_bytes, sha256_file
 from dmcvb_gen.store.manifest import CommitRecord, FileRecord, SubsetRecord, parse_commit
 from dmcvb_gen.store.writer import commit_path, shard_episodes
 
+NOTHING: Mapping[str, str] = {}
 
-def read_commit(root: Path, record: SubsetRecord, shard: int) -> CommitRecord | None:
-    """The shard's commit record, None where it is missing, unreadable or another shard's."""
-    path = root / commit_path(record.name, shard)
+
+def read_commit(
+    root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str] = NOTHING
+) -> CommitRecord | None:
+    """The shard's commit record, None where it is missing, unreadable or another shard's.
+
+    Args:
+      known: path in the release -> SHA-256 of files that are known; a record with another is as good as none.
+    """
+    name = commit_path(record.name, shard)
     try:
-        commit = parse_commit(path.read_bytes(), str(path))
+        data = (root / name).read_bytes()
+        commit = parse_commit(data, str(root / name))
     except (OSError, StoreError):
+        return None
+    if name in known and sha256_bytes(data) != known[name]:
         return None
     mine = (commit.subset, commit.shard, commit.episodes) == (record.name, shard, shard_episodes(record, shard))
     return commit if mine else None
 
 
-def damage(root: Path, record: SubsetRecord, shard: int) -> str | None:
-    """What is wrong with a shard's files, in words; None where every byte is as committed."""
-    commit = read_commit(root, record, shard)
+def damage(root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str] = NOTHING) -> str | None:
+    """What is wrong with a shard's files, in words; None where every byte is as committed (`known`: see there)."""
+    commit = read_commit(root, record, shard, known)
     if commit is None:
         return "has no commit record"
     for file in commit.files:
