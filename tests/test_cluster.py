@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -164,6 +165,44 @@ def test_a_release_grows_in_a_bucket_as_in_a_folder(tmp_path):
     assert open_release(f"file://{tmp_path}/bucket").manifest == grown
     with pytest.raises(StoreError, match="seed 2, asked for 4"):
         prepare(make_plan(quick_recipe(seed=4), bucket))
+
+
+def test_growing_in_a_bucket_is_refused_where_something_is_damaged_and_goes_on_where_it_was_stopped(
+    tmp_path, monkeypatch
+):
+    def grow(place, episodes):
+        plan = prepare(make_plan(quick_recipe(WALKER | {"episodes": episodes}), place))
+        list(run_jobs(plan.jobs))
+        return finish(plan)
+
+    bucket = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    grow(bucket, 2)
+    grow(tmp_path / "r", 2)
+    wanted = grow(tmp_path / "r", 4)
+    path = next(tmp_path.glob("bucket/**/state/zarr.json"))
+    before = path.read_bytes()
+    path.write_bytes(before.replace(b'"zarr_format": 3', b'"zarr_format":  3'))
+    with pytest.raises(StoreError, match="state/zarr.json.* is damaged"):
+        grow(bucket, 4)
+    path.write_bytes(before)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(type(bucket), "remove", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        prepare(make_plan(quick_recipe(WALKER | {"episodes": 4}), bucket))
+    assert path.read_bytes() != before
+    assert grow(bucket, 4).digest == wanted.digest
+    assert contents(tmp_path / "bucket") == contents(tmp_path / "r")
+
+
+def test_no_room_for_the_digests_of_a_bucket_is_one_line(tmp_path, monkeypatch):
+    plan = prepare(make_plan(quick_recipe(), site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")))
+    list(run_jobs(plan.jobs))
+
+    def full(path, data):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr("dmcvb_gen.rollout.plan.write_bytes", full)
+    with pytest.raises(StoreError, match="no room to write to .*scratch.*No space left"):
+        finish(plan)
 
 
 def test_many_verify_as_one(whole, tmp_path):

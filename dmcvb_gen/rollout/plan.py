@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -23,7 +24,7 @@ from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX, POLICIES, parse_index, refuse_altered
 from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment, subset_path
-from dmcvb_gen.store.remote import local_path
+from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
@@ -286,8 +287,8 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
 
 def _prepare_bucket(plan: Plan, site: BucketSite) -> Manifest:
     """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
-    with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
-        begun = _begun(Path(folder), plan, plan.manifest, plan.manifest.subsets)
+    with _desk(site) as folder:
+        begun = _begun(folder, plan, plan.manifest, plan.manifest.subsets)
         strange = set(site.listing()) - set(begun) - {MANIFEST}
         if strange and site.manifest() is None:
             raise StoreError(
@@ -300,6 +301,13 @@ def _prepare_bucket(plan: Plan, site: BucketSite) -> Manifest:
     if first is None:
         raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
     return _grow_bucket(plan, site, first)
+
+
+@contextlib.contextmanager
+def _desk(site: Site) -> Iterator[Path]:
+    """A folder of one's own in a site's scratch, for a moment; no room there is one line."""
+    with storage_errors(site.workshop, "write to"), tempfile.TemporaryDirectory(dir=site.workshop) as folder:
+        yield Path(folder)
 
 
 def _begun(root: Path, plan: Plan, manifest: Manifest, records: Sequence[SubsetRecord]) -> dict[str, Path]:
@@ -322,22 +330,32 @@ def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
         return there
     old = {record.name: record for record in there.subsets}
     changed = [record for record in manifest.subsets if record != old.get(record.name)]
-    with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
-        root = Path(folder)
+    with _desk(site) as root:
         listed = site.listing()
         for record in changed:
             if record.name in old:  # its arrays are there, and get room for more episodes
                 _bring_metadata(site, record, listed, root)
         begun = _begun(root, plan, manifest, changed)
+        _refuse_altered_bucket(site, there, begun)
         new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
         in_parallel(lambda name: site.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
-    text = site.read(INDEX) if there.digest else None
-    refuse_altered(parse_index(text, f"{site.place}/{INDEX}") if text else None, site.read, site.place)
     if site.manifest() != there:
         raise StoreError(f"{site.place} was grown by somebody else meanwhile; run the same command again")
     site.remove(INDEX)  # written again when the release is finished
     site.write(MANIFEST, json_bytes(manifest))
     return manifest
+
+
+def _refuse_altered_bucket(site: BucketSite, there: Manifest, begun: Mapping[str, Path]) -> None:
+    """See `refuse_altered`; metadata that are as they are to become were put there when growing was interrupted."""
+    text = site.read(INDEX) if there.digest else None
+    index = parse_index(text, f"{site.place}/{INDEX}") if text else None
+    kept = [file for file in index.files if not _holds(site, file.path, begun)] if index else []
+    refuse_altered(index.model_copy(update={"files": tuple(kept)}) if index else None, site.read, site.place)
+
+
+def _holds(site: BucketSite, path: str, begun: Mapping[str, Path]) -> bool:
+    return path in begun and path.endswith("/zarr.json") and site.read(path) == begun[path].read_bytes()
 
 
 def _bring_metadata(site: BucketSite, record: SubsetRecord, listed: Iterable[str], root: Path) -> None:
@@ -430,8 +448,7 @@ def finish_site(site: Site, manifest: Manifest) -> Manifest:
     if isinstance(site, FolderSite):
         return finish_release(site.root, manifest)
     commits = site.commits(manifest.subsets)
-    with tempfile.TemporaryDirectory(dir=site.workshop) as folder:
-        mirror = Path(folder)
+    with _desk(site) as mirror:
         shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
         small = [path for path in site.listing() if path not in shards | {MANIFEST, INDEX}]
 
