@@ -16,6 +16,7 @@ from dmcvb_gen.files import write_json
 from dmcvb_gen.release import paint
 from dmcvb_gen.release.paint import paint_release, without_pictures
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.index import write_release
 from dmcvb_gen.store.manifest import commit_path
 
 TINY = [
@@ -341,6 +342,8 @@ def test_another_painter_is_said_before_and_after(made, tmp_path):
     commit = subset.commits[0]
     other = tuple(file.model_copy(update={"sha256": "0" * 64}) for file in commit.pictures)
     write_json(tmp_path / "light" / commit_path(subset.name, 0), commit.model_copy(update={"pictures": other}))
+    light = open_release(tmp_path / "light")
+    write_release(light.path, light.manifest, {name: subset.commits for name, subset in light.subsets.items()})
     result = run("paint", tmp_path / "light", "--episodes", "0:1", "--only", subset.name)
     assert result.exit_code == 1 and "1 of 1 differ" in result.stdout
     notes = result.stderr.splitlines()
