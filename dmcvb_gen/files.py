@@ -25,13 +25,16 @@ _OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)\.[^.]+{re.escape(PARTIAL)}")
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, new: bool = False) -> Iterator[Path]:
     """Give a fresh path to write to; when the block ends well, that file takes the place of `path`, else it goes.
 
     For writers that want a path; what they write is flushed to the disk before it is put in place.
 
+    Args:
+      new: `path` must not be there yet.
+
     Raises:
-      OSError: the folder cannot be made or written.
+      OSError: the folder cannot be made or written; FileExistsError: `path` should be new and is there.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +46,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp's files are their owner's alone
-        os.replace(temporary, path)
+        if new:
+            os.link(temporary, path)
+            temporary.unlink()
+        else:
+            os.replace(temporary, path)
         _flush_folder(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)

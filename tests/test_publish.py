@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
+import os
 import pathlib
 import re
 import resource
@@ -558,3 +560,20 @@ def test_the_whole_release_has_fewer_files_than_the_hub_takes(small_release, sma
         specs = array_specs(EpisodeShape.of(get_task(request.task)), 64)
         total += files_of(request.name, -(-request.episodes // request.episodes_per_shard), specs)
     assert 50_000 < total < 70_000
+
+
+def test_no_room_for_the_manifest_is_one_line_and_leaves_none(tiny, tmp_path, monkeypatch):
+    link = os.link
+
+    def full(made, path):
+        if str(path).endswith("manifest.json"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        link(made, path)
+
+    url = f"file://{tmp_path}/there"
+    with monkeypatch.context() as patch, pytest.raises(StoreError, match="no room for manifest.json"):
+        patch.setattr(os, "link", full)
+        publish(tiny, url)
+    assert not list((tmp_path / "there").glob("*manifest.json*"))
+    publish(tiny, url)
+    assert open_release(url).manifest.complete and not list((tmp_path / "there").rglob("*.partial"))

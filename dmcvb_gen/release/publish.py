@@ -34,7 +34,7 @@ from dmcvb_gen.store.manifest import (
     shard_count,
 )
 from dmcvb_gen.store.reader import load_manifest
-from dmcvb_gen.store.remote import file_system, public, reason, storage_errors
+from dmcvb_gen.store.remote import file_system, public, storage_errors
 from dmcvb_gen.store.transfer import (
     create_object,
     in_parallel,
@@ -124,11 +124,8 @@ def publish(
         text = (root / MANIFEST).read_bytes()
     if before is not None:
         retry(place, MANIFEST, lambda: put_object(filesystem, f"{base}/{MANIFEST}", text))
-    else:
-        try:
-            create_object(filesystem, f"{base}/{MANIFEST}", text)
-        except FileExistsError:
-            _published(filesystem, place, base, index, manifest)  # another one's raises
+    elif not create_object(filesystem, place, f"{base}/{MANIFEST}", text):
+        _published(filesystem, place, base, index, manifest)  # another one's raises
     retry(place, CLAIM, lambda: filesystem.rm_file(f"{base}/{CLAIM}"))
     return Moved(len(index.files), total, sum(results))
 
@@ -174,17 +171,8 @@ def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
     """
     mine = {"name": manifest.name, "version": manifest.version, "manifest_sha256": digest}
     data, path = json.dumps(mine).encode(), f"{base}/{CLAIM}"
-
-    def attempt():
-        try:
-            create_object(filesystem, path, data)
-            return None
-        except FileExistsError:
-            return filesystem.cat_file(path)
-        except FileNotFoundError as error:
-            raise StoreError(f"{place}: {reason(error)}; create the bucket first") from None
-
-    found = retry(place, CLAIM, attempt)
+    created = create_object(filesystem, place, path, data)
+    found = None if created else read_object(filesystem, place, path)
     if found is None or found == data:
         return found is None  # else ours, from an interrupted try: the files that are there already are kept
     if take_over:

@@ -246,15 +246,7 @@ class BucketSite(Site):
     def create(self, path: str, data: bytes) -> bool:
         """Write a small file that must not be there yet; False where it is."""
         filesystem, base = self._open()
-
-        def attempt() -> bool:
-            try:
-                create_object(filesystem, f"{base}/{path}", data)
-            except FileExistsError:
-                return False
-            return True
-
-        return retry(self.place, path, attempt)
+        return create_object(filesystem, self.place, f"{base}/{path}", data)
 
     def write(self, path: str, data: bytes) -> None:
         """Write a small file, in place of what is there."""

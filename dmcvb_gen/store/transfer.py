@@ -12,7 +12,7 @@ from typing import Any
 import fsspec
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import sha256_file
+from dmcvb_gen.files import remove_partial, replacing, sha256_file
 from dmcvb_gen.store.manifest import FileRecord
 from dmcvb_gen.store.remote import NO_ROOM, is_refusal, reason, refused, storage_errors
 
@@ -175,17 +175,34 @@ def put_object(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) ->
     filesystem.pipe_file(path, data)
 
 
-def create_object(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) -> None:
-    """Write a file that must not be there yet; atomic on local disks and S3, as good as can be elsewhere.
+def create_object(filesystem: fsspec.AbstractFileSystem, place: str, path: str, data: bytes) -> bool:
+    """Write a small file that must not be there yet; False where it is.
+
+    Atomic on local disks and S3, as good as can be elsewhere.
 
     Raises:
-      FileExistsError: it is there.
+      StoreError: there is no such bucket, or see `retry`.
     """
+
+    def attempt() -> bool:
+        try:
+            _create(filesystem, path, data)
+        except FileExistsError:
+            return False
+        except FileNotFoundError as error:
+            raise StoreError(f"{place}: {reason(error)}; create the bucket first") from None
+        return True
+
+    return retry(place, path.rsplit("/", 1)[-1], attempt)
+
+
+def _create(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) -> None:
     if protocol(filesystem) not in OBJECT_STORES:
         filesystem.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
     if protocol(filesystem) in ("file", "local"):
-        with open(path, "xb") as file:
-            file.write(data)
+        remove_partial(Path(path).parent, below=False)
+        with replacing(path, new=True) as temporary:  # whole or not there; a file that is opened as a new one is not
+            temporary.write_bytes(data)
         return
     try:
         filesystem.pipe_file(path, data, mode="create")
