@@ -217,6 +217,8 @@ def test_recipes_that_make_no_sense_are_refused_before_any_work(tmp_path, change
         ({"levels": "master"}, "expert"),
         ({"settings": "blurry"}, "dynamic"),
         ({"episodes": 0}, "greater than 0"),
+        ({"episodes": 10**9}, "1,000,000,000 episodes are more than the 100,000,000"),
+        ({"episodes": 10**7}, "shards.*give more episodes_per_shard"),
         ({"episodes": None}, "say how much"),
         ({"steps": 500}, "not both"),
         ({"policies": {"expert": "x"}}, "does not ask for"),

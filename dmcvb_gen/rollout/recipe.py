@@ -40,6 +40,7 @@ from dmcvb_gen.names import (
     subset_name,
 )
 from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
+from dmcvb_gen.store.manifest import MAX_EPISODES, MAX_SHARDS
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -160,6 +161,11 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
     if unused:
         raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
+    if (shards := sum(-(-each.episodes // each.episodes_per_shard) for each in requests.values())) > MAX_SHARDS:
+        raise RecipeError(
+            f"recipe {recipe.name!r} comes to {shards:,} shards, and a release may have {MAX_SHARDS:,}; give more "
+            "episodes_per_shard, or fewer episodes"
+        )
     return tuple(requests.values())
 
 
@@ -177,6 +183,8 @@ def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting:
         raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
     else:
         episodes = -(-pattern.steps // max_steps)
+    if episodes > MAX_EPISODES:
+        raise RecipeError(f"{name}: {episodes:,} episodes are more than the {MAX_EPISODES:,} that a subset may have")
     shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[task.family]
     return SubsetRequest(
         name=name,
