@@ -427,3 +427,11 @@ def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path
 def test_the_table_of_formats_names_them_all():
     table = format_table()
     assert all(f"| `{name}` |" in table for name in FORMATS) and len(table.splitlines()) == len(FORMATS) + 2
+
+
+def test_a_feature_that_is_none_is_refused_in_one_line(tmp_path):
+    steps = {"featuresDict": {"features": {"reward": [1, 2]}}}
+    tree = {"featuresDict": {"features": {"steps": {"sequence": {"feature": steps}}}}}
+    (tmp_path / "features.json").write_text(json.dumps(tree))
+    with pytest.raises(StoreError, match="features.json does not describe RLDS steps"):
+        import_tfds(tmp_path, tmp_path / "out", task="walker-walk", level="expert", setting="none")

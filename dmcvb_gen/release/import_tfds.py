@@ -204,6 +204,8 @@ def _flatten(feature: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
     if "featuresDict" in feature:
         for name, inner in feature["featuresDict"]["features"].items():
             yield from _flatten(inner, f"{prefix}/{name}" if prefix else name)
+    elif not isinstance(feature, dict):
+        raise ValueError(f"{prefix} is no feature")
     else:
         yield prefix, feature
 
