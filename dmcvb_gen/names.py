@@ -43,7 +43,7 @@ SPLITS = ("train", "val")
 """Which videos and maze styles: for data, or kept for evaluation."""
 
 LABEL_TYPES = {"depth": "float32", "segmentation": "int16"}
-"""Labels that can be painted a pixel each -> the type of their arrays."""
+"""Labels that can be painted a pixel each -> dtype: depth in meters (0: sky), segmentation by geom id (-1: sky)."""
 
 _MAZE_ID = re.compile(rf"{ANT_MAZE}-(?P<layout>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?(@(?P<reward>\w+))?")
 

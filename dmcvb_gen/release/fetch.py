@@ -31,11 +31,11 @@ from dmcvb_gen.store.manifest import (
     SubsetRecord,
     checked_commit,
     commit_path,
+    local_manifest,
     parse_manifest,
     shard_count,
     subset_path,
 )
-from dmcvb_gen.store.reader import local_manifest
 from dmcvb_gen.store.remote import file_system, local_path, public, storage_errors
 from dmcvb_gen.store.shards import ShardKey, chosen_shards
 from dmcvb_gen.store.transfer import download, in_parallel, protocol, read_object, retry

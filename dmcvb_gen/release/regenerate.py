@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -174,15 +174,15 @@ class Regeneration:
           DmcvbError: the shards cannot be made here (policy, backgrounds or renderer missing).
         """
         root, manifest = load_manifest(self.root)
-        shards, known = chosen_shards(manifest, self.only, self.episodes), known_digests(root, manifest)
-        outcomes, held = [], Held(root, known)
-        with _Workshop(root, manifest, _unique(shards.values())) as folder:
+        shards, known = chosen_shards(manifest, self.only, self.episodes), _Known(root, manifest)
+        outcomes, held = [], Held(known)
+        with _Workshop(known, _unique(shards.values())) as folder:
             for commit in self._make(manifest, shards, folder, tick):
                 record = shards[commit.subset, commit.shard]
-                promised = read_commit(root, record, commit.shard, known)
+                promised = known.commit(record, commit.shard)
                 held.add(commit)
                 equal = None if promised is None else promised.same_data(commit)
-                was = damage(root, record, commit.shard, known)
+                was = known.damage(record, commit.shard)
                 outcomes.append(_outcome(root, folder, record, commit, was, equal))
                 for file in commit.files:
                     (folder / file.path).unlink(missing_ok=True)  # a checked shard needs no room
@@ -203,15 +203,14 @@ class Regeneration:
         Raises: see `check`.
         """
         root, manifest = load_manifest(self.root)
-        wanted, known = chosen_shards(manifest, self.only, self.episodes), known_digests(root, manifest)
-        shards = {key: record for key, record in wanted.items() if damage(root, record, key[1], known) is not None}
+        wanted, known = chosen_shards(manifest, self.only, self.episodes), _Known(root, manifest)
+        shards = {key: record for key, record in wanted.items() if known.damage(record, key[1]) is not None}
         records = _unique(chosen_shards(manifest, self.only).values())
-        with _Workshop(root, manifest, records) as folder:
-            metadata = _Metadata(root, manifest)
+        with _Workshop(known, records) as folder:
             with storage_errors(root, "write to"):
                 for record in records:
-                    metadata.restore(folder, record)
-            outcomes = self._repair(root, manifest, shards, folder, tick)
+                    known.restore(folder, record)
+            outcomes = self._repair(known, shards, folder, tick)
         if not manifest.complete and any(outcome.repaired for outcome in outcomes):
             finish_release(root, manifest)
         elif manifest.complete:
@@ -219,22 +218,21 @@ class Regeneration:
             restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})
         return Outcome(tuple(outcomes), environment_difference(manifest))
 
-    def _repair(self, root, manifest, shards, folder, tick) -> list[ShardOutcome]:
-        known = known_digests(root, manifest)
-        outcomes, held = [], Held(root, known)
+    def _repair(self, known: _Known, shards, folder, tick) -> list[ShardOutcome]:
+        root, manifest = known.root, known.manifest
+        outcomes, held = [], Held(known)
         waiting: list[tuple[SubsetRecord, CommitRecord, str | None]] = []
 
         def settle(record, commit, was, equal):
             taken = equal is not False
             if taken:
-                kept = read_commit(root, record, commit.shard, known)
+                kept = known.commit(record, commit.shard)
                 _move_in(root, folder, kept or restored_commit(root, manifest, commit))
             outcomes.append(_outcome(root, folder, record, commit, was, equal, repaired=taken))
 
         for commit in self._make(manifest, shards, folder, tick):
             record = shards[commit.subset, commit.shard]
-            was = damage(root, record, commit.shard, known)
-            promised = read_commit(root, record, commit.shard, known)
+            was, promised = known.damage(record, commit.shard), known.commit(record, commit.shard)
             if promised is None and record.digest is not None:  # the subset's digest decides, once all are there
                 held.add(commit)
                 waiting.append((record, commit, was))
@@ -261,19 +259,19 @@ class Regeneration:
         records = _unique(shards.values())
         fresh = start_release(out, _unfinished(manifest))
         create_groups(out, fresh, records)
-        metadata = _Metadata(root, manifest)
+        known = _Known(root, manifest)
         for record in records:
-            metadata.take(out, record)
+            known.take(out, record)
         done = {record.name: read_commits(out, record) for record in records}
         todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
         commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
         commits += self._make(manifest, todo, out, tick, copy=True)
         finished = finish_release(out, fresh)
-        digests, known = {record.name: record.digest for record in finished.subsets}, known_digests(root, manifest)
+        digests = {record.name: record.digest for record in finished.subsets}
         outcomes = []
         for commit in commits:
             record = shards[commit.subset, commit.shard]
-            promised = read_commit(root, record, commit.shard, known)
+            promised = known.commit(record, commit.shard)
             equal = promised.same_data(commit) if promised else None
             if promised is None and record.digest and digests[record.name]:
                 equal = digests[record.name] == record.digest
@@ -311,17 +309,11 @@ def _unfinished(manifest: Manifest) -> Manifest:
     return manifest.model_copy(update={"subsets": subsets, "environments": (environment(),), "complete": False})
 
 
-def known_digests(root: Path, manifest: Manifest) -> dict[str, str]:
-    """Path in the release -> SHA-256, by its index; nothing where that cannot be trusted."""
-    index = trusted_index(root, manifest)
-    return {file.path: file.sha256 for file in index.files} if index else {}
-
-
 class Held:
     """Shards made again whose commit record is lost: with the others, they must give their subset's digest."""
 
-    def __init__(self, root: Path, known: Mapping[str, str]):
-        self._root, self._known = root, known
+    def __init__(self, known: _Known):
+        self._known = known
         self._commits: dict[tuple[str, int], CommitRecord] = {}
 
     def add(self, commit: CommitRecord) -> None:
@@ -333,7 +325,7 @@ class Held:
             return None
         commits = {}
         for shard in range(shard_count(record)):
-            commit = read_commit(self._root, record, shard, self._known) or self._commits.get((record.name, shard))
+            commit = self._known.commit(record, shard) or self._commits.get((record.name, shard))
             if commit is None:
                 return None
             commits[shard] = commit
@@ -350,16 +342,25 @@ def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardO
 # -- files ----------------------------------------------------------------------------------------
 
 
-class _Metadata:
-    """Which of a release's zarr.json files are what they were: by the index; without one, those that are JSON."""
+class _Known:
+    """Which files of a release are what they were: by its index; where that cannot be trusted, those that are JSON."""
 
     def __init__(self, root: Path, manifest: Manifest):
-        self._root, self._digests = root, known_digests(root, manifest)
+        self.root, self.manifest, index = root, manifest, trusted_index(root, manifest)
+        self._digests = {file.path: file.sha256 for file in index.files} if index else {}
+
+    def commit(self, record: SubsetRecord, shard: int) -> CommitRecord | None:
+        """A shard's record, None where it is missing, damaged or not what it was."""
+        return read_commit(self.root, record, shard, self._digests)
+
+    def damage(self, record: SubsetRecord, shard: int) -> str | None:
+        """What is wrong with a shard, in words; None where every byte is as committed."""
+        return damage(self.root, record, shard, self._digests)
 
     def sound(self, path: str) -> bool:
         """Whether a file (a path in the release) can be used."""
         try:
-            data = (self._root / path).read_bytes()
+            data = (self.root / path).read_bytes()
             parse_json(data)
         except (OSError, ValueError):
             return False
@@ -382,16 +383,16 @@ class _Metadata:
             if self.sound(path):
                 continue
             if path in self._digests and sha256_file(source) != self._digests[path]:
-                raise StoreError(f"{self._root / path} is damaged, and this version makes another; fetch it again")
-            copy_file(source, self._root / path)
-        mark_created(self._root, record)
+                raise StoreError(f"{self.root / path} is damaged, and this version makes another; fetch it again")
+            copy_file(source, self.root / path)
+        mark_created(self.root, record)
 
     def _source(self, path: str) -> Path | None:
         """The file itself, or one of another subset with its digest."""
         if self.sound(path):
-            return self._root / path
+            return self.root / path
         twins = [twin for twin, digest in self._digests.items() if digest == self._digests.get(path)]
-        return next((self._root / twin for twin in twins if self.sound(twin)), None)
+        return next((self.root / twin for twin in twins if self.sound(twin)), None)
 
 
 def _unique(records) -> list[SubsetRecord]:
@@ -401,21 +402,21 @@ def _unique(records) -> list[SubsetRecord]:
 class _Workshop:
     """A folder beside the data (same file system, so that files can be moved in) where shards are made."""
 
-    def __init__(self, root: Path, manifest: Manifest, records: Sequence[SubsetRecord]):
-        self._root, self._manifest, self._records = root, manifest, records
+    def __init__(self, known: _Known, records: Sequence[SubsetRecord]):
+        self._known, self._records = known, records
 
     def __enter__(self) -> Path:
+        root = self._known.root
         with contextlib.ExitStack() as stack:
             try:
-                remove_partial(self._root, below=False)  # the workshop of a run that was killed
-                folder = stack.enter_context(folder_in_the_making(self._root, "regenerate"))
+                remove_partial(root, below=False)  # the workshop of a run that was killed
+                folder = stack.enter_context(folder_in_the_making(root, "regenerate"))
             except OSError as error:
-                raise StoreError(f"cannot write to {self._root}: {error.strerror or error}; give --out") from None
-            create_groups(folder, self._manifest, self._records)
-            with storage_errors(self._root, "write to"):
-                metadata = _Metadata(self._root, self._manifest)
+                raise StoreError(f"cannot write to {root}: {error.strerror or error}; give --out") from None
+            create_groups(folder, self._known.manifest, self._records)
+            with storage_errors(self._known.root, "write to"):
                 for record in self._records:
-                    metadata.take(folder, record)
+                    self._known.take(folder, record)
             self._stack = stack.pop_all()
         return folder
 

@@ -36,7 +36,6 @@ from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, 
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
-"""Pictures beside the colors -> dtype: depth in meters (0: sky), segmentation by geom id (-1: sky)."""
 COPIED = ("state", "action", "reward", "discount", "physics")
 COPIED_PER_EPISODE = ("length", "terminated", "return", "seed", "behaviour", "goal_pair")
 LABEL_FRAMES = 512

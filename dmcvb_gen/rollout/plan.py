@@ -14,7 +14,7 @@ from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
-from dmcvb_gen.files import copy_file, json_bytes, sha256_file, write_bytes
+from dmcvb_gen.files import copy_file, json_bytes, sha256_bytes, sha256_file, write_bytes
 from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
 from dmcvb_gen.pool import ignore
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs, part_of
@@ -22,8 +22,16 @@ from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
-from dmcvb_gen.store.index import INDEX, POLICIES, parse_index, refuse_altered
-from dmcvb_gen.store.manifest import MANIFEST, Manifest, PolicyRecord, SubsetRecord, environment, subset_path
+from dmcvb_gen.store.index import INDEX, POLICIES, parse_index, refuse_altered, watched
+from dmcvb_gen.store.manifest import (
+    MANIFEST,
+    FileRecord,
+    Manifest,
+    PolicyRecord,
+    SubsetRecord,
+    environment,
+    subset_path,
+)
 from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
@@ -347,15 +355,19 @@ def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
 
 
 def _refuse_altered_bucket(site: BucketSite, there: Manifest, begun: Mapping[str, Path]) -> None:
-    """See `refuse_altered`; metadata that are as they are to become were put there when growing was interrupted."""
+    """See `refuse_altered`; what is as it is to become was put there when growing was interrupted."""
     text = site.read(INDEX) if there.digest else None
-    index = parse_index(text, f"{site.place}/{INDEX}") if text else None
-    kept = [file for file in index.files if not _holds(site, file.path, begun)] if index else []
-    refuse_altered(index.model_copy(update={"files": tuple(kept)}) if index else None, site.read, site.place)
+    if text is None:
+        return
+    listed = watched(parse_index(text, f"{site.place}/{INDEX}"))
 
+    def digest(file: FileRecord) -> str | None:
+        data = site.read(file.path)
+        return None if data is None else sha256_bytes(data)
 
-def _holds(site: BucketSite, path: str, begun: Mapping[str, Path]) -> bool:
-    return path in begun and path.endswith("/zarr.json") and site.read(path) == begun[path].read_bytes()
+    found = dict(zip([file.path for file in listed], in_parallel(digest, listed, CONNECTIONS, ignore), strict=True))
+    left = [f for f in listed if f.path not in begun or found[f.path] != sha256_file(begun[f.path])]
+    refuse_altered(left, found.get, site.place)
 
 
 def _bring_metadata(site: BucketSite, record: SubsetRecord, listed: Iterable[str], root: Path) -> None:

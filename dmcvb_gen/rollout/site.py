@@ -385,11 +385,13 @@ def leave(site: Site) -> None:
         stage.close()
 
 
-@TIDY.append
 def leave_all() -> None:
     """Remove this process's stages."""
     for site in list(_stages):
         leave(site)
+
+
+TIDY.append(leave_all)
 
 
 class Sender:

@@ -218,24 +218,27 @@ def trusted_index(root: Path, manifest: Manifest) -> Index | None:
     return index
 
 
-def refuse_altered(index: Index | None, read: Callable[[str], bytes | None], place: str) -> None:
+def watched(index: Index) -> list[FileRecord]:
+    """Files of a release that no shard's record holds a digest of: arrays' metadata, policies, videos."""
+    return [
+        file for file in index.files if file.path.endswith(f"/{ZARR_JSON}") or file.path.startswith((POLICIES, VIDEOS))
+    ]
+
+
+def refuse_altered(listed: Iterable[FileRecord], digest: Callable[[str], str | None], place: str) -> None:
     """Keep damage from becoming what is right: a release whose digests are to be made anew must have its old ones.
 
-    Shards apart, whose records hold their digests.
-
     Args:
-      index: of the release as it is; None: it has none yet.
-      read: bytes of a path in the release, None where nothing is.
+      listed: of the release as it is, see `watched`.
+      digest: of a path in the release, None where nothing is.
 
     Raises:
-      StoreError: arrays' metadata, a policy or a video is missing, or not what it was.
+      StoreError: one of them is missing, or not what it was.
     """
-    for file in index.files if index else ():
-        if not (file.path.endswith(f"/{ZARR_JSON}") or file.path.startswith((POLICIES, VIDEOS))):
-            continue
-        data = read(file.path)
-        if data is None or files.sha256_bytes(data) != file.sha256:
-            what = "is missing" if data is None else "is damaged"
+    for file in listed:
+        found = digest(file.path)
+        if found != file.sha256:
+            what = "is damaged" if found else "is missing"
             raise StoreError(f"{file.path} of {place} {what}; mend it first: dmcvb-gen regenerate {place}")
 
 
@@ -251,11 +254,11 @@ def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
     if index is None:
         raise StoreError(f"{root / INDEX} is damaged; mend it first: dmcvb-gen regenerate {root}")
 
-    def read(path: str) -> bytes | None:
+    def digest(path: str) -> str | None:
         with storage_errors(root / path):
-            return (root / path).read_bytes() if (root / path).is_file() else None
+            return files.sha256_file(root / path) if (root / path).is_file() else None
 
-    refuse_altered(index, read, str(root))
+    refuse_altered(watched(index), digest, str(root))
 
 
 def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> None:

@@ -15,6 +15,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
 from dmcvb_gen.names import ANT_MAZE, FIXED, LOCOMOTION, family_of, hides_goal
+from dmcvb_gen.store.remote import storage_errors
 from dmcvb_gen.store.schema import SCHEMA_VERSION
 from dmcvb_gen.version import __version__
 
@@ -278,6 +279,18 @@ def parse_manifest(text: str | bytes, where: str = MANIFEST) -> Manifest:
       StoreError: not JSON, not a manifest, or of a newer schema version.
     """
     return _parse(Manifest, text, where)
+
+
+def local_manifest(root: Path) -> Manifest:
+    """The manifest in a release's folder.
+
+    Raises:
+      StoreError: there is none, it is damaged or cannot be read.
+    """
+    with storage_errors(root / MANIFEST):
+        if not (root / MANIFEST).is_file():
+            raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
+        return parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
 
 
 def parse_commit(text: str | bytes, where: str = "commit record") -> CommitRecord:

@@ -19,6 +19,7 @@ from dmcvb_gen.store.manifest import (
     SubsetRecord,
     checked_commit,
     commit_path,
+    local_manifest,
     parse_manifest,
     shard_count,
     subset_path,
@@ -347,18 +348,6 @@ def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
         if root.is_file():
             return root.parent, parse_manifest(root.read_bytes(), str(root))
     return root, local_manifest(root)
-
-
-def local_manifest(root: Path) -> Manifest:
-    """The manifest in a release's folder.
-
-    Raises:
-      StoreError: there is none, it is damaged or cannot be read.
-    """
-    with storage_errors(root / MANIFEST):
-        if not (root / MANIFEST).is_file():
-            raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
-        return parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
 
 
 def _remote_commits(filesystem: Any, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:

@@ -29,7 +29,7 @@ from dmcvb_gen.store.manifest import (
     SubsetRecord,
     checked_commit,
     commit_path,
-    parse_manifest,
+    local_manifest,
     shard_count,
     shard_episodes,
     subset_path,
@@ -79,8 +79,7 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
     with storage_errors(root, "write to"), contextlib.ExitStack() as stack:
         if path.exists():
             stack.enter_context(only_writer(root, wait=LOCK_SECONDS))
-            with storage_errors(path):
-                there = parse_manifest(path.read_bytes(), str(path))
+            there = local_manifest(root)
             old = merged(there, manifest, str(root))
             refuse_altered_folder(root, there)
             environments = old.environments

@@ -43,10 +43,9 @@ EVALUATION_STEPS = 40.0
 Here evaluations take most of the time, not a fifth of it as in SAC's runs: a step costs 3.0 ms trained and 1.8 ms
 evaluated (one core, 32 simulations), so a fifth would be 0.4 steps, 28 episodes in the 40,000 steps of a run. But the
 policy goes from lost to expert within 10,000 steps, and medium is picked from checkpoints 300 steps apart, each judged
-on twenty episodes, whose returns have a standard deviation of 190. So two minutes of training
-come with some fifteen of evaluation. Above 900, a larger --evaluate-every takes less, at `most_evaluation_episodes`.
-The bound is counted in steps, not in seconds, so that a run that is stopped and resumed gives the same bits however
-busy its machine is."""
+on twenty episodes, whose returns have a standard deviation of 190. Above 900, a larger --evaluate-every takes less, at
+`most_evaluation_episodes`. The bound is counted in steps, not in seconds, so that a run that is stopped and resumed
+gives the same bits however busy its machine is."""
 
 
 @dataclass(frozen=True)
