@@ -58,10 +58,16 @@ class StoredArray:
             return cast(np.ndarray, self._array[selection])
 
     def rows(self, episodes: np.ndarray) -> np.ndarray:
-        """(episode, ...) values of episodes in any order."""
+        """(episode, ...) values of episodes in any order; of arrays with steps, those in a row are read at once.
+
+        Zarr's own selection of scattered rows takes thirty times as long for pictures.
+        """
         self._check_painted(episodes)
         with storage_errors(self._place, decoding=True):
-            return cast(np.ndarray, self._array.oindex[episodes])
+            if self.ndim == 1:
+                return cast(np.ndarray, self._array.oindex[episodes])
+            runs = np.split(episodes, np.flatnonzero(np.diff(episodes) != 1) + 1)
+            return np.concatenate([self._array[int(run[0]) : int(run[-1]) + 1] for run in runs])
 
     def _check_painted(self, selection: Any) -> None:
         """Raises StoreError for an episode without pictures, which would read as black."""
@@ -235,8 +241,6 @@ class Subset:
                 raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
         if not len(chosen):
             return np.zeros((0, *source.shape[1:]), source.dtype)
-        if len(chosen) == chosen[-1] - chosen[0] + 1 and (np.diff(chosen) == 1).all():
-            return source[int(chosen[0]) : int(chosen[-1]) + 1]
         return source.rows(chosen)
 
     def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
