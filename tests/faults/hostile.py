@@ -18,7 +18,6 @@ import io
 import json
 import os
 import resource
-import shutil
 import signal
 import struct
 import subprocess
@@ -637,7 +636,7 @@ def serve() -> None:
     sys.dont_write_bytecode = True
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    guard, kind, base = _Guard(), None, {}
+    guard, kind, laid = _Guard(), None, Laid(Path(), {})
     signal.signal(signal.SIGALRM, _too_late)
     signal.signal(signal.SIGPROF, _too_late)
     sys.addaudithook(guard)
@@ -646,31 +645,70 @@ def serve() -> None:
         for line in iter(requests.readline, ""):
             asked, case = json.loads(line)
             if asked != kind:
-                kind, base = asked, KINDS[asked].base()
-                _warm_up(KINDS[kind], folder, base)
-            lay_out(folder, base | {name: base64.b64decode(data) for name, data in case.items()})
+                kind, laid = asked, Laid(folder, KINDS[asked].base())
+                _warm_up(KINDS[kind], laid)
+            laid.out({name: base64.b64decode(data) for name, data in case.items()})
             answers.write(json.dumps(_take(KINDS[kind].take, folder, guard)) + "\n")
             answers.flush()
 
 
-def _warm_up(kind: Kind, folder: Path, base: Files) -> None:
+def _warm_up(kind: Kind, laid: Laid) -> None:
     """Take a sound case without bounds (what is imported or made once for all counts for none), then set them."""
     from dmcvb_gen.errors import DmcvbError
 
     resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    lay_out(folder, base)
+    laid.out({})
     with contextlib.suppress(DmcvbError, OSError):
-        kind.take(folder)
+        kind.take(laid.folder)
     resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, resource.RLIM_INFINITY))
 
 
-def lay_out(folder: Path, files: Files) -> None:
-    """Make a folder of these files alone."""
-    shutil.rmtree(folder, ignore_errors=True)
-    for name, data in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-    folder.mkdir(parents=True, exist_ok=True)
+class Laid:
+    """A folder of sound files and one case at a time; what a case changed, or its taker, is put back before the next.
+
+    (Making a release of a hundred files anew for each takes longer than to read it.)
+    """
+
+    def __init__(self, folder: Path, base: Files):
+        self.folder, self.base = folder, base
+        self._seen: dict[str, tuple[int, int, int]] = {}
+
+    def out(self, case: Files) -> None:
+        """Make the folder hold the base and over it these files, and nothing else."""
+        os.makedirs(self.folder, exist_ok=True)
+        there = self._tidy(str(self.folder), "")
+        for name in self.base.keys() - case.keys() - there:
+            self._write(name, self.base[name])
+            self._seen[name] = _mark(os.lstat(f"{self.folder}/{name}"))
+        for name, data in case.items():
+            self._seen.pop(name, None)
+            self._write(name, data)
+
+    def _tidy(self, folder: str, prefix: str) -> set[str]:
+        """Remove what is not of the base any more, and folders left empty; the names of what stays."""
+        stays = set()
+        for entry in list(os.scandir(folder)):
+            name = prefix + entry.name
+            if entry.is_dir(follow_symlinks=False):
+                inner = self._tidy(entry.path, name + "/")
+                stays |= inner
+                if not inner:
+                    os.rmdir(entry.path)
+            elif self._seen.get(name) == _mark(entry.stat(follow_symlinks=False)):
+                stays.add(name)
+            else:
+                os.unlink(entry.path)
+        return stays
+
+    def _write(self, name: str, data: bytes) -> None:
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)  # a name may be a link to another
+        path.write_bytes(data)
+
+
+def _mark(found: os.stat_result) -> tuple[int, int, int]:
+    return found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def _too_late(*_):
