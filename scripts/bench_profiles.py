@@ -33,7 +33,8 @@ class Variant:
 
     network: Architecture = NARROW
     batch: int = 64
-    rate: float = 1.0
+    rate: float = 2.0
+    shift: bool = False
     half: bool = True
     compiled: bool = False
 
@@ -42,8 +43,9 @@ VARIANTS = {
     "quick": Variant(),
     "batch 32": Variant(batch=32),
     "batch 128": Variant(batch=128),
-    "half the rate": Variant(rate=0.5),
-    "twice the rate": Variant(rate=2.0),
+    "half the rate": Variant(rate=1.0),
+    "twice the rate": Variant(rate=4.0),
+    "shifted": Variant(shift=True),
     "half as wide": Variant(Architecture((8, 16, 16, 32), (2, 2, 2, 1))),
     "twice as wide": Variant(Architecture((32, 64, 64, 128), (2, 2, 2, 1))),
     "four strides": Variant(Architecture((16, 32, 64, 64), (2, 2, 2, 2))),
@@ -67,6 +69,7 @@ def settings(variant: Variant, steps: int) -> TrainSettings:
         half=variant.half,
         compile=variant.compiled,
         rate=variant.rate,
+        shift=variant.shift,
         decay=True,
     )
 

@@ -263,6 +263,7 @@ class TrainingData(Dataset):
         k: int = 1,
         sample_k: bool = False,
         hold_out: bool = False,
+        shift: bool = True,
         dtype: torch.dtype = torch.float32,
         reuse: Batch | None = None,
     ) -> Batch:
@@ -272,6 +273,7 @@ class TrainingData(Dataset):
           next_observation: give the observation k steps later too, under the same shift.
           k: steps between the two; with `sample_k` drawn from 1..k for each.
           hold_out: draw from the held-out episodes, without shifts.
+          shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
           dtype: of pictures. Half the bytes are half the time to write them.
           reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
             memory for a large batch costs several times the work that fills it.
@@ -285,7 +287,7 @@ class TrainingData(Dataset):
                 "episodes"
             )
         chosen = rows[self._to_device(generator.integers(len(rows), size=size))]
-        if hold_out or self.frames is None:
+        if hold_out or not shift or self.frames is None:
             down, right = self._no_shift(size)
         else:
             down, right = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))

@@ -57,14 +57,15 @@ class _DataCache:
 _cache = _DataCache()
 
 
-def train_settings(setup: Setup, steps: int, half: bool = True, evaluations: int = 1) -> TrainSettings:
+def train_settings(setup: Setup, steps: int, pixels: bool = True, evaluations: int = 1) -> TrainSettings:
     """How a piece of a cell is trained under a profile."""
     return TrainSettings(
         steps=steps,
-        batch_size=setup.profile.batch_size,
+        batch_size=setup.profile.batch_size if pixels else setup.profile.state_batch_size,
         evaluate_every=-(-steps // evaluations),
-        half=half,
-        rate=setup.profile.rate,
+        half=pixels,
+        rate=setup.profile.rate if pixels else 1.0,
+        shift=setup.profile.shift,
         decay=setup.profile.decay,
         compile=setup.compile,
         workers=1 if setup.device != "cpu" else 0,
@@ -202,7 +203,7 @@ def _train_policy(
         return {"score": score.facts()}
 
     label = f"{cell.agent.name} on {cell.task} {cell.policy_label}/{cell.setting}"
-    settings = train_settings(setup, policy_steps(profile, cell.agent), half=pixels, evaluations=profile.evaluations)
+    settings = train_settings(setup, policy_steps(profile, cell.agent), pixels, profile.evaluations)
     started = time.perf_counter()
     try:
         curve = train(
