@@ -19,6 +19,7 @@ from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
 from dmcvb_gen.benchmarks.figures import curve_figure, data_url, figure_url, label_of, place_of, return_figure
 from dmcvb_gen.benchmarks.paper import paper_score
+from dmcvb_gen.benchmarks.questions import QUESTIONS, ask
 from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.tables import Cell, Missing
 from dmcvb_gen.files import write_json, write_text
@@ -188,6 +189,7 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup
         returns=_returns(facts["returns"]),
         scores=[_scores(name, facts) for name in dict.fromkeys(r["cell"]["benchmark"] for r in facts["results"])],
         notes=_notes(facts["results"]),
+        answers=_answers(facts["results"]),
         figures=figures,
         rollouts=_sheets(good, setup, "rollout"),
         decoders=_sheets(good, setup, "decoder"),
@@ -321,6 +323,10 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
             "over the time to reach it, of those episodes."
         )
     return notes
+
+
+def _answers(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    return [(QUESTIONS[a.question][0], a.where, a.answer, a.numbers) for a in ask(results)]
 
 
 def _inspection(good: Results, profile: str) -> list[tuple]:

@@ -23,6 +23,10 @@ COMMANDS = {
     "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
     "verify": ("release:verify", "Check that a release is what it says."),
     "validate": ("validate:validate", "Check a release, run the paper's benchmarks, report both."),
+    "questions": (
+        "validate:questions",
+        "Ask reports what the paper asked of its scores, of several seeds together.",
+    ),
     "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
     "paint": ("paint:paint", "Fill in the pictures of a release that travelled without."),
     "repaint": ("release:repaint", "New pixels from stored physics states: distractor, size, renderer."),

@@ -1,4 +1,4 @@
-"""validate."""
+"""validate, questions."""
 
 from __future__ import annotations
 
@@ -128,3 +128,42 @@ def _show(result, profile) -> None:
         ]
     click.echo(f"{'; '.join(verdict)} ({checked}); {profile.note}")
     click.echo(f"Report: {result.report}")
+
+
+@click.command()
+@click.argument("reports", nargs=-1, required=True, type=click.Path(path_type=Path))
+@json_option
+def questions(reports, as_json):
+    """What the paper asked of its scores, asked of the reports that validate wrote.
+
+    Is none above static above dynamic? Does BC(state) stay near its data? Does ID+BC beat the others? Does more data
+    help? Reports that differ in their seed are taken together. A difference counts from two standard errors on (of the
+    episodes, or of the seeds' means where these lie further apart); what lies nearer is open.
+
+    \b
+    dmcvb-gen validate releases/mini --profile quick --agents bc,state-bc,id+bc --seed 0 --out reports/seed0
+    dmcvb-gen validate releases/mini --profile quick --agents bc,state-bc,id+bc --seed 1 --out reports/seed1
+    dmcvb-gen questions reports/seed0 reports/seed1
+    """
+    from dataclasses import asdict
+
+    from dmcvb_gen.benchmarks.questions import QUESTIONS, ask, pool, read_reports
+
+    results = read_reports(reports)
+    answers = ask(results)
+    if as_json:
+        scores = [asdict(place) | asdict(score) for place, score in pool(results).items()]
+        print_json({"scores": scores, "answers": [asdict(answer) for answer in answers]})
+        return
+    for place, score in pool(results).items():
+        seeds = ", ".join(f"{mean:.1f}" for mean in score.seeds)
+        where = f"{place.benchmark} {place.task} {place.learns_from}, {place.setting}"
+        click.echo(f"{where}, {place.agent}: {score} (seeds: {seeds}); data {score.data:.1f}")
+    for name, (words, _) in QUESTIONS.items():
+        found = [answer for answer in answers if answer.question == name]
+        if found:
+            click.echo(f"\n{words}")
+        for answer in found:
+            click.echo(f"  {answer.answer:>4}  {answer.where}: {answer.numbers}")
+    if not answers:
+        click.echo("These reports hold no scores that answer any: use --profile quick or paper.")

@@ -7,6 +7,7 @@ pictures cost the same, share theirs.
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 from collections.abc import Hashable
@@ -81,7 +82,8 @@ def _simulate(job: Job) -> _Sample:
     started = time.perf_counter()
     timed = simulate_job(job, max_steps=TIMED_STEPS)
     seconds = (time.perf_counter() - started) / timed.length.sum()
-    return _Sample(simulate_job(job, episodes=range(count)), seconds)
+    threads = min(os.cpu_count() or 1, count)  # what is timed had one
+    return _Sample(simulate_job(job, threads, episodes=range(count)), seconds)
 
 
 def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, float]:

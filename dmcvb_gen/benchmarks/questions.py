@@ -1,0 +1,235 @@
+"""What the paper asked of its scores, asked of ours: results of one or more seeds in, answers with their spread out.
+
+Results that differ in nothing but the seed are taken together: the mean of all their episodes; its standard error is
+that of the episodes, or of the seeds' means where these lie further apart. A difference counts from two of its
+standard errors on; what lies nearer is left open, whatever its sign.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.benchmarks.tables import FEW_EPISODES
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import DISTRACTOR_KINDS
+
+ERRORS = 2.0
+"""Standard errors from which on a difference counts."""
+NEAR = 0.05
+"""Of the data's return: how near BC(state) is to it (the paper underlines what lies within 5 % of BC(state))."""
+YES, NO, OPEN = "yes", "no", "open"
+
+
+@dataclass(frozen=True)
+class Place:
+    """What results share that differ by agent, setting or data alone."""
+
+    benchmark: str
+    task: str
+    setting: str
+    learns_from: str
+    agent: str
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Scores of one cell over all seeds.
+
+    Attributes:
+      mean, stderr: of the returns. seeds: each seed's mean.
+      data: mean return of what the policy learned from.
+    """
+
+    mean: float
+    stderr: float
+    seeds: tuple[float, ...]
+    data: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.1f} +- {self.stderr:.1f}"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One question at one place.
+
+    Attributes:
+      question: of `QUESTIONS`. where: task, data, setting, agents.
+      answer: "yes", "no", or "open" where the scores do not tell.
+      numbers: what it rests on.
+    """
+
+    question: str
+    where: str
+    answer: str
+    numbers: str
+
+
+Scores = Mapping[Place, Pooled]
+
+
+def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
+    """The results of reports (folders that `validate` wrote).
+
+    Raises:
+      DmcvbError: there is no report, or two were made with different profiles.
+    """
+    results, profiles = [], {}
+    for folder in folders:
+        path = Path(folder) / "report.json"
+        try:
+            facts = json.loads(path.read_text())
+            results += facts["results"]
+            profiles[facts["profile"]["name"]] = folder
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DmcvbError(f"cannot read {path} ({type(error).__name__}); dmcvb-gen validate writes it") from None
+    if len(profiles) > 1:
+        named = ", ".join(f"{folder} ({profile})" for profile, folder in profiles.items())
+        raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")
+    return results
+
+
+def pool(results: Iterable[Mapping[str, Any]]) -> dict[Place, Pooled]:
+    """Results by place, those of several seeds together."""
+    found: dict[Place, list[Mapping[str, Any]]] = {}
+    for result in results:
+        cell = result["cell"]
+        learns = cell["policy_label"] + (f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else "")
+        place = Place(cell["benchmark"], cell["task"], cell["setting"], learns, cell["agent_name"])
+        found.setdefault(place, []).append(result)
+    return {place: _pool(several) for place, several in found.items()}
+
+
+def _pool(results: Sequence[Mapping[str, Any]]) -> Pooled:
+    returns = np.concatenate([result["score"]["returns"] for result in results])
+    seeds = np.array([np.mean(result["score"]["returns"]) for result in results])
+    within = returns.std(ddof=1) / math.sqrt(len(returns)) if len(returns) > 1 else math.inf
+    between = seeds.std(ddof=1) / math.sqrt(len(seeds)) if len(seeds) > 1 else 0.0
+    data = float(np.mean([result["data"]["mean"] for result in results]))
+    return Pooled(float(returns.mean()), float(max(within, between)), tuple(seeds.tolist()), data)
+
+
+def _judge(more: Pooled, less: Pooled) -> tuple[str, str]:
+    """Whether the first is above the second, and the difference as text."""
+    error = math.hypot(more.stderr, less.stderr)
+    difference = more.mean - less.mean
+    answer = OPEN if abs(difference) < ERRORS * error else YES if difference > 0 else NO
+    return answer, f"{difference:+.1f} +- {error:.1f}"
+
+
+def _beside(names: Sequence[str], scores: Sequence[Pooled], difference: str) -> str:
+    listed = ", ".join(f"{name} {score}" for name, score in zip(names, scores, strict=True))
+    return f"{listed}; difference {difference}"
+
+
+def _above(question: str, where: str, names: Sequence[str], scores: Sequence[Pooled]) -> Answer:
+    """Whether the first of two scores is above the second."""
+    answer, difference = _judge(*scores)
+    return Answer(question, f"{where}, {names[0]} over {names[1]}", answer, _beside(names, scores, difference))
+
+
+def _with(place: Place, **others: str) -> Place:
+    return Place(**{**place.__dict__, **others})
+
+
+def _order(scores: Scores) -> Iterator[Answer]:
+    for place, score in scores.items():
+        if place.benchmark != "b1" or place.setting not in DISTRACTOR_KINDS[:-1]:
+            continue
+        later = DISTRACTOR_KINDS[DISTRACTOR_KINDS.index(place.setting) + 1 :]
+        following = next((kind for kind in later if _with(place, setting=kind) in scores), None)
+        if following:
+            pair = (score, scores[_with(place, setting=following)])
+            where = f"{place.task} {place.learns_from}, {place.agent}"
+            yield _above("order", where, (place.setting, following), pair)
+
+
+def _state(scores: Scores) -> Iterator[Answer]:
+    for place, score in scores.items():
+        if place.benchmark == "b1" and place.agent == "state-bc":
+            away = abs(score.mean - score.data)
+            near = away <= NEAR * abs(score.data)
+            answer = YES if near else NO if away > ERRORS * score.stderr else OPEN
+            numbers = f"{score}, data {score.data:.1f}; difference {score.mean - score.data:+.1f}"
+            yield Answer("state", f"{place.task} {place.learns_from}", answer, numbers)
+
+
+def _gap(scores: Scores) -> Iterator[Answer]:
+    for place, score in scores.items():
+        if place.benchmark == "b1" and place.agent == "bc":
+            states = [s for p, s in scores.items() if p == _with(place, setting=p.setting, agent="state-bc")]
+            if states:
+                where = f"{place.task} {place.learns_from}, {place.setting}"
+                yield _above("gap", where, ("BC(state)", "BC"), (states[0], score))
+
+
+def _encoder(scores: Scores) -> Iterator[Answer]:
+    for place, score in scores.items():
+        if place.benchmark != "b1" or place.agent != "id+bc" or place.setting == DISTRACTOR_KINDS[0]:
+            continue
+        for other, beside in scores.items():
+            if other.agent.startswith("state-"):
+                continue
+            if other == _with(place, agent=other.agent) and other.agent != place.agent:
+                where = f"{place.task} {place.learns_from}, {place.setting}"
+                yield _above("id", where, (place.agent, other.agent), (score, beside))
+
+
+def _pretrained(benchmark: str, question: str) -> Callable[[Scores], Iterator[Answer]]:
+    def ask(scores: Scores) -> Iterator[Answer]:
+        for place, score in scores.items():
+            own, with_encoder, _ = place.learns_from.partition(" (encoder: ")
+            reference = _with(place, learns_from=own, agent="bc")
+            if place.benchmark == benchmark and with_encoder and reference in scores:
+                names, pair = (place.agent, "bc"), (score, scores[reference])
+                yield _above(question, f"{place.task} {place.learns_from}, {place.setting}", names, pair)
+
+    return ask
+
+
+def _share(scores: Scores) -> Iterator[Answer]:
+    groups: dict[Place, list[tuple[float, Pooled]]] = {}
+    for place, score in scores.items():
+        if place.benchmark == "ablations":
+            share, percent, level = place.learns_from.rpartition("% ")
+            key = _with(place, learns_from=level)
+            groups.setdefault(key, []).append((float(share) if percent else 100.0, score))
+    for place, shares in groups.items():
+        for (few, less), (many, more) in itertools.pairwise(sorted(shares, key=lambda entry: entry[0])):
+            where = f"{place.task} {place.learns_from}, {place.setting}, {place.agent}"
+            yield _above("share", where, (f"{many:g} %", f"{few:g} %"), (more, less))
+
+
+QUESTIONS: dict[str, tuple[str, Callable[[Scores], Iterator[Answer]]]] = {
+    "order": ("Do stronger distractors cost return (none > static > dynamic)?", _order),
+    "state": ("Does BC(state) stay near its data (5 %)?", _state),
+    "gap": ("Is BC(state) above BC from pictures?", _gap),
+    "id": ("Does ID+BC beat the other agents under distractors and in mazes?", _encoder),
+    "mixed": (
+        f"Does an encoder of mixed data help a policy of {FEW_EPISODES} episodes (B2)?",
+        _pretrained("b2", "mixed"),
+    ),
+    "goals": (
+        "Does an encoder of hidden random goals help a policy of one goal's episodes (B3)?",
+        _pretrained("b3", "goals"),
+    ),
+    "share": ("Does more data give more return?", _share),
+}
+"""Question -> its words, and who answers it at every place that the scores allow."""
+
+
+def ask(results: Iterable[Mapping[str, Any]]) -> list[Answer]:
+    """All answers that results (of `report.json`, of any number of seeds) allow; those of profile smoke allow none."""
+    scores = pool(result for result in results if result["profile"]["scores"])
+    return [answer for _, answers in QUESTIONS.values() for answer in answers(scores)]
+
+
+__all__ = ["QUESTIONS", "Answer", "Place", "Pooled", "ask", "pool", "read_reports"]

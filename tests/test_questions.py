@@ -1,0 +1,117 @@
+"""The paper's questions of made-up scores whose answers are known, and of a report that `validate` wrote."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.benchmarks.questions import ask, pool, read_reports
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError
+
+
+def result(agent, setting, returns, *, benchmark="b1", learns="expert", encoder="", data=100.0, scores=True, **more):
+    """A result as `report.json` has it, with what questions are asked of."""
+    cell = {"benchmark": benchmark, "task": "walker-walk", "setting": setting, "agent_name": agent}
+    cell |= {"policy_label": learns, "pretrain_label": encoder}
+    return {"cell": cell, "score": {"returns": returns}, "data": {"mean": data}, "profile": {"scores": scores}, **more}
+
+
+def near(mean):
+    return [mean - 1.0, mean, mean + 1.0]
+
+
+def answers_of(*results):
+    return {(answer.question, answer.where): answer.answer for answer in ask(results)}
+
+
+def test_order_is_asked_of_settings_that_follow_each_other():
+    found = answers_of(
+        result("bc", "none", near(90)), result("bc", "static", near(91)), result("bc", "dynamic", near(20))
+    )
+    assert list(found.values()) == ["open", "yes"]
+    assert list(answers_of(result("bc", "none", near(20)), result("bc", "dynamic", near(90))).values()) == ["no"]
+
+
+def test_states_near_their_data():
+    where = ("state", "walker-walk expert")
+    assert answers_of(result("state-bc", "none", near(97)))[where] == "yes"
+    assert answers_of(result("state-bc", "none", near(80)))[where] == "no"
+    assert answers_of(result("state-bc", "none", [20.0, 160.0, 90.0]))[where] == "open"  # 10 below, but 40 uncertain
+    assert answers_of(result("state-bc", "none", near(-104), data=-100.0))[where] == "yes"
+
+
+def test_id_is_compared_with_pictures_alone_and_not_without_distractors():
+    found = answers_of(
+        *(result(agent, "dynamic", near(mean)) for agent, mean in (("id+bc", 50), ("bc", 60), ("lfd+bc", 20))),
+        *(result(agent, "none", near(mean)) for agent, mean in (("id+bc", 99), ("bc", 60), ("state-bc", 97))),
+    )
+    assert {where.rpartition(", ")[2]: answer for (question, where), answer in found.items() if question == "id"} == {
+        "id+bc over bc": "no",
+        "id+bc over lfd+bc": "yes",
+    }
+    every = ask([result("id+bc", "dynamic", near(50)), result("state-bc", "dynamic", near(97))])
+    assert not [answer for answer in every if answer.question == "id"]
+
+
+def test_the_gap_to_states_is_of_every_setting():
+    found = ask([result("state-bc", "none", near(97)), *(result("bc", s, near(60)) for s in ("none", "dynamic"))])
+    assert [answer.answer for answer in found if answer.question == "gap"] == ["yes", "yes"]
+
+
+@pytest.mark.parametrize("benchmark, question", [("b2", "mixed"), ("b3", "goals")])
+def test_an_encoder_from_other_data_is_compared_with_bc_on_the_same_episodes(benchmark, question):
+    own = dict(benchmark=benchmark, learns="20 expert")
+    found = ask(
+        [
+            result("bc", "none", near(40), **own),
+            result("bc", "none", near(90), benchmark=benchmark, learns="expert"),
+            result("id+bc", "none", near(70), encoder="mixed", **own),
+        ]
+    )
+    assert [(answer.question, answer.answer) for answer in found] == [(question, "yes")]
+    assert "70.0" in found[0].numbers and "40.0" in found[0].numbers
+
+
+def test_shares_are_compared_in_their_order():
+    made = [result("bc", "none", near(mean), benchmark="ablations", learns=label) for mean, label in
+            ((80, "expert"), (20, "1% expert"), (81, "25% expert"), (40, "5% expert"))]  # fmt: skip
+    assert [answer.answer for answer in ask(made)] == ["yes", "yes", "open"]
+
+
+def test_seeds_that_lie_apart_widen_the_error():
+    one, two = result("bc", "none", near(50)), result("bc", "none", near(90))
+    (score,) = pool([one, two]).values()
+    assert score.mean == 70 and score.seeds == (50, 90) and score.stderr == pytest.approx(20)
+    (alone,) = pool([one]).values()
+    assert alone.stderr == pytest.approx(1 / 3**0.5)
+
+
+def test_numbers_that_claim_no_score_answer_nothing():
+    assert ask([result("state-bc", "none", near(97), scores=False)]) == []
+
+
+def write(folder, profile, *results):
+    folder.mkdir()
+    (folder / "report.json").write_text(json.dumps({"profile": {"name": profile}, "results": results}))
+    return str(folder)
+
+
+def test_command(tmp_path):
+    both = [write(tmp_path / str(i), "quick", result("state-bc", "none", near(96 + i))) for i in (0, 1)]
+    shown = CliRunner().invoke(main, ["questions", *both])
+    assert shown.exit_code == 0 and "seeds: 96.0, 97.0" in shown.output and "  yes  walker-walk expert" in shown.output
+    facts = json.loads(CliRunner().invoke(main, ["questions", *both, "--json"]).output)
+    assert facts["scores"][0]["seeds"] == [96, 97] and facts["answers"][0]["answer"] == "yes"
+    other = write(tmp_path / "other", "paper", result("state-bc", "none", near(97)))
+    refused = CliRunner().invoke(main, ["questions", *both, other])
+    assert refused.exit_code == 2 and "different profiles" in refused.output and refused.output.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"profile": {"name": "quick"}}', "\0"])
+def test_what_is_no_report_is_one_line(tmp_path, text):
+    (tmp_path / "report.json").write_text(text)
+    with pytest.raises(DmcvbError, match="validate writes it"):
+        read_reports([tmp_path])
