@@ -367,8 +367,9 @@ def _read_all(root: str) -> None:
     list(check_files(Path(root)))
     describe_release(root)
     for subset in release.subsets.values():
-        for episode in subset.episodes[:2]:
-            subset.episode(int(episode))
+        for array in subset.arrays:  # of every shard at once
+            subset.read(array)
+        subset.episode(int(subset.episodes[0]), ["action"])
 
 
 def take_release(folder: Path) -> None:
