@@ -24,7 +24,7 @@ def small_recipe(**changes):
         "name": "small",
         "seed": 3,
         "size": 16,
-        "renderer": {"backend": "warp", "samples": 1},
+        "renderer": {"backend": "native"},
         "subsets": [
             {
                 "tasks": "walker-walk",
@@ -53,7 +53,7 @@ TINY_MAZE = "ant-maze-tiny:****/*..*/****"
 def maze_recipe(settings=("visible",), **changes):
     """A maze of two cells, random actions, 2 episodes in shards of 1, small pictures."""
     pattern = {"tasks": TINY_MAZE, "levels": "random", "settings": list(settings), "episodes": 2}
-    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "warp", "samples": 1}}
+    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "native"}}
     return make_recipe(fields | {"subsets": [pattern | {"episodes_per_shard": 1} | changes]})
 
 

@@ -28,7 +28,7 @@ TINY = "ant-maze-tiny:****/*..*/****"
 
 def maze_recipe(settings=("visible",), **changes):
     pattern = {"tasks": TINY, "levels": "random", "settings": list(settings), "episodes": 2, "episodes_per_shard": 1}
-    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "warp", "samples": 1}}
+    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "native"}}
     return make_recipe(fields | {"subsets": [pattern | changes]})
 
 

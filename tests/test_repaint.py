@@ -122,11 +122,11 @@ def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, n
 @pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")
 def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
-    roll_out(small_recipe(subsets=[pattern]), tmp_path / "warp")
+    roll_out(small_recipe(subsets=[pattern]), tmp_path / "native")
     options = ["--renderer", "opengl", "--name", "gl", "--out", str(tmp_path / "gl")]
-    result = CliRunner().invoke(main, ["repaint", str(tmp_path / "warp"), *options])
+    result = CliRunner().invoke(main, ["repaint", str(tmp_path / "native"), *options])
     assert result.exit_code == 0, result.output
-    old, new = (open_release(tmp_path / f)["walker-walk/random/none"].read("pixels") for f in ("warp", "gl"))
+    old, new = (open_release(tmp_path / f)["walker-walk/random/none"].read("pixels") for f in ("native", "gl"))
     assert 0 < np.abs(old.astype(int) - new).mean() < 15
     assert open_release(tmp_path / "gl").manifest.recipe["renderer"]["backend"] == "opengl"
 

@@ -320,7 +320,7 @@ def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_thi
 def test_the_manifest_names_everything_needed_to_make_it_again(small_release):
     data = json.loads((small_release / "manifest.json").read_text())
     subset = next(subset for subset in data["subsets"] if subset["setting"] == "dynamic")
-    assert data["recipe"]["seed"] == 3 and subset["renderer"]["name"] == "warp" and subset["renderer"]["samples"] == 1
+    assert data["recipe"]["seed"] == 3 and subset["renderer"]["name"] == "native" and subset["renderer"]["samples"] == 4
     assert len(subset["backgrounds"]["digest"]) == 64 and subset["digest"]
     assert {"mujoco", "numba", "numpy", "cpu", "system", "zarr"} <= set(data["environments"][0])
     assert make_recipe(data["recipe"]) == small_recipe()

@@ -27,7 +27,7 @@ def release(tmp_path_factory):
     """Random actions, an episode with the goal visible, one with it hidden, one of each of two fixed goals."""
     pattern = {"tasks": TINY, "levels": "random", "settings": ["visible", "hidden", "fixed"], "episodes": 1}
     pattern |= {"fixed_goals": 2, "episodes_per_goal": 1}
-    recipe = {"name": "tiny-maze", "size": 16, "renderer": {"backend": "warp", "samples": 1}, "subsets": [pattern]}
+    recipe = {"name": "tiny-maze", "size": 16, "renderer": {"backend": "native"}, "subsets": [pattern]}
     folder = tmp_path_factory.mktemp("validate-maze") / "tiny"
     roll_out(make_recipe(recipe), folder)
     return folder
