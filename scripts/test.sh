@@ -7,7 +7,7 @@ ruff format --check .
 mypy
 # The tests write and remove very many small files: in memory, where there is plenty (8 GB), else on the disk.
 if [ -z "${TMPDIR:-}" ] && [ "$(df --output=avail /dev/shm 2>/dev/null | tail -1)" -gt 8000000 ] 2>/dev/null; then
-  TMPDIR="$(mktemp -d /dev/shm/dmcvb-tests-XXXXXX)"
+  TMPDIR="$(mktemp -d /dev/shm/dmcvb-XXXX)"
   export TMPDIR
   trap 'rm -rf "$TMPDIR"' EXIT
 fi

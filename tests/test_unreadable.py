@@ -83,7 +83,7 @@ WAYS = (deny, directory, loop, other_bytes)
 
 
 def one_line(error) -> str:
-    assert isinstance(error, DmcvbError) and "\n" not in str(error) and len(str(error)) < 400
+    assert isinstance(error, DmcvbError) and "\n" not in str(error) and len(str(error)) < 600
     return str(error)
 
 
