@@ -33,8 +33,8 @@ class Variant:
 
     network: Architecture = NARROW
     batch: int = 64
-    rate: float = 2.0
-    shift: bool = False
+    rate: float = 1.0
+    shift: bool = True
     half: bool = True
     compiled: bool = False
 
@@ -43,9 +43,9 @@ VARIANTS = {
     "quick": Variant(),
     "batch 32": Variant(batch=32),
     "batch 128": Variant(batch=128),
-    "half the rate": Variant(rate=1.0),
-    "twice the rate": Variant(rate=4.0),
-    "shifted": Variant(shift=True),
+    "half the rate": Variant(rate=0.5),
+    "twice the rate": Variant(rate=2.0),
+    "brief": Variant(rate=2.0, shift=False),
     "half as wide": Variant(Architecture((8, 16, 16, 32), (2, 2, 2, 1))),
     "twice as wide": Variant(Architecture((32, 64, 64, 128), (2, 2, 2, 1))),
     "four strides": Variant(Architecture((16, 32, 64, 64), (2, 2, 2, 2))),

@@ -150,7 +150,7 @@ def test_ablations_vary_frames_k_and_the_share_of_the_data():
 def test_unknown_benchmarks_and_profiles_list_the_known_ones():
     with pytest.raises(UnknownNameError, match=", ".join(sorted(BENCHMARKS))):
         plan_benchmark("b4", release_of(*WALKER))
-    with pytest.raises(UnknownNameError, match="paper, quick, smoke"):
+    with pytest.raises(UnknownNameError, match="brief, paper, quick, smoke"):
         get_profile("slow")
 
 

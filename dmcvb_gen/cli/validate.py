@@ -14,7 +14,7 @@ from dmcvb_gen.cli.common import OutPath, json_option, print_json
 
 @click.command()
 @click.argument("path")
-@click.option("--profile", default="smoke", show_default=True, help="smoke (minutes, no scores), quick, paper.")
+@click.option("--profile", default="smoke", show_default=True, help="smoke (no scores), brief, quick, paper.")
 @click.option("--scale", type=click.FloatRange(0, min_open=True), default=1.0, help="Times the profile's steps.")
 @click.option("--benchmark", "benchmarks", multiple=True, help="b1, b2, b3, ablations. Repeatable.  [default: b1]")
 @click.option("--agents", default="", metavar="A,B", help="Names such as bc,state-bc,id+bc instead of all.")
@@ -166,4 +166,4 @@ def questions(reports, as_json):
         for answer in found:
             click.echo(f"  {answer.answer:>4}  {answer.where}: {answer.numbers}")
     if not answers:
-        click.echo("These reports hold no scores that answer any: use --profile quick or paper.")
+        click.echo("These reports hold no scores that answer any: use --profile brief, quick or paper.")
