@@ -106,6 +106,31 @@ def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
     assert same.sum() < 8
 
 
+def test_shifts_can_be_left_out_and_the_same_transitions_are_drawn():
+    data = make_data()
+    shifted, plain = (data.batch(32, np.random.default_rng(0), next_observation=True, shift=s) for s in (True, False))
+    torch.testing.assert_close(plain.observation, data.observe(plain.reward.long(), *data._no_shift(32)))
+    torch.testing.assert_close(plain.next_observation, data.observe(plain.reward.long() + 1, *data._no_shift(32)))
+    assert (shifted.reward == plain.reward).all()
+
+
+@pytest.mark.parametrize("shift", [True, False])
+def test_a_training_shifts_its_pictures_as_it_is_told(monkeypatch, shift):
+    data, asked = make_data(), []
+    batch = data.batch
+    monkeypatch.setattr(data, "batch", lambda *a, **k: asked.append((k["shift"], k["hold_out"])) or batch(*a, **k))
+    train(pixel_learner(data), data, TrainSettings(steps=3, batch_size=4, evaluate_every=3, shift=shift))
+    assert {told for told, held in asked if not held} == {shift}
+
+
+def test_scattered_episodes_are_the_rows_of_all(small_release):
+    subset = open_release(small_release)["walker-walk/random/none"]
+    for name in ("pixels", "state", "length"):
+        every = subset.read(name)
+        for chosen in ([2, 0], [0, 2], [1], [2, 1, 0], [0, 1, 2]):
+            np.testing.assert_array_equal(subset.read(name, chosen), every[chosen])
+
+
 def test_states_are_normalized_by_the_training_episodes_with_a_floor():
     data = make_data()
     raw = torch.rand((16, 5), generator=torch.Generator().manual_seed(0))

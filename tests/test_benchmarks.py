@@ -18,6 +18,7 @@ from dmcvb_gen.agents.data import (
     normalize_pixels,
     training_views,
 )
+from dmcvb_gen.benchmarks.cells import train_settings
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
@@ -409,3 +410,12 @@ def test_a_negative_return_is_set_beside_its_reference_by_the_difference():
     assert walker["share"] == 0.5
     fixed = compared(MAZE, [("bc", -60.0), ("id+bc", -45.0)], "b3")["id+bc"]
     assert fixed["difference"] == 15.0 and fixed["reference"] == "BC on these episodes"
+
+
+def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
+    setup = Setup(root="r", out="o", profile=PROFILES["brief"])
+    pixels, states = train_settings(setup, 10), train_settings(setup, 10, pixels=False)
+    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, False, True)
+    assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
+    whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10)
+    assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
