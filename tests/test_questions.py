@@ -95,7 +95,8 @@ def test_numbers_that_claim_no_score_answer_nothing():
 
 def write(folder, profile, *results):
     folder.mkdir()
-    (folder / "report.json").write_text(json.dumps({"profile": {"name": profile}, "results": results}))
+    marked = [one | {"fingerprint": f"{folder}, {index}"} for index, one in enumerate(results)]
+    (folder / "report.json").write_text(json.dumps({"profile": {"name": profile}, "results": marked}))
     return str(folder)
 
 
@@ -105,6 +106,7 @@ def test_command(tmp_path):
     assert shown.exit_code == 0 and "seeds: 96.0, 97.0" in shown.output and "  yes  walker-walk expert" in shown.output
     facts = json.loads(CliRunner().invoke(main, ["questions", *both, "--json"]).output)
     assert facts["scores"][0]["seeds"] == [96, 97] and facts["answers"][0]["answer"] == "yes"
+    assert len(read_reports([*both, both[0]])) == 2  # a report that is named twice is no second seed
     other = write(tmp_path / "other", "paper", result("state-bc", "none", near(97)))
     refused = CliRunner().invoke(main, ["questions", *both, other])
     assert refused.exit_code == 2 and "different profiles" in refused.output and refused.output.count("\n") == 1

@@ -77,24 +77,25 @@ Scores = Mapping[Place, Pooled]
 
 
 def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
-    """The results of reports (folders that `validate` wrote).
+    """The results of reports (folders that `validate` wrote), each once.
 
     Raises:
       DmcvbError: there is no report, or two were made with different profiles.
     """
-    results, profiles = [], {}
+    results: dict[str, dict[str, Any]] = {}
+    profiles = {}
     for folder in folders:
         path = Path(folder) / "report.json"
         try:
             facts = json.loads(path.read_text())
-            results += facts["results"]
+            results |= {result["fingerprint"]: result for result in facts["results"]}
             profiles[facts["profile"]["name"]] = folder
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DmcvbError(f"cannot read {path} ({type(error).__name__}); dmcvb-gen validate writes it") from None
     if len(profiles) > 1:
         named = ", ".join(f"{folder} ({profile})" for profile, folder in profiles.items())
         raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")
-    return results
+    return list(results.values())
 
 
 def pool(results: Iterable[Mapping[str, Any]]) -> dict[Place, Pooled]:

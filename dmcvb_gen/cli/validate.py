@@ -150,12 +150,12 @@ def questions(reports, as_json):
     from dmcvb_gen.benchmarks.questions import QUESTIONS, ask, pool, read_reports
 
     results = read_reports(reports)
-    answers = ask(results)
+    answers, pooled = ask(results), pool(results)
     if as_json:
-        scores = [asdict(place) | asdict(score) for place, score in pool(results).items()]
+        scores = [asdict(place) | asdict(score) for place, score in pooled.items()]
         print_json({"scores": scores, "answers": [asdict(answer) for answer in answers]})
         return
-    for place, score in pool(results).items():
+    for place, score in pooled.items():
         seeds = ", ".join(f"{mean:.1f}" for mean in score.seeds)
         where = f"{place.benchmark} {place.task} {place.learns_from}, {place.setting}"
         click.echo(f"{where}, {place.agent}: {score} (seeds: {seeds}); data {score.data:.1f}")
