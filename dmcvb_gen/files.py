@@ -16,11 +16,14 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 PARTIAL = ".partial"
 """Ending of files in the making."""
+LARGEST_YAML = 100_000
+"""Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes a second or two for it at worst."""
 _OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)\.[^.]+{re.escape(PARTIAL)}")
 
 
@@ -122,6 +125,26 @@ def parse_json(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def read_yaml(path: Path | Traversable) -> Any:
+    """A small YAML file as plain values.
+
+    Raises:
+      OSError: it cannot be read. ValueError: not text, too large, or not YAML (in a line).
+    """
+    import yaml  # reading releases needs none
+
+    with path.open("rb") as file:
+        content = file.read(LARGEST_YAML + 1)
+    if len(content) > LARGEST_YAML:
+        raise ValueError(f"over {LARGEST_YAML // 1000} kB, which no settings need")
+    try:
+        return yaml.safe_load(content.decode())
+    except UnicodeDecodeError:
+        raise ValueError("not text in UTF-8") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ValueError(f"not YAML: {' '.join(str(error).split())}") from None
 
 
 def write_json(path: str | Path, value: Any) -> None:

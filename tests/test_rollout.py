@@ -86,7 +86,7 @@ def test_killed_again_and_again_it_goes_on_and_ends_with_the_same_bytes(tmp_path
     quiet = dict(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     subprocess.run([*COMMAND, "--out", str(tmp_path / "whole")], check=True, **quiet)
     broken, rng, kills = tmp_path / "broken", random.Random(1), 0
-    for _ in range(4):
+    for _ in range(3):
         process = subprocess.Popen([*COMMAND, "--out", str(broken), "--workers", "2"], start_new_session=True, **quiet)
         wanted = len(list(broken.glob("commits/**/*.json"))) + 1
         deadline = time.time() + 120
@@ -242,6 +242,23 @@ def test_a_recipe_is_narrowed_to_what_has_the_asked_names():
         narrow(load_recipe("quickstart"), ["ant-maze-empty7x7"])
     with pytest.raises(RecipeError, match="no subset that is walker-walk, visible at once"):
         narrow(load_recipe("dmcvb-v1"), ["walker-walk"], (), ["visible"])
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b'{"levels": [' + b'"x", ' * 20_001 + b"]}", "over 100 kB"),  # a megabyte of it takes PyYAML ten seconds
+        (b"[" * 50_000, "not YAML"),
+        (b"name: \xff", "UTF-8"),
+        (b"a: b: c", "not YAML"),
+    ],
+)
+def test_what_is_no_recipe_is_refused_in_a_line(tmp_path, content, why):
+    path = tmp_path / "recipe.yaml"
+    path.write_bytes(content)
+    with pytest.raises(RecipeError, match=why) as refused:
+        load_recipe(path)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_recipe_takes_other_values_and_none_is_dropped():

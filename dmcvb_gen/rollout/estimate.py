@@ -29,7 +29,7 @@ from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, create_array
 from dmcvb_gen.store.writer import find_array
 from dmcvb_gen.tasks import get_task
 
-SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
+SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 3}
 """Whole episodes simulated for a sample; a maze's vary in length."""
 TIMED_STEPS = 16
 """Steps of a job's whole batch that are timed: a batch's cost a step is not that of a few episodes."""

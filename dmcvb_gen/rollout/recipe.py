@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
-import yaml
 
 from dmcvb_gen.errors import RecipeError, UnknownNameError
+from dmcvb_gen.files import read_yaml
 from dmcvb_gen.names import (
     ANT_MAZE,
     DISTRACTOR_KINDS,
@@ -367,20 +367,16 @@ def load_recipe(source: str | Path) -> Recipe:
       RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
     """
     path = Path(source)
-    if not path.exists() and str(source) in shipped_recipes():
-        text = (resources.files("dmcvb_gen.rollout") / "data" / "recipes" / f"{source}.yaml").read_text()
-    else:
-        try:
-            text = path.read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            raise RecipeError(
-                f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of the shipped: "
-                + ", ".join(shipped_recipes())
-            ) from None
+    shipped = not path.exists() and str(source) in shipped_recipes()
     try:
-        data = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise RecipeError(f"{source} is not YAML: {' '.join(str(error).split())}") from None
+        data = read_yaml(
+            resources.files("dmcvb_gen.rollout") / "data" / "recipes" / f"{source}.yaml" if shipped else path
+        )
+    except (OSError, ValueError) as error:
+        raise RecipeError(
+            f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of the shipped: "
+            + ", ".join(shipped_recipes())
+        ) from None
     if not isinstance(data, dict):
         raise RecipeError(f"{source} holds no mapping of recipe fields; see `dmcvb-gen rollout --help`")
     return make_recipe(data, str(source))

@@ -9,17 +9,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dmcvb_gen.behaviours.learning.runs import RunConfig
 from dmcvb_gen.behaviours.learning.settings import check_settings
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import read_yaml
 from dmcvb_gen.names import ANT_MAZE, family_of
 
 
 @functools.cache
 def _all() -> dict[str, Any]:
-    return yaml.safe_load((resources.files("dmcvb_gen.behaviours") / "data" / "defaults.yaml").read_text())
+    return read_yaml(resources.files("dmcvb_gen.behaviours") / "data" / "defaults.yaml")
 
 
 def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
@@ -47,8 +46,8 @@ def parse_settings(pairs: tuple[str, ...], config: str | Path | None, algorithm:
     settings: dict[str, Any] = {}
     if config:
         try:
-            read = yaml.safe_load(Path(config).read_text())
-        except (OSError, ValueError, yaml.YAMLError) as error:
+            read = read_yaml(Path(config))
+        except (OSError, ValueError) as error:
             raise DmcvbError(f"cannot read settings from {config}: {' '.join(str(error).split())}") from None
         if not isinstance(read or {}, dict):
             raise DmcvbError(f"{config} holds no settings; write lines like `learning_rate: 0.0003`")
