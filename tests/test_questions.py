@@ -93,10 +93,11 @@ def test_numbers_that_claim_no_score_answer_nothing():
     assert ask([result("state-bc", "none", near(97), scores=False)]) == []
 
 
-def write(folder, profile, *results):
+def write(folder, profile, *results, release="walkers"):
     folder.mkdir()
     marked = [one | {"fingerprint": f"{folder}, {index}"} for index, one in enumerate(results)]
-    (folder / "report.json").write_text(json.dumps({"profile": {"name": profile}, "results": marked}))
+    facts = {"profile": {"name": profile}, "results": marked, "release": {"name": release, "version": "1.0.0"}}
+    (folder / "report.json").write_text(json.dumps(facts))
     return str(folder)
 
 
@@ -108,6 +109,11 @@ def test_command(tmp_path):
     assert facts["scores"][0]["seeds"] == [96, 97] and facts["answers"][0]["answer"] == "yes"
     assert len(read_reports([*both, both[0]])) == 2  # a report that is named twice is no second seed
     other = write(tmp_path / "other", "paper", result("state-bc", "none", near(97)))
+    elsewhere = write(tmp_path / "elsewhere", "quick", result("bc", "none", near(1)), release="cheetahs")
+    assert len(read_reports([*both, elsewhere])) == 3
+    data = write(tmp_path / "data", "quick", result("state-bc", "none", near(97)), release="cheetahs")
+    with pytest.raises(DmcvbError, match="different data are no two seeds: cheetahs 1.0.0, walkers 1.0.0"):
+        read_reports([*both, data])
     refused = CliRunner().invoke(main, ["questions", *both, other])
     assert refused.exit_code == 2 and "different profiles" in refused.output and refused.output.count("\n") == 1
 

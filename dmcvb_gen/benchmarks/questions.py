@@ -80,21 +80,28 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     """The results of reports (folders that `validate` wrote), each once.
 
     Raises:
-      DmcvbError: there is no report, or two were made with different profiles.
+      DmcvbError: there is no report, or two were made with different profiles, or one cell of theirs of different data.
     """
     results: dict[str, dict[str, Any]] = {}
-    profiles = {}
+    profiles: dict[str, str | Path] = {}
+    releases: dict[Place, set[str]] = {}
     for folder in folders:
         path = Path(folder) / "report.json"
         try:
             facts = json.loads(path.read_text())
-            results |= {result["fingerprint"]: result for result in facts["results"]}
+            release = "{name} {version}".format(**facts["release"])
             profiles[facts["profile"]["name"]] = folder
+            for result in facts["results"]:
+                results[result["fingerprint"]] = result
+                releases.setdefault(_place(result), set()).add(release)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DmcvbError(f"cannot read {path} ({type(error).__name__}); dmcvb-gen validate writes it") from None
     if len(profiles) > 1:
         named = ", ".join(f"{folder} ({profile})" for profile, folder in profiles.items())
         raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")
+    mixed = next((names for names in releases.values() if len(names) > 1), None)
+    if mixed:
+        raise DmcvbError(f"scores of one cell on different data are no two seeds: {', '.join(sorted(mixed))}")
     return list(results.values())
 
 
@@ -102,11 +109,14 @@ def pool(results: Iterable[Mapping[str, Any]]) -> dict[Place, Pooled]:
     """Results by place, those of several seeds together."""
     found: dict[Place, list[Mapping[str, Any]]] = {}
     for result in results:
-        cell = result["cell"]
-        learns = cell["policy_label"] + (f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else "")
-        place = Place(cell["benchmark"], cell["task"], cell["setting"], learns, cell["agent_name"])
-        found.setdefault(place, []).append(result)
+        found.setdefault(_place(result), []).append(result)
     return {place: _pool(several) for place, several in found.items()}
+
+
+def _place(result: Mapping[str, Any]) -> Place:
+    cell = result["cell"]
+    learns = cell["policy_label"] + (f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else "")
+    return Place(cell["benchmark"], cell["task"], cell["setting"], learns, cell["agent_name"])
 
 
 def _pool(results: Sequence[Mapping[str, Any]]) -> Pooled:
