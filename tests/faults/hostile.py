@@ -791,7 +791,10 @@ def _run_round(taker: Taker, kind: str, examples: int, seed: int, outcome: Outco
             outcome.accepted += 1
         else:
             shown = {name: data if len(data) < 600 else data[:600] + b"..." for name, data in files.items()}
-            outcome.wrong.setdefault(answer["text"].strip().splitlines()[-1][:100], f"{answer['text']}\nof {shown}")
+            way = answer["text"].strip().splitlines()[-1][:100]
+            if way not in outcome.wrong:
+                outcome.wrong[way] = f"{answer['text']}\nof {shown}"
+                print(f"--- {kind}: {way}\n{outcome.wrong[way]}", file=sys.stderr, flush=True)
 
     every()
 
@@ -812,8 +815,6 @@ def main() -> int:
             outcome = run_kind(taker, kind, options.examples, options.seed)
             failed += bool(outcome.wrong)
             print(f"{kind}: {outcome}", flush=True)
-            for name, text in outcome.wrong.items():
-                print(f"--- {kind}: {name}\n{text}", flush=True)
     return 1 if failed else 0
 
 
