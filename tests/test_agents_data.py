@@ -230,7 +230,7 @@ def test_bfloat16_pictures_are_the_float32_ones_rounded_once():
     two = data.batch(16, np.random.default_rng(0), dtype=torch.bfloat16).observation
     assert two.dtype == torch.bfloat16
     assert (two.float() - one).abs().max() <= 2**-9 * 0.5 + 1e-6
-    levels = torch.arange(256, dtype=torch.uint8)
+    levels = torch.arange(256, dtype=torch.uint8).view(1, 1, 16, 16)
     assert len(normalize_pixels(levels, torch.bfloat16).unique()) == 256
 
 

@@ -156,11 +156,12 @@ class StoredFrames:
 def normalize_pixels(
     pictures: torch.Tensor, dtype: torch.dtype = torch.float32, out: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """uint8 -> [-0.5, 0.5], written over `out` if given.
+    """(batch, channel, size, size) uint8 -> [-0.5, 0.5], written over `out` if given; channels lie last in memory.
 
-    In this order bfloat16 rounds once, as autocast would: 127.5 less is exact in 8 bits.
+    So convolutions want them; else these would turn them over again, forward and backward. In this order bfloat16
+    rounds once, as autocast would: 127.5 less is exact in 8 bits.
     """
-    values = pictures.to(dtype) if out is None else out.copy_(pictures)
+    values = pictures.to(dtype, memory_format=torch.channels_last) if out is None else out.copy_(pictures)
     return values.sub_(127.5).mul_(1 / 255)
 
 

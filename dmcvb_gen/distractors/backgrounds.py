@@ -218,7 +218,7 @@ def _read_video(path: Path) -> np.ndarray:
         run = subprocess.run(command, capture_output=True, check=False, timeout=DECODING_SECONDS)
     except subprocess.TimeoutExpired:
         raise ValueError(f"decoding it takes more than {DECODING_SECONDS} s") from None
-    complaint = re.sub(r"\[[^]]*\]\s*", "", run.stderr.decode(errors="replace")).strip()
+    complaint = re.sub(r"\[[^]]*\]\s*", "", run.stderr[-2000:].decode(errors="replace")).strip()
     if complaint or run.returncode:
         raise ValueError(complaint or f"ffmpeg ended with code {run.returncode}")
     if not run.stdout:

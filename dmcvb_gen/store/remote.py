@@ -82,11 +82,22 @@ def file_system(url: str, options: dict[str, Any] | None = None) -> tuple[fsspec
     return filesystem, base.rstrip("/")
 
 
+_SECRETS = (
+    # Bounded, or a message that quotes 100,000 letters of somebody's file would take a minute.
+    (
+        re.compile(r"(?i)((?:secret|password|token|key|signature|credential)[\w-]{0,40}[\"']?\s*[=:]\s*)\S+"),
+        r"\1...",
+    ),
+    (re.compile(r"([A-Za-z][\w+.-]{0,20}://)[^/\s@]*@"), r"\1"),
+)
+"""What of a message is struck out, and what stands for it."""
+
+
 def reason(error: BaseException) -> str:
     """One line of an error for a person, with anything that looks like a secret struck out."""
     text = " ".join(str(error).split()) or type(error).__name__
-    text = re.sub(r"(?i)((?:secret|password|token|key|signature|credential)[\w-]*[\"']?\s*[=:]\s*)\S+", r"\1...", text)
-    text = re.sub(r"([A-Za-z][\w+.-]*://)[^/\s@]*@", r"\1", text)
+    for pattern, shown in _SECRETS:
+        text = pattern.sub(shown, text)
     return text[:300]
 
 

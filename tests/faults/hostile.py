@@ -597,7 +597,12 @@ class _Guard:
     """An audit hook that notes what no input may bring about."""
 
     def __init__(self):
-        self.folder, self.noted = None, []
+        self.folder, self.noted, self.late = None, [], False
+
+    def too_late(self, *_) -> None:
+        """A handler of the alarms. What is at work may take its error for one of the storage, so it is noted too."""
+        self.late = True
+        raise TimeoutError("it took too long")
 
     def __call__(self, event: str, arguments: tuple) -> None:
         if self.folder is None:
@@ -638,8 +643,8 @@ def serve() -> None:
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     guard, kind, laid = _Guard(), None, Laid(Path(), {})
-    signal.signal(signal.SIGALRM, _too_late)
-    signal.signal(signal.SIGPROF, _too_late)
+    signal.signal(signal.SIGALRM, guard.too_late)
+    signal.signal(signal.SIGPROF, guard.too_late)
     sys.addaudithook(guard)
     with tempfile.TemporaryDirectory(prefix="hostile-") as outer:
         folder = Path(os.path.realpath(outer)) / "case"
@@ -712,17 +717,13 @@ def _mark(found: os.stat_result) -> tuple[int, int, int]:
     return found.st_ino, found.st_mtime_ns, found.st_size
 
 
-def _too_late(*_):
-    raise TimeoutError("it took too long")
-
-
 def _take(take: Callable[[Path], None], folder: Path, guard: _Guard) -> dict[str, Any]:
     from dmcvb_gen.errors import DmcvbError
 
     Path("/proc/self/clear_refs").write_text("5")  # the high-water mark begins anew
     before, started = _memory("VmRSS"), time.process_time()
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    guard.folder, guard.noted = str(folder), []
+    guard.folder, guard.noted, guard.late = str(folder), [], False
     signal.setitimer(signal.ITIMER_PROF, SECONDS)  # the processor's time: the machine may be busy
     signal.alarm(60)
     try:
@@ -737,6 +738,8 @@ def _take(take: Callable[[Path], None], folder: Path, guard: _Guard) -> dict[str
     signal.setitimer(signal.ITIMER_PROF, 0)
     signal.alarm(0)
     guard.folder = None
+    if guard.late and status != "wrong":
+        status, text = "wrong", f"{text}\ntook over {SECONDS:g} s"
     if guard.noted:
         status, text = "wrong", f"it did {guard.noted[:3]}"
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
