@@ -82,7 +82,8 @@ PROFILES = {
         # 83, twice as wide 74, batches of 32 44), at twice the rate 133 +- 35, unshifted at twice the rate 490 +- 49
         # (ReLU: 510 +- 43; in a benchmark 519 +- 51). But unshifted pictures are soon known by heart: 428 +- 47 after
         # 10,000 of 20,000 steps, where shifted ones at the paper's rate returned 909 +- 11 in the end. So there are
-        # two profiles.
+        # two profiles. Compiled kernels make a third more samples a second, after a minute of compiling, so they pay
+        # from quick on (--compile); four strides instead of three make no more.
         Profile(
             "brief",
             pixel_steps=5_000,
