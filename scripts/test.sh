@@ -12,4 +12,6 @@ if [ -z "${TMPDIR:-}" ] && [ "$(df --output=avail /dev/shm 2>/dev/null | tail -1
   trap 'rm -rf "$TMPDIR"' EXIT
 fi
 # Two processes, a file of tests each at a time: more would want more memory than small machines have.
+# A thread each for numerics: more than there are cores only wait for each other.
+export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 python -m pytest -n "$(python -c 'import os; print(min(2, os.cpu_count() or 1))')" --dist loadfile "$@"

@@ -72,7 +72,7 @@ def evaluated(*arguments):
 
 
 def test_one_command_sets_every_bundled_level_beside_the_paper():
-    rows = json.loads(evaluated("--episodes", 1, "--json"))
+    rows = json.loads(evaluated("--episodes", 2, "--json"))
     asked = [
         (task, level) for task in task_ids() for level in [*bundled_levels(task), "random"] if bundled_levels(task)
     ]
