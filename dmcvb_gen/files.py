@@ -23,7 +23,7 @@ from typing import Any
 PARTIAL = ".partial"
 """Ending of files in the making."""
 LARGEST_YAML = 100_000
-"""Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes a second or two for it at worst."""
+"""Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
 _OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)\.[^.]+{re.escape(PARTIAL)}")
 
 

@@ -86,7 +86,7 @@ def test_killed_again_and_again_it_goes_on_and_ends_with_the_same_bytes(tmp_path
     quiet = dict(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     subprocess.run([*COMMAND, "--out", str(tmp_path / "whole")], check=True, **quiet)
     broken, rng, kills = tmp_path / "broken", random.Random(1), 0
-    for _ in range(3):
+    for _ in range(4):
         process = subprocess.Popen([*COMMAND, "--out", str(broken), "--workers", "2"], start_new_session=True, **quiet)
         wanted = len(list(broken.glob("commits/**/*.json"))) + 1
         deadline = time.time() + 120

@@ -179,7 +179,7 @@ def test_no_end_of_a_process_between_two_file_operations_loses_or_spoils_anythin
     assert reference["complete"]
     Releases.server, Releases.reference = server, reference
     chosen = settings(
-        max_examples=int(os.environ.get("DMCVB_STATEFUL_EXAMPLES", "4")),
+        max_examples=int(os.environ.get("DMCVB_STATEFUL_EXAMPLES", "6")),
         stateful_step_count=14,
         deadline=None,
         suppress_health_check=list(HealthCheck),

@@ -78,7 +78,7 @@ PROFILES = {
             scores=False,
             note="smoke: a few steps to see that everything runs; its numbers are not scores",
         ),
-        # BC on walker expert, none, 100 episodes, four minutes of a busy core each: shifted 99 +- 14 (half as wide
+        # BC on walker expert, none, 100 episodes, up to four minutes of a core each: shifted 99 +- 14 (half as wide
         # 83, twice as wide 74, batches of 32 44), at twice the rate 133 +- 35, unshifted at twice the rate 490 +- 49
         # (ReLU: 510 +- 43; in a benchmark 519 +- 51). But unshifted pictures are soon known by heart: 428 +- 47 after
         # 10,000 of 20,000 steps, where shifted ones at the paper's rate returned 909 +- 11 in the end. So there are

@@ -48,7 +48,7 @@ def parse_settings(pairs: tuple[str, ...], config: str | Path | None, algorithm:
         try:
             read = read_yaml(Path(config))
         except (OSError, ValueError) as error:
-            raise DmcvbError(f"cannot read settings from {config}: {' '.join(str(error).split())}") from None
+            raise DmcvbError(f"cannot read settings from {config}: {error}") from None
         if not isinstance(read or {}, dict):
             raise DmcvbError(f"{config} holds no settings; write lines like `learning_rate: 0.0003`")
         settings |= {str(name): value for name, value in (read or {}).items()}
