@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import nn
@@ -18,16 +19,21 @@ HIDDEN = (256, 256)
 """Hidden layers of every MLP."""
 
 
+ACTIVATIONS = {"gelu": nn.GELU, "relu": nn.ReLU}
+
+
 @dataclass(frozen=True)
 class Architecture:
     """The 3x3 convolutions of an encoder; its decoder has the same ones in reverse.
 
     Attributes:
       channels: of each convolution's output. strides: of each.
+      activation: behind each convolution.
     """
 
     channels: tuple[int, ...]
     strides: tuple[int, ...]
+    activation: Literal["gelu", "relu"] = "gelu"
 
     def sizes(self, size: int) -> tuple[int, ...]:
         """Pixels a side before the first convolution and after each: (64, 32, 16, 16, 16)."""
@@ -40,8 +46,9 @@ class Architecture:
 PAPER = Architecture((32, 64, 128, 256), (2, 2, 1, 1))
 """The paper's: 64 x 64 pictures become 16 x 16 x 256 = 65,536 features, and 0.2 GFLOP a stack of 9 channels."""
 
-NARROW = Architecture((16, 32, 32, 64), (2, 2, 2, 1))
-"""For short trainings on a CPU: 8 x 8 x 64 = 4,096 features for a 23rd of the paper's work."""
+NARROW = Architecture((16, 32, 32, 64), (2, 2, 2, 1), "relu")
+"""For short trainings on a CPU: 8 x 8 x 64 = 4,096 features for a 23rd of the paper's work, without GELU, which takes
+a quarter of a step of so narrow a network and does not raise its score (`scripts/bench_profiles.py`)."""
 
 
 def initialize(module: nn.Module) -> nn.Module:
@@ -66,7 +73,7 @@ class Trunk(nn.Sequential):
 class _SameLayout(torch.autograd.Function):
     """Pictures as they are; their gradient with the channels last in memory as they are.
 
-    GELU's gradient costs five times as much where the two lie differently, as behind a flattening they do.
+    An activation's gradient costs five times as much where the two lie differently, as behind a flattening they do.
     """
 
     @staticmethod
@@ -86,7 +93,7 @@ class _Flatten(nn.Module):
 
 
 class Convolutions(nn.Sequential):
-    """(batch, channel, size, size) -> (batch, features): 3x3 convolutions with GELU, flattened.
+    """(batch, channel, size, size) -> (batch, features): 3x3 convolutions, an activation behind each, flattened.
 
     Weights lie in memory with the channels last, which makes the kernels a fifth faster on a CPU.
     """
@@ -95,7 +102,7 @@ class Convolutions(nn.Sequential):
         layers: list[nn.Module] = []
         width = channels
         for out, stride in zip(architecture.channels, architecture.strides, strict=True):
-            layers += [nn.Conv2d(width, out, 3, stride, padding=1), nn.GELU()]
+            layers += [nn.Conv2d(width, out, 3, stride, padding=1), ACTIVATIONS[architecture.activation]()]
             width = out
         super().__init__(*layers, _Flatten())
         self.features = width * architecture.sizes(size)[-1] ** 2
@@ -155,7 +162,10 @@ class ObservationDecoder(nn.Module):
         for index, (out, stride) in enumerate(zip(wanted, architecture.strides[::-1], strict=True)):
             # Without output padding n pixels become stride (n - 1) + 1: what an odd size needs.
             missing = sizes[index + 1] - (stride * (sizes[index] - 1) + 1)
-            layers += [nn.ConvTranspose2d(width, out, 3, stride, padding=1, output_padding=missing), nn.GELU()]
+            layers += [
+                nn.ConvTranspose2d(width, out, 3, stride, padding=1, output_padding=missing),
+                ACTIVATIONS[architecture.activation](),
+            ]
             width = out
         self.deconvolutions = nn.Sequential(*layers[:-1])
         initialize(self).to(memory_format=torch.channels_last)  # as the pictures lie that it is compared with
