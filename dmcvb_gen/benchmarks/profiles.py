@@ -80,10 +80,10 @@ PROFILES = {
         ),
         # BC on walker expert, none, 100 episodes, up to four minutes of a core each: shifted 99 +- 14 (half as wide
         # 83, twice as wide 74, batches of 32 44), at twice the rate 133 +- 35, unshifted at twice the rate 490 +- 49
-        # (GELU; ReLU: 510 +- 43, with 4/3 of the steps a second). But unshifted pictures are soon known by heart: 428 +- 47 after
-        # 10,000 of 20,000 steps, where shifted ones at the paper's rate returned 909 +- 11 in the end. So there are
-        # two profiles. Compiled kernels make a third more samples a second, after a minute of compiling, so they pay
-        # from quick on (--compile); four strides instead of three make no more.
+        # (with GELU; with ReLU, a third faster, 510 +- 43). But unshifted pictures are soon known by heart: 428 +- 47
+        # after 10,000 of 20,000 steps, where shifted ones at the paper's rate returned 909 +- 11 in the end. So there
+        # are two profiles. Compiled kernels made a third more samples a second than GELU, after a minute of compiling,
+        # so they may pay from quick on (--compile); four strides instead of three make no more.
         Profile(
             "brief",
             pixel_steps=5_000,
@@ -98,8 +98,8 @@ PROFILES = {
             rate=2.0,
             shift=False,
             decay=True,
-            note="brief: a network with a 23rd of the work of the paper's and ReLU, 0.3 % of its samples (2.5 % of states), no "
-            "random shifts, twice the rate, falling; scores are not comparable with the paper's",
+            note="brief: a network with a 23rd of the work of the paper's and ReLU, 0.3 % of its samples (2.5 % of "
+            "states), no random shifts, twice the rate, falling; scores are not comparable with the paper's",
         ),
         # Ten to fifteen minutes of one core for a cell with pictures: 909 +- 11 on walker as above (BC from states
         # 945 +- 3); the paper's network had 708 +- 72 after 40,000 batches of 16 and 31 minutes. An agent of states
@@ -116,8 +116,8 @@ PROFILES = {
             batch_size=64,
             network=NARROW,
             decay=True,
-            note="quick: a network with a 23rd of the work of the paper's and ReLU, 1 % of its samples (10 % of states), a "
-            "falling rate; scores are not comparable with the paper's",
+            note="quick: a network with a 23rd of the work of the paper's and ReLU, 1 % of its samples (10 % of "
+            "states), a falling rate; scores are not comparable with the paper's",
         ),
         Profile(
             "paper",
