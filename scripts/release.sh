@@ -35,7 +35,7 @@ for name in random.Random(int(os.environ["TENTH"])).sample(names, -(-len(names) 
 }
 
 stage rollout dmcvb-gen rollout --recipe "$recipe" --out "$out" --workers "$workers"
-stage verify dmcvb-gen verify "$out"
+stage verify dmcvb-gen verify "$out" --workers "$workers"
 if [ -n "$validate" ]; then
   # shellcheck disable=SC2086
   stage validate dmcvb-gen validate "$out" $validate --workers "$workers" --threads 1 --out "$out.report"

@@ -16,10 +16,11 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
+from dmcvb_gen.pool import Workers
 from dmcvb_gen.readers.painted import PaintedSubset
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.paint import drift
-from dmcvb_gen.release.verify import verify
+from dmcvb_gen.release.verify import in_order, verify
 from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.tasks import get_task
@@ -166,31 +167,38 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
 
 
 def check_structure(
-    release: Release, backgrounds: str | None = None, tick: Callable[[str], None] = lambda subset: None
+    release: Release,
+    backgrounds: str | None = None,
+    tick: Callable[[str], None] = lambda subset: None,
+    workers: Workers = 1,
 ) -> Structure:
-    """All checks of a local release.
+    """All checks of a local release, or of some of its subsets.
 
     Args:
       backgrounds: where the manifest's videos are now, if they moved.
       tick: told the subset that is looked at.
+      workers: processes, or a Ray cluster that sees the folder; a subset each.
 
     Raises:
       DmcvbError: nothing is committed.
     """
     started = time.perf_counter()
-    verified = verify(release.path, backgrounds, tick)
+    verified = verify(release.path, backgrounds, tick, workers, names=release.subsets)
     wanted = {record.name for record in release.manifest.subsets}
     others = {record.name for record in open_release(release.path).manifest.subsets} - wanted
     findings, warnings = [f for f in verified.findings if f.subset not in others], []
     unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
-    for name, subset in release.subsets.items():
-        if name in unreadable:
-            continue
-        tick(name)
-        findings += check_policy_returns(subset)
-        findings += check_labels(subset)
-        findings += check_pictures(subset)
-        warnings += check_paper_returns(subset)
+    readable = [subset for name, subset in release.subsets.items() if name not in unreadable]
+    for found, odd in in_order(_check_subset, readable, workers, tick):
+        findings += found
+        warnings += odd
     for text in painter_drift(release, backgrounds):
         warnings.append(Finding("painter", "pictures painted on reading", text))
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)
+
+
+def _check_subset(subset: Subset, tick: Callable[[str], None]) -> tuple[list[Finding], list[Finding]]:
+    """What is wrong, and what is odd."""
+    tick(subset.name)
+    found = [*check_policy_returns(subset), *check_labels(subset), *check_pictures(subset)]
+    return found, list(check_paper_returns(subset))

@@ -109,7 +109,7 @@ def validate(
       benchmarks: names out of `tables.BENCHMARKS`; none: structure checks alone.
       agents: instead of each benchmark's own.
       patterns: only these subsets.
-      workers: cells side by side, or a Ray cluster that sees the same folders.
+      workers: subsets checked and cells trained side by side, or a Ray cluster that sees the same folders.
       train_unsound: run the benchmarks even where a structure check fails.
 
     Raises:
@@ -123,7 +123,7 @@ def validate(
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
     cells, missing = _plan(chosen, benchmarks, agents, release.subsets.keys() - chosen.subsets.keys())
     check_writable(setup.out)
-    structure = check_structure(chosen, setup.backgrounds, progress.checking)
+    structure = check_structure(chosen, setup.backgrounds, progress.checking, workers)
     results = []
     if structure.sound or train_unsound:
         progress.total(planned_steps(setup.profile, cells))

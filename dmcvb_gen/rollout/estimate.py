@@ -1,15 +1,17 @@
 """How long and how big: a plan in, steps, bytes and core-hours out, from short measurements on this machine.
 
 What is measured once serves all that it is true of: episodes of a task and level for all settings that show them (a
-maze's fixed goals are drawn as its random ones are), pictures of a task, level and kind of distractor; the mazes, whose
-pictures cost the same, share theirs.
+maze's fixed goals are drawn as its random ones are), pictures of a task, level and kind of distractor. The mazes, whose
+pictures cost the same, share theirs, and the lengths of their episodes: a plan of all of them simulates one in each.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import time
+from collections import Counter, defaultdict
 from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +31,9 @@ from dmcvb_gen.store.schema import PIXEL_CHUNK_STEPS, EpisodeShape, create_array
 from dmcvb_gen.store.writer import find_array
 from dmcvb_gen.tasks import get_task
 
-SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 3}
-"""Whole episodes simulated for a sample; a maze's vary in length."""
+SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
+"""Whole episodes simulated of each locomotion task and level, and of each level of all mazes together: theirs vary in
+length."""
 TIMED_STEPS = 16
 """Steps of a job's whole batch that are timed: a batch's cost a step is not that of a few episodes."""
 SAMPLE_CHUNKS = 5
@@ -76,8 +79,18 @@ class _Sample:
     seconds_per_step: float
 
 
-def _simulate(job: Job) -> _Sample:
-    count = min(SAMPLE_EPISODES[job.subsets[0].family], job.subsets[0].episodes)
+def _trajectory(record: SubsetRecord) -> tuple:
+    """What decides how its episodes go."""
+    return (record.task, record.level, record.deterministic, record.max_steps)
+
+
+def _alike(record: SubsetRecord) -> tuple:
+    """Whose episodes' lengths are taken together: those of the level's mazes."""
+    return _trajectory(record) if record.family == LOCOMOTION else (ANT_MAZE, *_trajectory(record)[1:])
+
+
+def _simulate(job: Job, count: int) -> _Sample:
+    count = min(count, job.subsets[0].episodes)
     simulate_job(job, max_steps=1)  # models are compiled, policies read
     started = time.perf_counter()
     timed = simulate_job(job, max_steps=TIMED_STEPS)
@@ -128,24 +141,47 @@ def _runs(rows: np.ndarray, chunk: int) -> list[tuple[int, int]]:
     return [known[index] for index in chosen]
 
 
+def _samples(plan: Plan) -> dict[tuple, _Sample]:
+    """By trajectory: as many episodes of each that those alike come to `SAMPLE_EPISODES` together."""
+    first: dict[tuple, tuple[Job, SubsetRecord]] = {
+        _trajectory(record): (job, record) for job in reversed(plan.jobs) for record in job.subsets
+    }
+    sharing = Counter(_alike(record) for _, record in first.values())
+    return {
+        trajectory: _simulate(job, math.ceil(SAMPLE_EPISODES[record.family] / sharing[_alike(record)]))
+        for trajectory, (job, record) in first.items()
+    }
+
+
+def _mean_lengths(plan: Plan, samples: dict[tuple, _Sample]) -> dict[tuple, float]:
+    """By trajectory: the mean length in steps of all sampled episodes that are alike."""
+    alike = {_trajectory(record): _alike(record) for job in plan.jobs for record in job.subsets}
+    lengths: dict[Hashable, list[int]] = defaultdict(list)
+    for trajectory, sample in samples.items():
+        lengths[alike[trajectory]] += sample.episodes.length.tolist()
+    return {trajectory: float(np.mean(lengths[key])) for trajectory, key in alike.items()}
+
+
 def estimate(plan: Plan) -> Estimate:
     """Measure what a plan is made of for a moment and extrapolate."""
-    samples: dict[Hashable, _Sample] = {}
+    samples = _samples(plan)
+    lengths = _mean_lengths(plan, samples)
     paintings: dict[Hashable, tuple[float, float]] = {}
     rates: dict[str, Rate] = {}
     for job in sorted(plan.jobs, key=lambda job: _painting_key(job.subsets[0])):  # a painter serves all its levels
         for record in job.subsets:
             if record.name in rates:
                 continue
-            trajectory = (record.task, record.level, record.deterministic, record.max_steps)
-            if trajectory not in samples:
-                samples[trajectory] = _simulate(job)
-            sample, key = samples[trajectory], _painting_key(record)
+            sample, key = samples[_trajectory(record)], _painting_key(record)
             if key not in paintings:
                 paintings[key] = _paint(job, record, sample.episodes)
             seconds, size = paintings[key]
             shared = sample.seconds_per_step / len(job.subsets)
-            rates[record.name] = Rate(seconds + shared, size, float(sample.episodes.length.mean()))
+            rates[record.name] = Rate(seconds + shared, size, lengths[_trajectory(record)])
+    return _extrapolate(plan, rates)
+
+
+def _extrapolate(plan: Plan, rates: dict[str, Rate]) -> Estimate:
     steps = size = seconds = 0.0
     for job in plan.jobs:
         for record in job.subsets:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-import weakref
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +16,8 @@ from dmcvb_gen.tasks.base import Task, physics_columns
 
 CHUNK = 512
 """States a call into MuJoCo at most; only memory depends on it."""
+KEPT = 2
+"""Tasks whose simulations are kept, those asked for last: a maze's hold a copy of its 200 MB of textures."""
 
 
 class _KeptBatch:
@@ -50,7 +52,7 @@ class _KeptBatch:
                 self._bound[name] = self._batch.bind(name)
 
 
-_kept: weakref.WeakKeyDictionary[Task, _KeptBatch] = weakref.WeakKeyDictionary()
+_kept: OrderedDict[Task, _KeptBatch] = OrderedDict()
 _kept_lock = threading.Lock()
 
 
@@ -58,16 +60,16 @@ class Kinematics:
     """Forward kinematics of a task's physics states; cheap to make, may be called from several threads.
 
     Args:
-      task: whose model it is. All `Kinematics` of a task share one kept batch of simulations.
+      task: whose model it is. All `Kinematics` of a task share one batch of simulations while it is kept (`KEPT`).
       fields: MjData fields to give, e.g. ("geom_xpos", "cam_xmat").
     """
 
     def __init__(self, task: Task, fields: Sequence[str]):
         self._fields = tuple(fields)
         with _kept_lock:
-            if task not in _kept:
-                _kept[task] = _KeptBatch(task)
-            self._batch = _kept[task]
+            self._batch = _kept[task] = _kept.pop(task) if task in _kept else _KeptBatch(task)
+            while len(_kept) > KEPT:
+                _kept.popitem(last=False)
 
     def __call__(self, physics: np.ndarray) -> dict[str, np.ndarray]:
         """(frame, physics) float64 -> each field with a leading frame axis, float64.

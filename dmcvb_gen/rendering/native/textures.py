@@ -7,6 +7,7 @@ bilinear sample of the level before. Textures in sRGB are kept in linear light, 
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -73,6 +74,13 @@ def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) ->
             current = np.floor((_display(smaller) if srgb else smaller) + 0.5).astype(np.uint8)
         out.append(np.rint(255 * _LINEAR_OF[current]).astype(np.uint8) if srgb else current)
     return out
+
+
+@lru_cache(maxsize=64)  # the seven mazes share their textures, a task's settings too
+def _packed_levels(picture: bytes, height: int, width: int, srgb: bool) -> tuple[np.ndarray, ...]:
+    """The levels of (height, width, 3) uint8 bytes, `packed`."""
+    pixels = np.frombuffer(picture, np.uint8).reshape(height, width, 3)
+    return tuple(packed(level) for level in levels(pixels, srgb))
 
 
 def packed(picture: np.ndarray) -> np.ndarray:
@@ -151,8 +159,8 @@ class Textures:
         # OpenGL reads cubes as they are.
         srgb = faces == 1 and self._model.tex_colorspace[index] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
         for face, picture in enumerate(self._faces(index, faces)):
-            for level, smaller in enumerate(levels(picture, bool(srgb))):
-                self._put(index, level, packed(smaller), face)
+            for level, texels in enumerate(_packed_levels(picture.tobytes(), *picture.shape[:2], bool(srgb))):
+                self._put(index, level, texels, face)
 
     def background(self, video: int, frame: int) -> int:
         """The texture of a video's frame, made now if need be; stays for the next `slots` - 1 others."""
