@@ -24,7 +24,8 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
 
 HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
-"""At least so many batches, and transitions, of the hold-out are what a test loss is the mean of."""
+"""At least so many batches, and transitions, of the hold-out are what a test loss is the mean of; but no more batches
+than were trained on."""
 SAVE_SECONDS = 120.0
 """Work that a stop may cost."""
 RESUME_FILE = "resume.safetensors"
@@ -87,12 +88,14 @@ def draw(
     )
 
 
-def hold_out_losses(learner: Learner, data: TrainingData, size: int, seed: int = 0) -> dict[str, float]:
-    """Losses on held-out episodes, always on the same batches; {} where nothing is held out."""
+def hold_out_losses(
+    learner: Learner, data: TrainingData, size: int, seed: int = 0, most: int = 1 << 30
+) -> dict[str, float]:
+    """Losses on held-out episodes, always on the same (at `most` so many) batches; {} where nothing is held out."""
     if not len(data.hold_out_rows):
         return {}
     sums: dict[str, float] = {}
-    count = max(HOLD_OUT_BATCHES, -(-HOLD_OUT_TRANSITIONS // size))
+    count = min(most, max(HOLD_OUT_BATCHES, -(-HOLD_OUT_TRANSITIONS // size)))
     for index in range(count):
         for name, value in learner.metrics(draw(learner, data, size, seed, index, hold_out=True)).items():
             sums[f"test_{name}"] = sums.get(f"test_{name}", 0.0) + float(value) / count
@@ -145,7 +148,8 @@ def train(
         tick(1)
         evaluating = done % settings.evaluate_every == 0 or done == settings.steps
         if evaluating or done % log_every == 0:
-            point = {"step": done, **means.take(done), **hold_out_losses(learner, data, settings.batch_size)}
+            held_out = hold_out_losses(learner, data, settings.batch_size, most=settings.steps)
+            point = {"step": done, **means.take(done), **held_out}
             if evaluating and evaluate:
                 point |= evaluate(learner)
             curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})

@@ -20,7 +20,7 @@ from torch import nn
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
 from dmcvb_gen.agents.data import Source, TrainingData, load_data
 from dmcvb_gen.agents.learners import ObservationReadout, Policy, StateReadout
-from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, hold_out_losses, train
+from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.paper import paper_score
@@ -316,7 +316,7 @@ def inspect(setup: Setup, encoder: nn.Module, data: TrainingData, cell: Cell, ti
         curves[name] = train(
             learner, data, settings, seed=setup.seed, tick=lambda made, n=name: tick(f"{n} decoder", made)
         )
-        errors[f"{name}_mse"] = hold_out_losses(learner, data, settings.batch_size).get("test_loss")
+        errors[f"{name}_mse"] = curves[name][-1].get("test_loss")
     held_out = len(data.hold_out_rows) > 0
     batch = draw(readouts["observation"], data, 8, setup.seed, 0, hold_out=held_out)
     with torch.no_grad(), readouts["observation"].precision():
