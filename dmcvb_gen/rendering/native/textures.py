@@ -76,7 +76,7 @@ def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) ->
     return out
 
 
-@lru_cache(maxsize=64)  # the seven mazes share their textures, a task's settings too
+@lru_cache(maxsize=16)  # 6 MB each; the seven mazes share their sky, a task's settings its floor
 def _packed_levels(picture: bytes, height: int, width: int, srgb: bool) -> tuple[np.ndarray, ...]:
     """The levels of (height, width, 3) uint8 bytes, `packed`."""
     pixels = np.frombuffer(picture, np.uint8).reshape(height, width, 3)

@@ -87,7 +87,7 @@ def _quiet_renderer_choice():
         del os.environ["MUJOCO_GL"]
 
 
-@functools.cache
+@functools.lru_cache(maxsize=3)  # each holds 200 MB of textures
 def build_arena(layout: Layout) -> Arena:
     """The arena of a layout, with the ant and the goal."""
     import labmaze
@@ -139,6 +139,7 @@ def build_arena(layout: Layout) -> Arena:
                     names[repeat, style, number] = name
 
     model = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
+    assert model.opt.timestep == PHYSICS_STEP
     looks = {}
     for style in styles:
         for look in look_numbers(style):
