@@ -114,7 +114,10 @@ class HeldFrames:
     def put(self, first: int, pictures: torch.Tensor, channel: int = 0) -> None:
         """Fill rows from `first` on, channels from `channel` on, with (n, c, size, size) uint8 pictures."""
         rows, channels = slice(first, first + len(pictures)), slice(channel, channel + pictures.shape[1])
-        self.table[rows, channels] = pictures.to(self.table.device)[..., self._mirror]
+        filled = self.table[rows, channels]
+        inner = filled[..., PAD:-PAD]
+        inner[:] = pictures.to(filled.device)
+        filled[..., :PAD], filled[..., -PAD:] = inner[..., :PAD].flip(-1), inner[..., -PAD:].flip(-1)
 
     def shifted(self, rows, down, right):
         (batch, frames), wide = rows.shape, self.size + 2 * PAD
