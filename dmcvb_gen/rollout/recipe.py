@@ -266,14 +266,16 @@ def override(recipe: Recipe, **changes: Any) -> Recipe:
     own = {name: value for name, value in changes.items() if name in Recipe.model_fields}
     each = {name: value for name, value in changes.items() if name in SUBSET_FIELDS}
     goals = {name: value for name, value in changes.items() if name in GOAL_FIELDS}
-    fixed = any(FIXED in pattern.settings for pattern in recipe.subsets)
+    settings = {setting for pattern in recipe.subsets for setting in pattern.settings}
+    fixed = FIXED in settings
     if goals and not fixed:
         raise RecipeError(f"recipe {recipe.name!r} has no fixed goals, so --{_option(goals)} means nothing for it")
     amount = {"episodes", "steps"} & set(each)
-    if amount and fixed:
+    if amount and fixed and not (goals and settings - {FIXED}):
+        cure = "give those too" if settings - {FIXED} else "give those"
         raise RecipeError(
             f"--{amount.pop()} means nothing for fixed goals, which have --fixed-goals x --episodes-per-goal episodes; "
-            "give those, or leave those subsets out with --goal visible --goal hidden"
+            f"{cure}, or leave those subsets out with --goal visible --goal hidden"
         )
     if amount:
         each = {"episodes": None, "steps": None} | each
@@ -281,7 +283,9 @@ def override(recipe: Recipe, **changes: Any) -> Recipe:
         each["policies"] = {_one_level(recipe): changes["behaviour"]}
     data = recipe.model_dump(mode="json") | own
     for pattern in data["subsets"]:
-        pattern |= each | goals
+        only_fixed = set(pattern["settings"]) == {FIXED}
+        pattern |= {name: value for name, value in each.items() if not (only_fixed and name in ("episodes", "steps"))}
+        pattern |= goals
     return make_recipe(data, "command line")
 
 
