@@ -3,7 +3,7 @@
 #   bash scripts/release.sh [RECIPE [OUT]]     dmcvb-mini and releases/RECIPE by default
 # Run again, it goes on where it stopped. A line a stage; what each printed is in OUT.log. Options by environment:
 #   WORKERS (2), VALIDATE ("--profile brief --benchmark b1 --agents bc,state-bc,id+bc"; "" leaves it out), TENTH (its seed, 0)
-extras=train
+extras=train,hf
 . "$(dirname "$0")/setup.sh"
 recipe="${1:-dmcvb-mini}"
 out="${2:-releases/$(basename "$recipe" .yaml)}"

@@ -24,7 +24,7 @@ from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
-from dmcvb_gen.benchmarks.setup import Setup, fingerprint, pretraining_of
+from dmcvb_gen.benchmarks.setup import Setup, fingerprint, open_data, pretraining_of
 from dmcvb_gen.benchmarks.tables import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.distractors import ExogenousWalk
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -289,6 +289,17 @@ def test_cells_in_processes_give_what_cells_in_this_one_give(small_release, tmp_
     assert scores[0][1] == pytest.approx(scores[1][1]) and scores[0][2] == pytest.approx(scores[1][2])
 
 
+def test_the_cells_of_a_run_open_the_release_once(small_release, tmp_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr("dmcvb_gen.benchmarks.setup.open_data", lambda setup: opened.append(1) or open_data(setup))
+    cells = plan_benchmark("b1", open_release(small_release), ["bc"])[0][:2]
+    for run in (1, 2):
+        setup = Setup(str(small_release), str(tmp_path / str(run)), PROFILES["smoke"])
+        results = dict(run_cells(setup, cells))
+        assert len(cells) == len(results) == 2 and not any("error" in result for result in results.values())
+        assert len(opened) == run
+
+
 def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path):
     release = open_release(small_release)
     cells = [c for c in plan_benchmark("b1", release, ["dino+bc", "state-bc"])[0] if c.setting == "none"]
@@ -381,7 +392,7 @@ def test_cells_on_a_cluster_take_no_more_than_their_share_of_a_node(small_releas
 
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
     cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc"])[0]][:1]
-    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"], seed=7)  # data that no other test has loaded
 
     def out_of_memory(*_, **__):
         raise MemoryError("no room for 7 GB")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import signal
@@ -15,6 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
+from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
+from dmcvb_gen.benchmarks.tables import plan_benchmark
 from dmcvb_gen.cli import main
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_manifest
@@ -108,6 +111,29 @@ def test_the_same_command_goes_on_where_it_stopped(report):
     after = [file.stat().st_mtime_ns for file in files]
     assert len(facts["results"]) == 3
     assert after[0] != before[0] and after[1:] == before[1:]
+
+
+def test_a_page_holds_so_many_pictures_and_says_where_the_others_are(report, monkeypatch):
+    monkeypatch.setattr("dmcvb_gen.benchmarks.report.SHEETS", 1)
+    arguments, out, _ = report
+    run(*arguments)
+    page = (out / "report.html").read_text()
+    for kind in ("rollout", "decoder"):
+        assert f"1 more lie beside this page: cells/*.{kind}.png" in page
+        assert len(list((out / "cells").glob(f"*.{kind}.png"))) == 2
+
+
+def test_many_histograms_and_learning_curves_stand_in_several_figures(release, small_release, monkeypatch):
+    monkeypatch.setattr("dmcvb_gen.benchmarks.figures.COLUMNS", 1)
+    monkeypatch.setattr("dmcvb_gen.benchmarks.figures.HISTOGRAM_LINES", 2)
+    many = open_release(small_release)
+    assert sum(len(figure.axes) for figure in return_figures(many)) == len(many.subsets) > 2
+    assert max(len(figure.axes) for figure in return_figures(many)) == 2
+    cell = plan_benchmark("b1", open_release(release), ["bc"])[0][0]
+    point = {"step": 1, "loss": 1.0, "score": {"mean": 1.0, "stderr": 0.1}}
+    cells = [dataclasses.replace(cell, setting=f"setting{number}") for number in range(2 * CURVE_LINES + 1)]
+    figures = list(curve_figures([(cell, {"curve": [point], "data": {"mean": 1.0}}) for cell in cells], "smoke"))
+    assert [len(figure.axes) for figure in figures] == [2 * CURVE_LINES, 2 * CURVE_LINES, 2]
 
 
 def test_subsets_left_out_by_only_are_called_so_and_not_missing(small_release, tmp_path):

@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, renderer
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import Profile
-from dmcvb_gen.benchmarks.setup import Pretraining, Setup, fingerprint, open_data, pretraining_of, read_result
+from dmcvb_gen.benchmarks.setup import Pretraining, Setup, data_of_run, fingerprint, pretraining_of, read_result
 from dmcvb_gen.benchmarks.tables import Cell, Part
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json
@@ -88,7 +88,7 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: Tick = ignore) -> dic
     Raises:
       DmcvbError: training does not stay finite.
     """
-    release = open_data(setup)
+    release = data_of_run(setup)
     mark = fingerprint(setup, release, work)
     facts_path, weights_path = setup.encoders / f"{work.id}.json", setup.encoders / f"{work.id}.safetensors"
     done = read_result(facts_path, mark)
@@ -139,7 +139,7 @@ def run_cell(setup: Setup, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:
     Raises:
       DmcvbError: DINO's weights are missing, the renderer cannot start, or training does not stay finite.
     """
-    release = open_data(setup)
+    release = data_of_run(setup)
     mark = fingerprint(setup, release, cell)
     path = setup.cells / f"{cell.id}.json"
     done = read_result(path, mark)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -18,6 +19,10 @@ from dmcvb_gen.store import Release
 DPI = 110
 COLUMNS = 3
 """Histograms side by side."""
+HISTOGRAM_LINES, CURVE_LINES = 6, 6
+"""Lines of a figure at most. More stand in further ones: laying a figure out takes time that grows with the square of
+its axes, and beyond 65,536 pixels it cannot be drawn.
+"""
 NAME_BREAK = 26
 """Characters of a subset's name beyond which it stands on two lines."""
 
@@ -34,9 +39,20 @@ def figure_url(figure: Figure) -> str:
     return data_url(buffer.getvalue())
 
 
-def return_figure(release: Release) -> Figure:
+def batched(values: Iterable, most: int) -> Iterator[list]:
+    """The values in lists of `most`, the last one what is left."""
+    rest = iter(values)
+    while part := list(islice(rest, most)):
+        yield part
+
+
+def return_figures(release: Release) -> Iterator[Figure]:
     """Histograms of returns, the paper's quartiles and range as a box under each."""
-    names = list(release.subsets)
+    for names in batched(release.subsets, HISTOGRAM_LINES * COLUMNS):
+        yield _return_figure(release, names)
+
+
+def _return_figure(release: Release, names: Sequence[str]) -> Figure:
     columns = min(COLUMNS, len(names))
     lines = -(-len(names) // columns)
     figure = Figure(figsize=(4 * columns, 2.4 * lines), layout="constrained")
@@ -59,14 +75,19 @@ def return_figure(release: Release) -> Figure:
     return figure
 
 
-def curve_figure(results: Sequence[tuple[Cell, dict[str, Any]]], profile: str) -> Figure:
+def curve_figures(results: Sequence[tuple[Cell, dict[str, Any]]], profile: str) -> Iterator[Figure]:
     """A row a group of cells (task, policy set, setting): losses on the left, online scores on the right."""
     groups: dict[tuple, list] = {}
     for cell, result in results:
         groups.setdefault((cell.benchmark, cell.task, cell.policy_label, cell.setting), []).append((cell, result))
     colors = {name: f"C{index}" for index, name in enumerate(dict.fromkeys(label_of(cell) for cell, _ in results))}
+    for part in batched(groups.values(), CURVE_LINES):
+        yield _curve_figure(part, colors, profile)
+
+
+def _curve_figure(groups: Sequence[Sequence], colors: Mapping[str, str], profile: str) -> Figure:
     figure = Figure(figsize=(11, 2.8 * len(groups)), layout="constrained")
-    for line, members in enumerate(groups.values()):
+    for line, members in enumerate(groups):
         loss, score = (figure.add_subplot(len(groups), 2, 2 * line + column) for column in (1, 2))
         for cell, result in members:
             _draw_curve(loss, score, label_of(cell), colors[label_of(cell)], result["curve"])

@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
-from dmcvb_gen.benchmarks.figures import curve_figure, data_url, figure_url, label_of, place_of, return_figure
+from dmcvb_gen.benchmarks.figures import curve_figures, data_url, figure_url, label_of, place_of, return_figures
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.questions import QUESTIONS, ask
 from dmcvb_gen.benchmarks.setup import Setup
@@ -55,6 +55,8 @@ TITLES = {
 }
 SHOWN = 200
 """Findings on the page; the JSON file has all."""
+SHEETS = 60
+"""Pictures of each kind on the page, which holds them; the others lie beside the cells."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 Results = Sequence[tuple[Cell, dict[str, Any]]]
 
@@ -174,9 +176,10 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     profile = facts["profile"]
-    figures = {"returns": figure_url(return_figure(release))}
-    if good:
-        figures["curves"] = figure_url(curve_figure(good, profile["name"]))
+    figures = {
+        "returns": [figure_url(figure) for figure in return_figures(release)],
+        "curves": [figure_url(figure) for figure in curve_figures(good, profile["name"])],
+    }
     return environment.get_template("report.html.jinja").render(
         release=facts["release"],
         profile=profile,
@@ -345,20 +348,20 @@ def _inspection(good: Results, profile: str) -> list[tuple]:
     ]
 
 
-def _sheets(good: Results, setup: Setup, kind: str) -> list[dict[str, str]]:
+def _sheets(good: Results, setup: Setup, kind: str) -> dict[str, Any]:
     """Pictures that cells left: "rollout" or "decoder"."""
     found = []
-    for cell, result in good:
-        path = setup.cells / f"{cell.id}.{kind}.png"
-        if not path.exists() or cell.agent.sees_state:
-            continue
+    seeing = [(cell, result) for cell, result in good if not cell.agent.sees_state]
+    paths = [setup.cells / f"{cell.id}.{kind}.png" for cell, _ in seeing]
+    there = [(*pair, path) for pair, path in zip(seeing, paths, strict=True) if path.exists()]
+    for cell, result, path in there[:SHEETS]:
         caption = f"{label_of(cell)} on {place_of(cell)}"
         if kind == "rollout":
             score = result["final"]
             caption += f": first of {len(score['returns'])} episodes of the last evaluation, return "
             caption += f"{_number(score['returns'][0])} [{setup.profile.name}]"
         found.append({"caption": caption, "source": data_url(path.read_bytes())})
-    return found
+    return {"shown": found, "more": len(there) - len(found), "names": f"cells/*.{kind}.png"}
 
 
 def _missing(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -9,6 +9,7 @@ import dataclasses
 import os
 import time
 import traceback
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ def run_cells(
       StoreError: a worker was killed; finished cells are kept.
     """
     encoders = dict.fromkeys(filter(None, map(pretraining_of, cells)))
+    setup = dataclasses.replace(setup, run=uuid.uuid4().hex)
     if workers == 1:
         torch.set_num_threads(setup.threads)
     elif isinstance(workers, int):

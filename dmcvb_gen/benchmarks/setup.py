@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.evaluate import protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.tables import Cell, Part, slug
-from dmcvb_gen.readers.painted import DEFAULT_CACHE, Painting, painted_release
+from dmcvb_gen.readers.painted import DEFAULT_CACHE, PaintedSubset, Painting, painted_release
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.writer import subset_digest
 
@@ -42,6 +42,7 @@ class Setup:
       compile: torch.compile the losses.
       memory: bytes of pictures held at most, over all workers (on a cluster: by each cell); None: half of what is free
         (on a cluster: of a cell's share of its node).
+      run: of one run's cells, so that a process opens the release for the first of them; "": for each.
     """
 
     root: str
@@ -54,6 +55,7 @@ class Setup:
     dino_weights: str | None = None
     backgrounds: str | None = None
     memory: int | None = None
+    run: str = ""
 
     @property
     def cells(self) -> Path:
@@ -72,6 +74,24 @@ def open_data(setup: Setup) -> Release:
     """
     room = DEFAULT_CACHE if setup.memory is None else min(setup.memory, DEFAULT_CACHE)
     return painted_release(open_release(setup.root), Painting(backgrounds=setup.backgrounds, cache_bytes=room), True)
+
+
+_opened: dict[str, Release] = {}
+"""The release of the last run that a cell of this process belonged to."""
+
+
+def data_of_run(setup: Setup) -> Release:
+    """`open_data`, once for all cells of a run: of a large release it takes a second.
+
+    Releases that are painted on reading are opened each time, as each of their subsets keeps pictures.
+    """
+    if setup.run not in _opened:
+        _opened.clear()
+        release = open_data(setup)
+        if not setup.run or any(isinstance(subset, PaintedSubset) for subset in release.subsets.values()):
+            return release
+        _opened[setup.run] = release
+    return _opened[setup.run]
 
 
 @dataclass(frozen=True)
