@@ -2,13 +2,14 @@
 # A release from recipe to proof: rolled out, verified, validated, carded, published, fetched, made again in part.
 #   bash scripts/release.sh [RECIPE [OUT]]     dmcvb-mini and releases/RECIPE by default
 # Run again, it goes on where it stopped. A line a stage; what each printed is in OUT.log. Options by environment:
-#   WORKERS (2), VALIDATE ("--profile brief --benchmark b1 --agents bc,state-bc,id+bc"; "" leaves it out), TENTH (its seed, 0)
+#   WORKERS (2), TENTH (its seed, 0), VALIDATE ("--profile smoke --benchmark b1 --agents bc,state-bc,id+bc", to see that
+#   agents train on every subset; "--profile brief ..." for scores takes minutes a cell; "" leaves it out)
 extras=train,hf
 . "$(dirname "$0")/setup.sh"
 recipe="${1:-dmcvb-mini}"
 out="${2:-releases/$(basename "$recipe" .yaml)}"
 workers="${WORKERS:-2}"
-validate="${VALIDATE---profile brief --benchmark b1 --agents bc,state-bc,id+bc}"
+validate="${VALIDATE---profile smoke --benchmark b1 --agents bc,state-bc,id+bc}"
 log="$out.log"
 mkdir -p "$(dirname "$out")"
 
