@@ -149,7 +149,7 @@ def _samples(plan: Plan) -> dict[tuple, _Sample]:
     sharing = Counter(_alike(record) for _, record in first.values())
     return {
         trajectory: _simulate(job, math.ceil(SAMPLE_EPISODES[record.family] / sharing[_alike(record)]))
-        for trajectory, (job, record) in first.items()
+        for trajectory, (job, record) in sorted(first.items())  # by task: few of their models are kept
     }
 
 

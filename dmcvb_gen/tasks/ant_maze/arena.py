@@ -26,6 +26,8 @@ GOAL_RADIUS, GOAL_HEIGHT = 0.5, 1.0
 TOP_HEIGHT = 100.0
 """Meters of the top camera above the floor."""
 PHYSICS_STEP = 0.001
+ACTIONS = 8
+"""The ant's actuators."""
 SKY = "sky_02"
 STYLES = {"train": (2, 3, 4, 5), "val": (1,)}
 """Labmaze's styles of data and of evaluation (paper, section 3.1: unseen distractors)."""
@@ -139,7 +141,7 @@ def build_arena(layout: Layout) -> Arena:
                     names[repeat, style, number] = name
 
     model = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
-    assert model.opt.timestep == PHYSICS_STEP
+    assert model.opt.timestep == PHYSICS_STEP and model.nu == ACTIONS
     looks = {}
     for style in styles:
         for look in look_numbers(style):

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from dmcvb_gen import arithmetic
 from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.tasks.ant_maze.arena import (
+    ACTIONS,
     CAMERAS,
     GOAL_HEIGHT,
     GOAL_RADIUS,
@@ -300,6 +301,10 @@ class AntMaze(Task):
     @property
     def model(self):
         return build_arena(self.layout).model
+
+    @property
+    def action_size(self):
+        return ACTIONS  # plans ask for it, and need no model
 
     @functools.cached_property
     def goal_geoms(self) -> tuple[int, ...]:  # type: ignore[override]
