@@ -18,8 +18,8 @@ LATENT = 64
 HIDDEN = (256, 256)
 """Hidden layers of every MLP."""
 
-
 ACTIVATIONS = {"gelu": nn.GELU, "relu": nn.ReLU}
+"""What may stand behind a convolution."""
 
 
 @dataclass(frozen=True)
