@@ -316,8 +316,18 @@ def test_a_loss_that_is_no_longer_finite_stops_the_run():
         train(state_learner(data), data, SETTINGS)
 
 
+@pytest.mark.parametrize("most, batches", [(2, 2), (1000, 64)])
+def test_a_test_loss_takes_no_more_batches_than_were_trained_on(monkeypatch, most, batches):
+    learner, asked = state_learner(make_data().states_only()), []
+    whole = learner.metrics
+    monkeypatch.setattr(learner, "metrics", lambda batch: asked.append(batch) or whole(batch))
+    losses = hold_out_losses(learner, make_data().states_only(), 4, most)
+    assert len(asked) == batches
+    assert losses["test_loss"] == pytest.approx(np.mean([float(whole(batch)["loss"].detach()) for batch in asked]))
+
+
 def test_without_held_out_episodes_there_is_no_test_loss():
     data = make_data(held=(False, False, False)).states_only()
-    assert hold_out_losses(state_learner(data), data, 4) == {}
+    assert hold_out_losses(state_learner(data), data, 4, 1) == {}
     with pytest.raises(DmcvbError, match="held-out"):
         data.batch(4, np.random.default_rng(0), hold_out=True)

@@ -25,13 +25,14 @@ from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
 from dmcvb_gen.names import LOCOMOTION, family_of
 from dmcvb_gen.release.regenerate import Regeneration
+from dmcvb_gen.rollout import estimate as estimating
 from dmcvb_gen.rollout.estimate import estimate
 from dmcvb_gen.rollout.plan import make_plan, prepare
 from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.store import open_release
 from dmcvb_gen.tasks import get_task
-from tests.conftest import roll_out, small_recipe
+from tests.conftest import TINY_MAZE, roll_out, small_recipe
 
 
 def digests(manifest):
@@ -178,6 +179,23 @@ def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path
         assert 0.75 * subset.bytes < subset.steps * cost.rates[name].bytes_per_step < 1.25 * subset.bytes
     assert all(1e-6 < rate.seconds_per_step < 1 for rate in cost.rates.values())
     assert not (tmp_path / "r").exists()
+
+
+def test_mazes_of_a_level_share_their_estimate_of_an_episode(tmp_path, monkeypatch):
+    simulated = []
+    whole = estimating._simulate
+    monkeypatch.setattr(
+        estimating, "_simulate", lambda job, count: simulated.append(whole(job, count)) or simulated[-1]
+    )
+    mazes = {"tasks": [TINY_MAZE, "ant-maze-empty7x7"], "levels": "random", "settings": ["visible", "hidden"]}
+    walker = {"tasks": "walker-walk", "levels": "random", "settings": ["none"]}
+    subsets = [pattern | {"episodes": 5, "max_steps": 30} for pattern in (mazes, walker)]
+    cost = estimate(make_plan(small_recipe(subsets=subsets), tmp_path / "r"))
+    lengths = sorted((sample.episodes.length.tolist() for sample in simulated), key=len)
+    assert [len(length) for length in lengths] == [2, 3, 3]  # the walker's, and six of the mazes together
+    mean = np.mean(lengths[1] + lengths[2])
+    assert {rate.steps_per_episode for name, rate in cost.rates.items() if "maze" in name} == {mean}
+    assert cost.steps == round(5 * (30 + 4 * mean))
 
 
 def test_shipped_recipes_expand_to_what_the_paper_has():

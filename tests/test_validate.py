@@ -18,6 +18,7 @@ from click.testing import CliRunner
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
 from dmcvb_gen.benchmarks.tables import plan_benchmark
+from dmcvb_gen.benchmarks.validate import only
 from dmcvb_gen.cli import main
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_manifest
@@ -59,6 +60,22 @@ def found(folder):
     return {
         (finding.check, finding.episode, finding.step) for finding in check_structure(open_release(folder)).findings
     }
+
+
+@pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
+def test_subsets_are_checked_side_by_side_and_only_those_asked_for(whole, tmp_path, request):
+    folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")
+    damaged, other, *rest = open_release(folder).subsets
+
+    def color(group):
+        group["exogenous/style"][:] = group["exogenous/style"][:] + 99
+
+    rewrite(folder, damaged, color)
+    release, looked_at = only(open_release(folder), [damaged, other]), []
+    alone, beside = check_structure(release, tick=looked_at.append), check_structure(release, workers=2)
+    assert rest and set(looked_at) == {damaged, other} and alone.checked["subsets"] == 2
+    assert {finding.subset for finding in alone.findings} == {damaged}
+    assert (beside.findings, beside.warnings, beside.checked) == (alone.findings, alone.warnings, alone.checked)
 
 
 # -- the command ----------------------------------------------------------------------------------

@@ -88,16 +88,14 @@ def draw(
     )
 
 
-def hold_out_losses(
-    learner: Learner, data: TrainingData, size: int, seed: int = 0, most: int = 1 << 30
-) -> dict[str, float]:
-    """Losses on held-out episodes, always on the same (at `most` so many) batches; {} where nothing is held out."""
+def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:
+    """Losses on held-out episodes, always on the same, at `most` so many batches; {} where nothing is held out."""
     if not len(data.hold_out_rows):
         return {}
     sums: dict[str, float] = {}
     count = min(most, max(HOLD_OUT_BATCHES, -(-HOLD_OUT_TRANSITIONS // size)))
     for index in range(count):
-        for name, value in learner.metrics(draw(learner, data, size, seed, index, hold_out=True)).items():
+        for name, value in learner.metrics(draw(learner, data, size, 0, index, hold_out=True)).items():
             sums[f"test_{name}"] = sums.get(f"test_{name}", 0.0) + float(value) / count
     return sums
 
@@ -148,7 +146,7 @@ def train(
         tick(1)
         evaluating = done % settings.evaluate_every == 0 or done == settings.steps
         if evaluating or done % log_every == 0:
-            held_out = hold_out_losses(learner, data, settings.batch_size, most=settings.steps)
+            held_out = hold_out_losses(learner, data, settings.batch_size, settings.steps)
             point = {"step": done, **means.take(done), **held_out}
             if evaluating and evaluate:
                 point |= evaluate(learner)

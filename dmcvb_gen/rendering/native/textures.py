@@ -76,7 +76,7 @@ def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) ->
     return out
 
 
-@lru_cache(maxsize=16)  # 6 MB each; the seven mazes share their sky, a task's settings its floor
+@lru_cache(maxsize=8)  # a sky's six faces and a floor, up to 9 MB each: seven mazes share them, a task's settings too
 def _packed_levels(picture: bytes, height: int, width: int, srgb: bool) -> tuple[np.ndarray, ...]:
     """The levels of (height, width, 3) uint8 bytes, `packed`."""
     pixels = np.frombuffer(picture, np.uint8).reshape(height, width, 3)
