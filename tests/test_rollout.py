@@ -26,7 +26,7 @@ from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameErr
 from dmcvb_gen.names import LOCOMOTION, family_of
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.rollout import estimate as estimating
-from dmcvb_gen.rollout.estimate import estimate
+from dmcvb_gen.rollout.estimate import estimate, measurements
 from dmcvb_gen.rollout.plan import make_plan, prepare
 from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.seeding import episode_stream
@@ -184,18 +184,30 @@ def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path
 def test_mazes_of_a_level_share_their_estimate_of_an_episode(tmp_path, monkeypatch):
     simulated = []
     whole = estimating._simulate
-    monkeypatch.setattr(
-        estimating, "_simulate", lambda job, count: simulated.append(whole(job, count)) or simulated[-1]
-    )
+    monkeypatch.setattr(estimating, "_simulate", lambda *job: simulated.append(whole(*job)[0]) or (simulated[-1], 1.0))
     mazes = {"tasks": [TINY_MAZE, "ant-maze-empty7x7"], "levels": "random", "settings": ["visible", "hidden"]}
     walker = {"tasks": "walker-walk", "levels": "random", "settings": ["none"]}
     subsets = [pattern | {"episodes": 5, "max_steps": 30} for pattern in (mazes, walker)]
     cost = estimate(make_plan(small_recipe(subsets=subsets), tmp_path / "r"))
-    lengths = sorted((sample.episodes.length.tolist() for sample in simulated), key=len)
+    lengths = sorted((sample.length.tolist() for sample in simulated), key=len)
     assert [len(length) for length in lengths] == [2, 3, 3]  # the walker's, and six of the mazes together
     mean = np.mean(lengths[1] + lengths[2])
     assert {rate.steps_per_episode for name, rate in cost.rates.items() if "maze" in name} == {mean}
     assert cost.steps == round(5 * (30 + 4 * mean))
+
+
+def test_tasks_are_measured_side_by_side(tmp_path):
+    given = {"levels": "random", "episodes": 2, "max_steps": 30}
+    mazes = given | {"tasks": [TINY_MAZE, "ant-maze-empty7x7"], "settings": ["visible", "hidden"]}
+    walker = given | {"tasks": "walker-walk", "settings": ["none", "dynamic"]}
+    plan = make_plan(small_recipe(subsets=[mazes, walker]), tmp_path / "r")
+    ticks = {1: [], 2: []}
+    alone, beside = (estimate(plan, workers, ticks[workers].append) for workers in ticks)
+    assert sum(ticks[1]) == sum(ticks[2]) == measurements(plan) == 3 + 3  # one maze is painted for both
+    for name, rate in alone.rates.items():
+        assert beside.rates[name].steps_per_episode == rate.steps_per_episode
+        assert beside.rates[name].bytes_per_step == pytest.approx(rate.bytes_per_step)
+    assert (beside.steps, beside.episodes, beside.jobs) == (alone.steps, alone.episodes, alone.jobs)
 
 
 def test_shipped_recipes_expand_to_what_the_paper_has():

@@ -16,11 +16,11 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
-from dmcvb_gen.pool import Workers
+from dmcvb_gen.pool import Workers, in_order
 from dmcvb_gen.readers.painted import PaintedSubset
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.paint import drift
-from dmcvb_gen.release.verify import in_order, verify
+from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.tasks import get_task

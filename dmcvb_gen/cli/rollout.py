@@ -84,7 +84,11 @@ def _out_default(name: str) -> str:
 @click.option("--finish", "finishing", is_flag=True, help="Only finish the release: write its digests.")
 @click.option("--other-versions", is_flag=True, help="Go on although packages differ from where it was begun.")
 @click.option("--slurm-script", type=click.IntRange(1), metavar="N", help="Print a script for an array of N tasks.")
-@click.option("--dry-run", is_flag=True, help="Show the plan: jobs, steps, bytes, time. Writes nothing.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Show the plan: jobs, steps, bytes, time, as --workers would take it. Writes nothing.",
+)
 @json_option
 @click.pass_context
 def rollout(
@@ -104,7 +108,7 @@ def rollout(
         --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
-    from dmcvb_gen.rollout.estimate import estimate, raw_bytes
+    from dmcvb_gen.rollout.estimate import raw_bytes
     from dmcvb_gen.rollout.plan import finish_site, make_plan, prepare
     from dmcvb_gen.rollout.site import site_of
 
@@ -123,7 +127,7 @@ def rollout(
     if by_warp and chosen:
         click.echo(f"warp paints, as native does not on {device}", err=True)
     if dry_run:
-        return _show_plan(plan, estimate(plan), workers, as_json)
+        return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
     shared = init or bool(part)
     plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
     if init:
@@ -327,6 +331,13 @@ def _told_when_stopped():
     except KeyboardInterrupt:
         click.echo("\nstopped; what was committed is safe, the same command goes on from there", err=True)
         raise
+
+
+def _measured(plan, workers, as_json):
+    from dmcvb_gen.rollout.estimate import estimate, measurements
+
+    with tqdm(total=measurements(plan), unit=" measurements", leave=False, disable=as_json or None) as bar:
+        return estimate(plan, workers, bar.update)
 
 
 def _show_plan(plan, cost, workers, as_json):

@@ -13,7 +13,7 @@ Functions and arguments travel by pickle between processes of one program and us
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from dmcvb_gen.pool.base import (
@@ -43,6 +43,7 @@ __all__ = [
     "Tick",
     "Workers",
     "ignore",
+    "in_order",
     "limit_threads",
     "open_pool",
     "run_all",
@@ -92,3 +93,18 @@ def run_all(
         for item in items:
             pool.submit(item, function, item)
         yield from pool.results()
+
+
+def in_order(function: Callable, items: Sequence, workers: Workers = 1, tick: Tick = ignore) -> list:
+    """`function(item, tick=...)` of all items, in their order, whoever had them first.
+
+    Raises:
+      StoreError: a worker was killed.
+    """
+    numbers = run_all(_numbered, [(number, function, item) for number, item in enumerate(items)], workers, tick=tick)
+    return [result for _, result in sorted((result for _, result in numbers), key=lambda pair: pair[0])]
+
+
+def _numbered(item: tuple[int, Callable, Any], tick: Tick) -> tuple[int, Any]:
+    number, function, work = item
+    return number, function(work, tick=tick)

@@ -7,14 +7,13 @@ simulated again and a sample of frames painted again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.pool import Workers, run_all
+from dmcvb_gen.pool import Workers, in_order
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.store import Subset, open_release
@@ -195,17 +194,6 @@ def _check_shards(work: _Shards, tick: Callable[[str], None] = lambda subset: No
 def _check_digest(record: SubsetRecord, commits: Mapping[int, CommitRecord]) -> Iterator[Finding]:
     if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
         yield Finding("files", record.name, "its commit records do not give the digest of the manifest")
-
-
-def in_order(function: Callable, items: Sequence, workers: Workers, tick: Callable[[str], None]) -> list:
-    """Results of all items, in their order, whoever had them first."""
-    numbers = run_all(_numbered, [(number, function, item) for number, item in enumerate(items)], workers, tick=tick)
-    return [result for _, result in sorted((result for _, result in numbers), key=lambda pair: pair[0])]
-
-
-def _numbered(item: tuple[int, Callable, Any], tick: Callable[[str], None]) -> tuple[int, Any]:
-    number, function, work = item
-    return number, function(work, tick=tick)
 
 
 def verify(

@@ -3,6 +3,7 @@
 What is measured once serves all that it is true of: episodes of a task and level for all settings that show them (a
 maze's fixed goals are drawn as its random ones are), pictures of a task, level and kind of distractor. The mazes, whose
 pictures cost the same, share theirs, and the lengths of their episodes: a plan of all of them simulates one in each.
+Tasks are measured side by side in as many processes as will work: cores that share a chip are slower together.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Hashable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ import zarr
 
 from dmcvb_gen.behaviours.policies.simulate import Simulation
 from dmcvb_gen.names import ANT_MAZE, LOCOMOTION, distractor_of
+from dmcvb_gen.pool import Tick, ignore, in_order
 from dmcvb_gen.rollout.jobs import Job
 from dmcvb_gen.rollout.painting import exogenous_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.rollout.plan import Plan
@@ -72,11 +75,22 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class _Sample:
-    """Whole episodes of a trajectory, and what a step of them costs without pictures."""
+class _Piece:
+    """What is measured of one task: a job and a number of episodes of each trajectory, and subsets to be painted."""
 
-    episodes: Simulation
-    seconds_per_step: float
+    trajectories: tuple[tuple[Job, int], ...]
+    paintings: tuple[tuple[Job, SubsetRecord], ...]
+    threads: int
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Lengths of whole episodes and what a step costs without pictures, by trajectory; seconds and bytes of a painted
+    step by `_painting_key`."""
+
+    lengths: dict[tuple, list[int]]
+    seconds: dict[tuple, float]
+    paintings: dict[tuple, tuple[float, float]]
 
 
 def _trajectory(record: SubsetRecord) -> tuple:
@@ -89,14 +103,13 @@ def _alike(record: SubsetRecord) -> tuple:
     return _trajectory(record) if record.family == LOCOMOTION else (ANT_MAZE, *_trajectory(record)[1:])
 
 
-def _simulate(job: Job, count: int) -> _Sample:
-    count = min(count, job.subsets[0].episodes)
+def _simulate(job: Job, count: int, threads: int) -> tuple[Simulation, float]:
+    """Whole episodes of a trajectory, and the seconds that a step takes one core without pictures."""
     simulate_job(job, max_steps=1)  # models are compiled, policies read
     started = time.perf_counter()
     timed = simulate_job(job, max_steps=TIMED_STEPS)
     seconds = (time.perf_counter() - started) / timed.length.sum()
-    threads = min(os.cpu_count() or 1, count)  # what is timed had one
-    return _Sample(simulate_job(job, threads, episodes=range(count)), seconds)
+    return simulate_job(job, min(threads, count), episodes=range(count)), seconds  # what is timed had one thread
 
 
 def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, float]:
@@ -141,43 +154,78 @@ def _runs(rows: np.ndarray, chunk: int) -> list[tuple[int, int]]:
     return [known[index] for index in chosen]
 
 
-def _samples(plan: Plan) -> dict[tuple, _Sample]:
-    """By trajectory: as many episodes of each that those alike come to `SAMPLE_EPISODES` together."""
-    first: dict[tuple, tuple[Job, SubsetRecord]] = {
-        _trajectory(record): (job, record) for job in reversed(plan.jobs) for record in job.subsets
-    }
-    sharing = Counter(_alike(record) for _, record in first.values())
-    return {
-        trajectory: _simulate(job, math.ceil(SAMPLE_EPISODES[record.family] / sharing[_alike(record)]))
-        for trajectory, (job, record) in sorted(first.items())  # by task: few of their models are kept
-    }
+def _pieces(plan: Plan, threads: int) -> list[_Piece]:
+    """By task. As many episodes of each trajectory as those alike come to `SAMPLE_EPISODES` together; each painting
+    once, of the first task that has it."""
+    jobs = {_trajectory(job.subsets[0]): job for job in reversed(plan.jobs)}
+    sharing = Counter(_alike(job.subsets[0]) for job in jobs.values())
+    paintings = {_painting_key(record): (job, record) for job in reversed(plan.jobs) for record in job.subsets}
+
+    def count(record: SubsetRecord) -> int:
+        return min(math.ceil(SAMPLE_EPISODES[record.family] / sharing[_alike(record)]), record.episodes)
+
+    return [
+        _Piece(
+            tuple((job, count(job.subsets[0])) for job in jobs.values() if job.subsets[0].task == task),
+            tuple(pair for _, pair in sorted(paintings.items()) if pair[1].task == task),  # a painter serves all levels
+            threads,
+        )
+        for task in sorted({job.subsets[0].task for job in jobs.values()})
+    ]
 
 
-def _mean_lengths(plan: Plan, samples: dict[tuple, _Sample]) -> dict[tuple, float]:
+def _measure(piece: _Piece, tick: Tick = ignore) -> _Measured:
+    measured, episodes = _Measured({}, {}, {}), {}
+    for job, count in piece.trajectories:
+        key = _trajectory(job.subsets[0])
+        episodes[key], measured.seconds[key] = _simulate(job, count, piece.threads)
+        measured.lengths[key] = episodes[key].length.tolist()
+        tick(1)
+    for job, record in piece.paintings:
+        measured.paintings[_painting_key(record)] = _paint(job, record, episodes[_trajectory(record)])
+        tick(1)
+    return measured
+
+
+def _mean_lengths(plan: Plan, lengths: dict[tuple, list[int]]) -> dict[tuple, float]:
     """By trajectory: the mean length in steps of all sampled episodes that are alike."""
     alike = {_trajectory(record): _alike(record) for job in plan.jobs for record in job.subsets}
-    lengths: dict[Hashable, list[int]] = defaultdict(list)
-    for trajectory, sample in samples.items():
-        lengths[alike[trajectory]] += sample.episodes.length.tolist()
-    return {trajectory: float(np.mean(lengths[key])) for trajectory, key in alike.items()}
+    together: dict[Hashable, list[int]] = defaultdict(list)
+    for trajectory, some in lengths.items():
+        together[alike[trajectory]] += some
+    return {trajectory: float(np.mean(together[key])) for trajectory, key in alike.items()}
 
 
-def estimate(plan: Plan) -> Estimate:
-    """Measure what a plan is made of for a moment and extrapolate."""
-    samples = _samples(plan)
-    lengths = _mean_lengths(plan, samples)
-    paintings: dict[Hashable, tuple[float, float]] = {}
+def measurements(plan: Plan) -> int:
+    """How many an estimate takes: one a trajectory and one a kind of pictures."""
+    records = [record for job in plan.jobs for record in job.subsets]
+    return len({_trajectory(record) for record in records}) + len({_painting_key(record) for record in records})
+
+
+def estimate(plan: Plan, workers: int = 1, tick: Tick = ignore) -> Estimate:
+    """Measure what a plan is made of for a moment and extrapolate.
+
+    Args:
+      workers: processes that measure side by side, as they will work; no more than there are cores.
+      tick: told 1 after each measurement; see `measurements`.
+
+    Raises:
+      StoreError: a worker was killed.
+    """
+    cores = os.cpu_count() or 1
+    workers = min(workers, cores)
+    measured = in_order(_measure, _pieces(plan, cores // workers), workers, tick)
+    lengths, seconds, paintings = (
+        dict(chain.from_iterable(getattr(part, name).items() for part in measured))
+        for name in ("lengths", "seconds", "paintings")
+    )
+    means = _mean_lengths(plan, lengths)
     rates: dict[str, Rate] = {}
-    for job in sorted(plan.jobs, key=lambda job: _painting_key(job.subsets[0])):  # a painter serves all its levels
+    for job in plan.jobs:
         for record in job.subsets:
-            if record.name in rates:
-                continue
-            sample, key = samples[_trajectory(record)], _painting_key(record)
-            if key not in paintings:
-                paintings[key] = _paint(job, record, sample.episodes)
-            seconds, size = paintings[key]
-            shared = sample.seconds_per_step / len(job.subsets)
-            rates[record.name] = Rate(seconds + shared, size, lengths[_trajectory(record)])
+            painting, size = paintings[_painting_key(record)]
+            shared = seconds[_trajectory(record)] / len(job.subsets)
+            rates.setdefault(record.name, Rate(painting + shared, size, means[_trajectory(record)]))
     return _extrapolate(plan, rates)
 
 
