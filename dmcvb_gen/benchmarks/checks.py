@@ -16,7 +16,7 @@ import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
-from dmcvb_gen.pool import Workers, in_order
+from dmcvb_gen.pool import Workers, in_order, open_pool
 from dmcvb_gen.readers.painted import PaintedSubset
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.paint import drift
@@ -183,15 +183,16 @@ def check_structure(
       DmcvbError: nothing is committed.
     """
     started = time.perf_counter()
-    verified = verify(release.path, backgrounds, tick, workers, names=release.subsets)
     wanted = {record.name for record in release.manifest.subsets}
     others = {record.name for record in open_release(release.path).manifest.subsets} - wanted
-    findings, warnings = [f for f in verified.findings if f.subset not in others], []
-    unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
-    readable = [subset for name, subset in release.subsets.items() if name not in unreadable]
-    for found, odd in in_order(_check_subset, readable, workers, tick):
-        findings += found
-        warnings += odd
+    with open_pool(workers, tick=tick) as pool:
+        verified = verify(release.path, backgrounds, tick, pool, names=release.subsets)
+        findings, warnings = [f for f in verified.findings if f.subset not in others], []
+        unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
+        readable = [subset for name, subset in release.subsets.items() if name not in unreadable]
+        for found, odd in in_order(_check_subset, readable, pool):
+            findings += found
+            warnings += odd
     for text in painter_drift(release, backgrounds):
         warnings.append(Finding("painter", "pictures painted on reading", text))
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)

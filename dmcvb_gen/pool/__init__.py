@@ -14,6 +14,7 @@ Functions and arguments travel by pickle between processes of one program and us
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 from dmcvb_gen.pool.base import (
@@ -81,22 +82,32 @@ def open_pool(
 
 
 def run_all(
-    function: Callable, items: Iterable[Item], workers: Workers = 1, *, threads: int = 1, tick: Tick = ignore
+    function: Callable, items: Iterable[Item], workers: Workers | Pool = 1, *, threads: int = 1, tick: Tick = ignore
 ) -> Iterator[tuple[Item, Any]]:
     """(item, `function(item, tick=...)`) of all items, as they come.
+
+    Args:
+      workers: or an open pool, which stays open, with the threads and the tick that it has.
 
     Raises:
       StoreError: a worker was killed.
     """
     items = list(items)
-    with open_pool(workers, threads=threads, tick=tick, most=len(items)) as pool:
+    if isinstance(workers, Pool):
+        opened: AbstractContextManager[Pool] = nullcontext(workers)
+    else:
+        opened = open_pool(workers, threads=threads, tick=tick, most=len(items))
+    with opened as pool:
         for item in items:
             pool.submit(item, function, item)
         yield from pool.results()
 
 
-def in_order(function: Callable, items: Sequence, workers: Workers = 1, tick: Tick = ignore) -> list:
+def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, tick: Tick = ignore) -> list:
     """`function(item, tick=...)` of all items, in their order, whoever had them first.
+
+    Args:
+      workers, tick: see `run_all`.
 
     Raises:
       StoreError: a worker was killed.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.pool import Workers, in_order
+from dmcvb_gen.pool import Pool, Workers, in_order, open_pool
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.store import Subset, open_release
@@ -71,11 +71,11 @@ class Verification:
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def check_files(root: Path, workers: Workers = 1) -> Iterator[Finding]:
+def check_files(root: Path, workers: Workers | Pool = 1) -> Iterator[Finding]:
     """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`.
 
     Args:
-      workers: processes, or a Ray cluster that sees the folder.
+      workers: processes, a Ray cluster that sees the folder, or an open pool.
     """
     try:
         with storage_errors(root / MANIFEST):
@@ -200,7 +200,7 @@ def verify(
     path: str | Path,
     backgrounds: str | None = None,
     tick: Callable[[str], None] = lambda subset: None,
-    workers: Workers = 1,
+    workers: Workers | Pool = 1,
     names: Collection[str] | None = None,
 ) -> Verification:
     """Check a release.
@@ -209,8 +209,8 @@ def verify(
       backgrounds: where the manifest's videos are now, if they moved.
       names: the subsets whose values are looked at; all by default. Bytes are checked everywhere.
       tick: told each subset whose values are looked at.
-      workers: processes, or a Ray cluster that sees the folder: bytes are checked a few shards at a time, values a
-        subset.
+      workers: processes, a Ray cluster that sees the folder, or an open pool (whose tick is told): bytes are checked a
+        few shards at a time, values a subset.
 
     Raises:
       DmcvbError: there is no release, or nothing is committed.
@@ -220,6 +220,9 @@ def verify(
         there = (root / MANIFEST).is_file()
     if not there:
         open_release(path)  # says what is the matter
+    if not isinstance(workers, Pool):
+        with open_pool(workers, tick=tick) as pool:  # one for bytes and values: its workers are slow to start
+            return verify(path, backgrounds, tick, pool, names)
     findings = list(check_files(root, workers))
     damaged = {finding.subset for finding in findings}
     counts = {"subsets": 0, "episodes": 0, "steps": 0}
