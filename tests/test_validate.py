@@ -10,13 +10,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
+import markdown
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
+from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, render_tables
 from dmcvb_gen.benchmarks.tables import plan_benchmark
 from dmcvb_gen.benchmarks.validate import only
 from dmcvb_gen.cli import main
@@ -117,6 +120,39 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     assert by_agent["bc"]["paper_share"] == pytest.approx(913 / 960)
     assert by_agent["id+bc"]["pretraining"]["curve"] and by_agent["id+bc"]["inspection"]["state_mse"] > 0
     assert (out / "cells" / "b1_walker-walk_dynamic_bc_expert.decoder.png").exists()
+
+
+def markdown_tables(text):
+    """Tables of a Markdown page as a renderer of Markdown sees them: lists of rows of cells."""
+    page = markdown.markdown(text, extensions=["tables"]).replace("<br>", "\n")
+    rows = [table.iter("tr") for table in ElementTree.fromstring(f"<page>{page}</page>").iter("table")]
+    return [[["".join(cell.itertext()) for cell in row] for row in table] for table in rows]
+
+
+def test_its_tables_stand_in_markdown_too(report):
+    _, out, _ = report
+    facts, text = json.loads((out / "report.json").read_text()), (out / "report.md").read_text()
+    checks, returns, scores, missing = markdown_tables(text)
+    assert [row[0] for row in checks[1:]] == list(CHECKS) and {row[2] for row in checks[1:]} == {"0"}
+    assert all(len(row) == len(table[0]) for table in (checks, returns, scores, missing) for row in table)
+    for name, values in facts["returns"].items():
+        assert [name, *(f"{values[statistic]:.1f}" for statistic in STATISTICS)] in returns
+    shown = {agent: cell for agent, cell in zip(scores[0], scores[1], strict=True) if "[smoke]" in cell}
+    for entry in facts["results"]:
+        lines = shown.pop(entry["cell"]["agent_name"]).splitlines()
+        assert float(lines[0].split(" ±")[0]) == pytest.approx(entry["score"]["mean"], rel=0.1)
+        assert f"paper {entry['paper']['mean']:.0f} ± {entry['paper']['stderr']:.0f}" in lines[-1]
+    assert not shown and "This profile claims no score." in text
+
+
+def test_a_message_stays_in_its_cell_of_a_markdown_table(report):
+    facts = json.loads((report[1] / "report.json").read_text())
+    message = "a | b\nc \\| *d* `e` <script>f</script>"
+    facts["structure"]["findings"] = [dict(check="files", subset="x|y", episode=0, step=None, message=message)]
+    text = render_tables(facts)
+    assert "<script>" not in text
+    found = markdown_tables(text)[1][1]
+    assert found[:4] == ["files", "x|y", "0", ""] and found[4].split() == message.split()
 
 
 def test_the_same_command_goes_on_where_it_stopped(report):

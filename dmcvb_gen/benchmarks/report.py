@@ -1,19 +1,21 @@
-"""The report of a validation: results in, one self-contained HTML page and a JSON file out.
+"""The report of a validation: results in, one self-contained HTML page, its tables as Markdown and a JSON file out.
 
-Wherever a score stands, the profile that made it stands beside it. The page's text lies in data/report.html.jinja;
-here is what it shows.
+Wherever a score stands, the profile that made it stands beside it. The page's text lies in data/report.html.jinja,
+the tables' in data/report.md.jinja; here is what they show.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import html
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure
@@ -57,6 +59,8 @@ SHOWN = 200
 """Findings on the page; the JSON file has all."""
 SHEETS = 60
 """Pictures of each kind on the page, which holds them; the others lie beside the cells."""
+MARKUP = {ord(mark): f"&#{ord(mark)};" for mark in "|\\*`"}
+"""Written as entities, they mean nothing to any reader of Markdown."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 Results = Sequence[tuple[Cell, dict[str, Any]]]
 
@@ -72,11 +76,13 @@ def write_report(
     warnings: Sequence[Finding],
     seconds: float,
 ) -> tuple[Path, Path]:
-    """Write report.html and report.json into the setup's folder; gives both paths."""
+    """Write report.html, report.md and report.json into the setup's folder; gives the paths of the page and of the JSON
+    file."""
     folder = Path(setup.out)
     facts = report_facts(setup, release, structure, cells, results, missing, warnings, seconds)
     write_json(folder / "report.json", facts)
     good = [(cell, result) for cell, result in results if "error" not in result]
+    write_text(folder / "report.md", render_tables(facts))
     write_text(folder / "report.html", render_page(facts, release, good, setup))
     return folder / "report.html", folder / "report.json"
 
@@ -171,18 +177,40 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup
     Args:
       good: results of cells that did not fail.
     """
+    name = facts["profile"]["name"]
+    return _template("report.html.jinja", autoescape=True).render(
+        **_tables(facts),
+        figures={
+            "returns": [figure_url(figure) for figure in return_figures(release)],
+            "curves": [figure_url(figure) for figure in curve_figures(good, name)],
+        },
+        rollouts=_sheets(good, setup, "rollout"),
+        decoders=_sheets(good, setup, "decoder"),
+        inspection=_inspection(good, name),
+        times=_times(facts),
+        settings=_settings(facts),
+    )
+
+
+def render_tables(facts: Mapping[str, Any]) -> str:
+    """What the page says but for pictures, times and settings, as Markdown; `facts` as in report.json."""
+    text = _template("report.md.jinja").render(**_tables(facts))
+    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+
+
+def _template(name: str, autoescape: bool = False) -> Template:
     loader = PackageLoader("dmcvb_gen.benchmarks", "data")
     environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader, autoescape=autoescape, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    profile = facts["profile"]
-    figures = {
-        "returns": [figure_url(figure) for figure in return_figures(release)],
-        "curves": [figure_url(figure) for figure in curve_figures(good, profile["name"])],
-    }
-    return environment.get_template("report.html.jinja").render(
+    environment.filters |= {"cell": _markdown_cell, "values_of": _values_of, "score_row": _score_row}
+    return environment.get_template(name)
+
+
+def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(
         release=facts["release"],
-        profile=profile,
+        profile=facts["profile"],
         verdict=_verdict(facts),
         checks=_checks(facts["structure"]["findings"]),
         incomplete=[(name, *counts) for name, counts in facts["incomplete"].items()],
@@ -193,14 +221,31 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup
         scores=[_scores(name, facts) for name in dict.fromkeys(r["cell"]["benchmark"] for r in facts["results"])],
         notes=_notes(facts["results"]),
         answers=_answers(facts["results"]),
-        figures=figures,
-        rollouts=_sheets(good, setup, "rollout"),
-        decoders=_sheets(good, setup, "decoder"),
-        inspection=_inspection(good, profile["name"]),
         missing=_missing(facts["missing"]),
-        times=_times(facts),
-        settings=_settings(facts),
     )
+
+
+def _markdown_cell(value: Any) -> str:
+    """A value in one cell of a table: no bar of its own, no line's end, nothing taken for Markdown or HTML."""
+    text = "" if value is None else html.escape(str(value), quote=False).translate(MARKUP)
+    return "<br>".join(text.splitlines())
+
+
+def _values_of(row: Mapping[str, Any], names: Sequence[str]) -> list[Any]:
+    return [row[name] for name in names]
+
+
+def _score_row(row: Mapping[str, Any], profile: str) -> list[str]:
+    """A row of `_scores` in plain text, its profile beside every score."""
+    return [*row["facts"], "\n".join(row["data"]), *(_score_text(entry, profile) for entry in row["scores"])]
+
+
+def _score_text(entry: Mapping[str, Any] | None, profile: str) -> str:
+    if entry is None:
+        return ""
+    paper = entry["paper"]
+    published = [f"paper {paper['mean']} ± {paper['stderr']}{paper['share']}"] if paper else []
+    return "\n".join([f"{entry['mean']} ± {entry['stderr']} [{profile}]", *entry["lines"], *published])
 
 
 def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
@@ -400,4 +445,4 @@ def _settings(facts: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return list({"profile": facts["profile"]["name"], **profile, **facts["settings"], **facts["versions"]}.items())
 
 
-__all__ = ["CHECKS", "compare", "release_episodes", "render_page", "report_facts", "write_report"]
+__all__ = ["CHECKS", "compare", "release_episodes", "render_page", "render_tables", "report_facts", "write_report"]
