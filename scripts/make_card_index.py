@@ -17,8 +17,8 @@ CARDS = Path(__file__).parents[1] / "dataset_cards"
 HEAD = """# Data set cards
 
 Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
-description, a contact sheet, and its manifest with the digest of every subset; any part of a release is made from its
-manifest alone, and compared with the digests:
+description, a contact sheet, where it was validated the report's tables, and its manifest with the digest of every
+subset; any part of a release is made from its manifest alone, and compared with the digests:
 
 ```text
 dmcvb-gen regenerate --manifest dataset_cards/NAME/manifest.json --only 'SUBSET' --out FOLDER
@@ -35,9 +35,10 @@ def row(folder: Path) -> str:
     episodes = sum(subset.episodes for subset in manifest.subsets)
     families = sorted({family_of(subset.task) for subset in manifest.subsets})
     tasks = len({subset.task for subset in manifest.subsets})
+    report = f" ([report]({folder.name}/report.md))" if (folder / "report.md").exists() else ""
     return (
-        f"| [{manifest.name}]({folder.name}/README.md) | {manifest.version} | {len(manifest.subsets)} | {episodes:,} "
-        f"| {tasks} ({', '.join(families)}) | `{(manifest.digest or '')[:16]}` |\n"
+        f"| [{manifest.name}]({folder.name}/README.md){report} | {manifest.version} | {len(manifest.subsets)} "
+        f"| {episodes:,} | {tasks} ({', '.join(families)}) | `{(manifest.digest or '')[:16]}` |\n"
     )
 
 
