@@ -17,7 +17,7 @@ CARDS = Path(__file__).parents[1] / "dataset_cards"
 HEAD = """# Data set cards
 
 Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
-description, a contact sheet, where it was validated the report's tables, and its manifest with the digest of every
+description, a contact sheet, the report's tables where it was validated, and its manifest with the digest of every
 subset; any part of a release is made from its manifest alone, and compared with the digests:
 
 ```text

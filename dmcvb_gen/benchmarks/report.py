@@ -59,7 +59,7 @@ SHOWN = 200
 """Findings on the page; the JSON file has all."""
 SHEETS = 60
 """Pictures of each kind on the page, which holds them; the others lie beside the cells."""
-MARKUP = {ord(mark): f"&#{ord(mark)};" for mark in "|\\*`"}
+MARKUP = {ord(mark): f"&#{ord(mark)};" for mark in "|\\*_`"}
 """Written as entities, they mean nothing to any reader of Markdown."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 Results = Sequence[tuple[Cell, dict[str, Any]]]
@@ -228,7 +228,7 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
 def _markdown_cell(value: Any) -> str:
     """A value in one cell of a table: no bar of its own, no line's end, nothing taken for Markdown or HTML."""
     text = "" if value is None else html.escape(str(value), quote=False).translate(MARKUP)
-    return "<br>".join(text.splitlines())
+    return "<br>".join(text.replace("](", "]&#40;").splitlines())  # no link; "[smoke]" stays as it is
 
 
 def _values_of(row: Mapping[str, Any], names: Sequence[str]) -> list[Any]:

@@ -15,7 +15,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Hashable
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -214,11 +213,13 @@ def estimate(plan: Plan, workers: int = 1, tick: Tick = ignore) -> Estimate:
     """
     cores = os.cpu_count() or 1
     workers = min(workers, cores)
-    measured = in_order(_measure, _pieces(plan, cores // workers), workers, tick)
-    lengths, seconds, paintings = (
-        dict(chain.from_iterable(getattr(part, name).items() for part in measured))
-        for name in ("lengths", "seconds", "paintings")
-    )
+    lengths: dict[tuple, list[int]] = {}
+    seconds: dict[tuple, float] = {}
+    paintings: dict[tuple, tuple[float, float]] = {}
+    for part in in_order(_measure, _pieces(plan, cores // workers), workers, tick):
+        lengths |= part.lengths
+        seconds |= part.seconds
+        paintings |= part.paintings
     means = _mean_lengths(plan, lengths)
     rates: dict[str, Rate] = {}
     for job in plan.jobs:
