@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
-from dmcvb_gen.cli.common import OutPath, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
 
 
 @click.command()
@@ -27,7 +26,7 @@ def backgrounds(videos, seed, out, sheet, as_json):
 
     from dmcvb_gen.distractors.clips import clip_sheet, make_clips
 
-    with tqdm(total=2 * videos, unit=" clips", disable=as_json or None) as bar:
+    with ProgressBar(as_json, total=2 * videos, unit=" clips") as bar:
         made = make_clips(videos, seed, out, bar.update)
     if sheet:
         sheet.parent.mkdir(parents=True, exist_ok=True)

@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 from rich.console import Console
 from rich.table import Table
-from tqdm import tqdm
 
-from dmcvb_gen.cli.common import OutPath, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
 
 
 @click.command("train-behaviour")
@@ -54,8 +53,8 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     done = (run.saved() or {"step": 0})["step"]
     expert = paper_returns(task, "expert")
     goal = f" of the paper's {expert['mean']:.0f}" if expert else ""
-    with tqdm(
-        total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task, disable=as_json or None
+    with ProgressBar(
+        as_json, total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task
     ) as bar:
 
         def report(progress):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import click
+from tqdm import tqdm
 
 from dmcvb_gen.errors import DmcvbError
 
@@ -16,6 +19,52 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON f
 def print_json(value: Any) -> None:
     """Print a value as JSON; numpy numbers and paths are turned into plain ones."""
     click.echo(json.dumps(value, indent=2, default=_plain))
+
+
+LOG_SECONDS = 60.0  # between two lines of progress where nobody watches a bar
+
+
+class ProgressBar(tqdm):
+    """tqdm's bar on a terminal; in a log (a batch job's file, a pipe) a line a minute, the first after a minute.
+
+    A log keeps every state of a bar, so there it has to be rare, and ends in a newline instead of a carriage return.
+    """
+
+    def __init__(self, as_json: bool = False, **options: Any) -> None:
+        self._logged = not sys.stderr.isatty()
+        self._told = time.monotonic()
+        if self._logged:
+            line = "{l_bar} {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+            options |= dict(file=_Lines(), delay=LOG_SECONDS, mininterval=LOG_SECONDS, miniters=1, bar_format=line)
+        super().__init__(disable=as_json, **options)
+
+    def __call__(self, done: int | str = 1) -> None:
+        """As a tick: how much was done since the last call, or the name of one thing that is at hand."""
+        if isinstance(done, str):
+            self.set_description(done, refresh=False)
+        self.update(1 if isinstance(done, str) else done)
+
+    def expect(self, count: float) -> None:
+        """How much will have been done at the end; may change on the way."""
+        self.total = count
+
+    def refresh(self, *args: Any, **options: Any) -> bool | None:
+        if self._logged:
+            if time.monotonic() < self._told + LOG_SECONDS:
+                return None
+            self._told = time.monotonic()
+        return super().refresh(*args, **options)
+
+
+class _Lines:
+    """A stream that turns each state of a bar into a line of standard error."""
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            click.echo(text.strip(), err=True)
+
+    def flush(self) -> None:
+        sys.stderr.flush()
 
 
 def _plain(value: Any) -> Any:

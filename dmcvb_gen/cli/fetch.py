@@ -6,9 +6,8 @@ import dataclasses
 import os
 
 import click
-from tqdm import tqdm
 
-from dmcvb_gen.cli.common import OutPath, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import OutPath, ProgressBar, format_bytes, json_option, print_json, remote_option
 from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
 from dmcvb_gen.cli.release import episodes_option, only_option, transfers_option
 
@@ -39,8 +38,8 @@ def fetch(context, url, only, episodes, painting, size, views, goal, out, option
     if not painting:
         if size or views or goal:
             raise click.UsageError("--size, --views and --goal say what to --paint.")
-        with tqdm(unit="B", unit_scale=True, disable=as_json or None) as bar:
-            moved, done = run(url, out, only, episodes, tick=bar.update, **given), None
+        with ProgressBar(as_json, unit="B", unit_scale=True) as bar:
+            moved, done = run(url, out, only, episodes, tick=bar, **given), None
     else:
         moved, done = _fetch_painted(url, out, only, episodes, look_of(size, views, goal), given, as_json)
     if as_json:
@@ -57,8 +56,8 @@ def _fetch_painted(url, out, only, episodes, look, given, as_json):
     from dmcvb_gen.release.paint import Painter
 
     with (
-        tqdm(unit="B", unit_scale=True, desc="fetched", disable=as_json or None) as bytes_bar,
-        tqdm(unit=" frames", unit_scale=True, desc="painted", disable=as_json or None) as frames,
+        ProgressBar(as_json, unit="B", unit_scale=True, desc="fetched") as bytes_bar,
+        ProgressBar(as_json, unit=" frames", unit_scale=True, desc="painted") as frames,
     ):
-        painter = Painter(look=look, workers=os.cpu_count() or 1, tick=frames.update, tell=tell)
-        return fetch_and_paint(url, out, only, episodes, painter=painter, tick=bytes_bar.update, **given)
+        painter = Painter(look=look, workers=os.cpu_count() or 1, tick=frames, tell=tell)
+        return fetch_and_paint(url, out, only, episodes, painter=painter, tick=bytes_bar, **given)

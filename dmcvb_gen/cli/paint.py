@@ -40,7 +40,7 @@ def paint(
     videos = background_source(backgrounds) if backgrounds else None
     team = crew(workers, executor, ray_address)
     with frames_bar(as_json) as bar:
-        painter = Painter(look_of(size, views, goal), team, device, videos, bar.update, tell)
+        painter = Painter(look_of(size, views, goal), team, device, videos, bar, tell)
         done = paint_release(path, only, episodes, painter)
     if as_json:
         print_json({"out": path} | painted_facts(done))

@@ -8,10 +8,17 @@ import tempfile
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
-from dmcvb_gen.cli.common import OutPath, background_source, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import (
+    OutPath,
+    ProgressBar,
+    background_source,
+    format_bytes,
+    json_option,
+    print_json,
+    remote_option,
+)
 from dmcvb_gen.cli.unheard import given_options, refuse
 from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS
 
@@ -44,13 +51,13 @@ def verify(context, path, everything, backgrounds, workers, executor, ray_addres
     given = given_options(context)
     if is_url(path):
         refuse(context, given, ("backgrounds", "executor", "ray_address"), "at a URL nothing is painted or simulated")
-        with tqdm(unit=" files", disable=as_json or None) as bar:
-            result = verify_url(path, options, everything, lambda name: bar.update(), workers or WORKERS)
+        with ProgressBar(as_json, unit=" files") as bar:
+            result = verify_url(path, options, everything, bar, workers or WORKERS)
     else:
         refuse(context, given, ("everything", "options"), f"{path} is no URL, and is read whole")
-        with tqdm(unit=" subsets", disable=as_json or None) as bar:
+        with ProgressBar(as_json, unit=" checks") as bar:
             team = crew(workers or 1, executor, ray_address)
-            result = run(path, backgrounds, lambda name: (bar.set_description(name), bar.update()), team)
+            result = run(path, backgrounds, bar, team)
     if as_json:
         findings = [dataclasses.asdict(finding) for finding in result.findings]
         facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
@@ -97,7 +104,7 @@ workers_option = click.option("--workers", type=click.IntRange(1), default=1, sh
 
 def frames_bar(as_json):
     """A progress bar of painted frames."""
-    return tqdm(unit=" frames", unit_scale=True, disable=as_json or None)
+    return ProgressBar(as_json, unit=" frames", unit_scale=True)
 
 
 @click.command()
@@ -142,7 +149,7 @@ def regenerate(
         raise click.UsageError("Give --check or --out, not both.")
     work = Regeneration(path, only, episodes, backgrounds, device, crew(workers, executor, ray_address))
     with frames_bar(as_json) as bar:
-        outcome = work.remake(out, bar.update) if out else (work.check if check else work.repair)(bar.update)
+        outcome = work.remake(out, bar) if out else (work.check if check else work.repair)(bar)
     if as_json:
         print_json(
             {
@@ -194,7 +201,7 @@ def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **o
 
     request = Repainting(path, out, backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
-        manifest = run(request, crew(workers, executor, ray_address), bar.update)
+        manifest = run(request, crew(workers, executor, ray_address), bar)
     if as_json:
         return print_json({"out": out, "complete": manifest.complete, "subsets": [s.name for s in manifest.subsets]})
     for subset in manifest.subsets:
@@ -233,12 +240,12 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
     exported = not (Path(path) / MANIFEST).exists() and export_format(path) is not None
     if exported and (no_pixels or take_over):
         raise click.UsageError("--no-pixels and --take-over are for releases; this is an export.")
-    with tqdm(unit=" files", disable=as_json or None) as bar, contextlib.ExitStack() as stack:
+    with ProgressBar(as_json, unit=" files") as bar, contextlib.ExitStack() as stack:
         if exported:
-            moved = publish_export(path, url, options=options, workers=workers, tick=bar.update)
+            moved = publish_export(path, url, options=options, workers=workers, tick=bar)
         else:
             sent = stack.enter_context(_left_behind(path)) if no_pixels else path
-            moved = run(sent, url, options=options, take_over=take_over, workers=workers, tick=bar.update)
+            moved = run(sent, url, options=options, take_over=take_over, workers=workers, tick=bar)
     if as_json:
         return print_json(dataclasses.asdict(moved))
     click.echo(f"{public(url)}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
@@ -318,8 +325,8 @@ def export(path, to, only, episodes, merge, video, workers, executor, ray_addres
     from dmcvb_gen.release.export import export as run
 
     team = crew(workers, executor, ray_address)
-    with tqdm(unit=" episodes", disable=as_json or None) as bar:
-        given = dict(merge=merge, video=video, workers=team, storage_options=options, tick=bar.update)
+    with ProgressBar(as_json, unit=" episodes") as bar:
+        given = dict(merge=merge, video=video, workers=team, storage_options=options, tick=bar)
         folders = run(path, to, out, only, episodes, **given)
     if as_json:
         return print_json([str(folder) for folder in folders])
@@ -342,8 +349,8 @@ def import_command(folder, task, level, setting, name, out, as_json):
     """
     from dmcvb_gen.release.import_tfds import import_tfds
 
-    with tqdm(unit=" episodes", disable=as_json or None) as bar:
-        manifest = import_tfds(folder, out, task=task, level=level, setting=setting, name=name, tick=bar.update)
+    with ProgressBar(as_json, unit=" episodes") as bar:
+        manifest = import_tfds(folder, out, task=task, level=level, setting=setting, name=name, tick=bar)
     if as_json:
         return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
     for subset in manifest.subsets:

@@ -9,11 +9,11 @@ from pathlib import Path
 import click
 from rich.console import Console
 from rich.table import Table
-from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, parse_bytes, parse_part, ray_option, slurm_script
 from dmcvb_gen.cli.common import (
     OutPath,
+    ProgressBar,
     background_source,
     format_bytes,
     format_duration,
@@ -163,7 +163,7 @@ def _run(plan, workers, as_json, whole=True):
     started, steps, seconds = time.time(), 0, {}
     with _told_when_stopped(), _progress(plan, as_json) as bar:
         finished = 0
-        for result in run_jobs(plan.jobs, workers, bar.update):
+        for result in run_jobs(plan.jobs, workers, bar):
             finished += sum(commit.episodes[1] - commit.episodes[0] for commit in result.commits)
             steps += result.steps
             for part, value in result.seconds.items():
@@ -314,12 +314,11 @@ def _layout_task(layout: str) -> str:
 
 
 def _progress(plan, as_json):
-    return tqdm(
-        total=plan.steps + plan.episodes,  # an episode has a frame more than it has steps
+    return ProgressBar(
+        as_json,
         unit=" frames",
         unit_scale=True,
         desc=plan.manifest.name,
-        disable=as_json or None,
         smoothing=0.1,
     )
 
@@ -336,7 +335,7 @@ def _told_when_stopped():
 def _measured(plan, workers, as_json):
     from dmcvb_gen.rollout.estimate import estimate, measurements
 
-    with tqdm(total=measurements(plan), unit=" measurements", leave=False, disable=as_json or None) as bar:
+    with ProgressBar(as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
         return estimate(plan, workers, bar.update)
 
 

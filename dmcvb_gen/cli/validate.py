@@ -6,10 +6,9 @@ import json
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
-from dmcvb_gen.cli.common import OutPath, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
 
 
 @click.command()
@@ -69,7 +68,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
         dino_weights=weights and str(weights),
         **options | {"threads": options["threads"] or threads},
     )
-    with tqdm(unit=" steps", desc="structure", disable=as_json or None) as bar:
+    with ProgressBar(as_json, unit=" steps", desc="structure") as bar:
         progress = Progress(
             checking=lambda name: bar.set_description(f"checking {name}"),
             total=bar.reset,

@@ -27,6 +27,7 @@ from dmcvb_gen.pool.base import (
     SerialPool,
     Tick,
     Workers,
+    expect,
     ignore,
     limit_threads,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "SerialPool",
     "Tick",
     "Workers",
+    "expect",
     "ignore",
     "in_order",
     "limit_threads",

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 Tick = Callable[..., None]
-"""Told by the functions at work how far they are; called in the process that asked for the work."""
+"""Told by the functions at work how far they are; called in the process that asked for the work. One that can `expect`
+is told beforehand how far they will get, see there."""
 
 IN_FLIGHT = 2
 """Pieces of work handed out for each worker: one at work, one that waits for it."""
@@ -24,6 +25,11 @@ KEPT = "what was committed is safe: run the same command again"
 
 def ignore(*_) -> None:
     """A tick for callers that show no progress."""
+
+
+def expect(tick: Tick, count: float) -> None:
+    """Tell a tick how much it will have been told at the end (by the best guess so far), if it has an `expect`."""
+    getattr(tick, "expect", ignore)(count)
 
 
 class Later:

@@ -20,6 +20,7 @@ from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.hub import on_the_hub
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import CARD_FILES, CARD_FOLDER, INDEX, Index, is_card, parse_index, write_release
@@ -41,7 +42,6 @@ from dmcvb_gen.store.shards import ShardKey, chosen_shards
 from dmcvb_gen.store.transfer import download, in_parallel, protocol, read_object, retry
 from dmcvb_gen.store.writer import LOCK, finish_release, mark_created, only_writer, read_commits
 
-Tick = Callable[[int], None]
 AHEAD = 64
 """Shards of a Hugging Face repository that are asked for at once."""
 
@@ -63,7 +63,7 @@ def fetch(
     *,
     options: dict[str, Any] | None = None,
     workers: int = 8,
-    tick: Tick = lambda count: None,
+    tick: Tick = ignore,
 ) -> Moved:
     """Bring a published release, or the shards of it that hold some episodes; run again, it goes on or adds.
 
@@ -93,7 +93,7 @@ def fetch_and_paint(
     painter: Any,
     options: dict[str, Any] | None = None,
     workers: int = 8,
-    tick: Tick = lambda count: None,
+    tick: Tick = ignore,
 ) -> tuple[Moved, Any]:
     """`fetch`, and paint the pictures that travelled without; a shard is painted while the next ones come.
 
@@ -112,6 +112,7 @@ def fetch_and_paint(
     with Arrival.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
         names, painted = {name for name, _ in arrival.shards}, arrival.painted
         studio = Studio.open(open_release(folder), names, painter, arrival.unpainted, painted)
+        studio.expect(arrival.unpainted_commits)
         arrived: queue.SimpleQueue = queue.SimpleQueue()
         bringing = threading.Thread(target=_bring, args=(arrival, arrived), name="fetch")
         bringing.start()
@@ -252,6 +253,8 @@ class Arrival:
             with only_writer(out):
                 arrival._keep_painted()
                 arrival._check_room(with_pictures)
+                coming = [file for _, commit in arrival.commits.values() for file in commit.files]
+                expect(tick, sum(file.bytes for file in [*coming, *arrival._metadata]))
                 arrival._download([(None, file) for file in arrival._metadata], lambda key: None)
                 _write_part(out, source, arrival.local, only, episodes)
                 yield arrival
@@ -259,7 +262,12 @@ class Arrival:
     @property
     def unpainted(self) -> set[str]:
         """Subsets of which shards come without pictures."""
-        return {key[0] for key, (_, commit) in self.commits.items() if not commit.painted and key not in self._kept}
+        return {commit.subset for commit in self.unpainted_commits}
+
+    @property
+    def unpainted_commits(self) -> list[CommitRecord]:
+        """Of the shards that come without pictures."""
+        return [commit for key, (_, commit) in self.commits.items() if not commit.painted and key not in self._kept]
 
     @property
     def painted(self) -> set[str]:

@@ -11,13 +11,14 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, sha256_file
+from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import INDEX, Index, is_replaced, keeps, parse_index
 from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest, parse_manifest, subset_path
@@ -79,9 +80,7 @@ def newest_of(url: str) -> tuple[str, str]:
     return repository, folder
 
 
-def publish_to_hub(
-    root: Path, manifest: Manifest, index: Index, url: str, tick: Callable[[int], None] = lambda count: None, api=None
-) -> int:
+def publish_to_hub(root: Path, manifest: Manifest, index: Index, url: str, tick: Tick = ignore, api=None) -> int:
     """Put a release into a data set repository (made if it is not there), and tag it; gives how many files were moved.
 
     Args:
@@ -105,6 +104,7 @@ def publish_to_hub(
         if found and not found & mine:
             _check_grown(api, where, url, folder, manifest, index)
         todo = [] if found & mine else list(_to_send(root, index.files, there, folder))
+        expect(tick, len(todo))
         for first in range(0, len(todo), BATCH):
             part = todo[first : first + BATCH]
             operations = [CommitOperationAdd(folder + file.path, str(root / file.path)) for file in part]

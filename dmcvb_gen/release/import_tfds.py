@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from PIL import Image
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_file
 from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
+from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
@@ -67,7 +68,7 @@ def import_tfds(
     level: str | None = None,
     setting: str | None = None,
     name: str = "dmc-vb-original",
-    tick: Callable[[int], None] = lambda episodes: None,
+    tick: Tick = ignore,
 ) -> Manifest:
     """Import subsets, of locomotion and of mazes; run again, it goes on where it stopped.
 
@@ -106,6 +107,7 @@ def import_tfds(
         ),
     )
     manifest = start_release(out, manifest)
+    expect(tick, sum(_episodes_to_come(source.record, out) for source in sources))
     for source in sources:
         _import_subset(source, out, tick)
     return finish_release(out, manifest)
@@ -214,7 +216,11 @@ def _files(path: Path) -> list[Path]:
     return sorted(file for file in path.glob("*.tfrecord*") if file.is_file())
 
 
-def _import_subset(source: _Source, out: Path, tick) -> None:
+def _episodes_to_come(record: SubsetRecord, out: Path) -> int:
+    return record.episodes - sum(len(range(*commit.episodes)) for commit in read_commits(out, record).values())
+
+
+def _import_subset(source: _Source, out: Path, tick: Tick) -> None:
     record = source.record
     task = get_task(record.task)
     rows = task.max_steps + 1

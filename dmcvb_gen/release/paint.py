@@ -23,17 +23,18 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import copy_file, sha256_file, write_json
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
-from dmcvb_gen.pool import Tick, Workers, ignore, open_pool
+from dmcvb_gen.pool import Tick, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.regenerate import environment_difference
 from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.rollout.jobs import background_source
-from dmcvb_gen.rollout.painting import paint, renderers
+from dmcvb_gen.rollout.painting import frame_count, paint, renderers
 from dmcvb_gen.rollout.plan import painting_facts, subset_attributes
 from dmcvb_gen.rollout.recipe import check_size
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.index import INDEX, refuse_altered_folder
 from dmcvb_gen.store.manifest import (
     MANIFEST,
+    CommitRecord,
     Manifest,
     SubsetRecord,
     commit_path,
@@ -173,6 +174,7 @@ def paint_release(
         shards = [key for key in chosen_shards(release.manifest, only, episodes) if key[0] in release.subsets]
         todo = [key for key in shards if (c := release[key[0]].commits.get(key[1])) and not c.painted]
         studio = Studio.open(release, {name for name, _ in shards}, painter, needed={name for name, _ in todo})
+        studio.expect([release[name].commits[shard] for name, shard in todo])
     waiting: queue.SimpleQueue = queue.SimpleQueue()
     for key in [*todo, None]:
         waiting.put(key)
@@ -235,6 +237,12 @@ class Studio:
         if needed:
             manifest = _make_room(root, manifest, {name: new[name] for name in changed | needed}, changed, look)
         return cls(root, manifest, painter, sources, known, told)
+
+    def expect(self, commits: Iterable[CommitRecord]) -> None:
+        """Tell the painter's tick how many frames the shards of some commit records have."""
+        records = {record.name: record for record in self.manifest.subsets}
+        frames = (frame_count(records[c.subset], c.steps, len(range(*c.episodes))) for c in commits)
+        expect(self.painter.tick, sum(frames))
 
     def paint(self, arriving: queue.SimpleQueue) -> Iterator[tuple[str, bool, bool]]:
         """Paint shards as they come; what `paint_shard` gives of each.

@@ -8,12 +8,13 @@ without a manifest is no release, so readers never see half of one.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import (
@@ -46,7 +47,6 @@ from dmcvb_gen.store.transfer import (
 from dmcvb_gen.store.writer import read_commits
 
 CLAIM = "publishing.json"
-Tick = Callable[[int], None]
 
 
 def index_of(root: Path, manifest: Manifest) -> Index:
@@ -80,7 +80,7 @@ def publish(
     options: dict[str, Any] | None = None,
     workers: int = 8,
     take_over: bool = False,
-    tick: Tick = lambda count: None,
+    tick: Tick = ignore,
 ) -> Moved:
     """Put a complete release at a URL; run again after an interruption, it goes on.
 
@@ -111,8 +111,10 @@ def publish(
     fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
     fresh = fresh and before is None and read_object(filesystem, place, f"{base}/{INDEX}") is None
     kept = set(before or ())
+    todo = [file for file in index.files if file not in kept]
+    expect(tick, len(todo))
     results = []
-    for part in _in_order([file for file in index.files if file not in kept]):
+    for part in _in_order(todo):
         results += in_parallel(
             lambda file: upload(filesystem, place, root / file.path, f"{base}/{file.path}", file, fresh),
             part,

@@ -18,10 +18,18 @@ from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
 from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, family_of, select
-from dmcvb_gen.pool import Tick, Workers, ignore, run_all
+from dmcvb_gen.pool import Tick, Workers, expect, ignore, run_all
 from dmcvb_gen.release.shards import damage
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
-from dmcvb_gen.rollout.painting import check_renderer, exogenous_of, label_arrays, len_rows, paint, renderers
+from dmcvb_gen.rollout.painting import (
+    check_renderer,
+    exogenous_of,
+    frame_count,
+    label_arrays,
+    len_rows,
+    paint,
+    renderers,
+)
 from dmcvb_gen.rollout.plan import copy_inputs, painting_facts, subset_attributes
 from dmcvb_gen.rollout.recipe import Recipe, check_size, make_recipe
 from dmcvb_gen.rollout.site import FolderSite, leave
@@ -143,6 +151,8 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
         PaintJob(job, tuple(pairs[record.name] for record in job.subsets), tuple(request.labels))
         for job in make_jobs(manifest, todo, site, inputs, request.device)
     ]
+    commits = [(pairs[name].record, pairs[name].source.commits[shard]) for name, shard in todo]
+    expect(tick, sum(frame_count(record, commit.steps, len(range(*commit.episodes))) for record, commit in commits))
     try:
         for _ in run_all(paint_shards, jobs, workers, tick=tick):
             pass

@@ -7,13 +7,13 @@ simulated again and a sample of frames painted again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.pool import Pool, Workers, in_order, open_pool
+from dmcvb_gen.pool import Pool, Tick, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.store import Subset, open_release
@@ -71,11 +71,12 @@ class Verification:
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def check_files(root: Path, workers: Workers | Pool = 1) -> Iterator[Finding]:
+def check_files(root: Path, workers: Workers | Pool = 1, tick: Tick = ignore) -> Iterator[Finding]:
     """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`.
 
     Args:
       workers: processes, a Ray cluster that sees the folder, or an open pool.
+      tick: told the subset's name for each few shards; expects one more for each subset, whose values may follow.
     """
     try:
         with storage_errors(root / MANIFEST):
@@ -92,7 +93,8 @@ def check_files(root: Path, workers: Workers | Pool = 1) -> Iterator[Finding]:
         if index is None and manifest.digest is not None:
             yield Finding("files", INDEX, "is missing; fetch it again")
     works, checked = _works(root, manifest), set()
-    found = in_order(_check_shards, works, workers, lambda subset: None)
+    expect(tick, len(works) + len(manifest.subsets))
+    found = in_order(_check_shards, works, workers, tick)
     for record in manifest.subsets:
         commits: dict[int, CommitRecord] = {}
         for work, part in zip(works, found, strict=True):
@@ -170,9 +172,10 @@ def _works(root: Path, manifest: Manifest) -> list[_Shards]:
     ]
 
 
-def _check_shards(work: _Shards, tick: Callable[[str], None] = lambda subset: None) -> _Checked:
+def _check_shards(work: _Shards, tick: Tick = ignore) -> _Checked:
     """Commit records and their files."""
     root, record, commits, checked, findings = work.root, work.record, {}, [], []
+    tick(record.name)
     for shard in work.shards:
         path = commit_path(record.name, shard)
         if not (root / path).is_file():
@@ -199,7 +202,7 @@ def _check_digest(record: SubsetRecord, commits: Mapping[int, CommitRecord]) -> 
 def verify(
     path: str | Path,
     backgrounds: str | None = None,
-    tick: Callable[[str], None] = lambda subset: None,
+    tick: Tick = ignore,
     workers: Workers | Pool = 1,
     names: Collection[str] | None = None,
 ) -> Verification:
@@ -208,7 +211,7 @@ def verify(
     Args:
       backgrounds: where the manifest's videos are now, if they moved.
       names: the subsets whose values are looked at; all by default. Bytes are checked everywhere.
-      tick: told each subset whose values are looked at.
+      tick: told the subset's name for each few shards whose bytes, and each subset whose values, are looked at.
       workers: processes, a Ray cluster that sees the folder, or an open pool (whose tick is told): bytes are checked a
         few shards at a time, values a subset.
 
@@ -223,7 +226,7 @@ def verify(
     if not isinstance(workers, Pool):
         with open_pool(workers, tick=tick) as pool:  # one for bytes and values: its workers are slow to start
             return verify(path, backgrounds, tick, pool, names)
-    findings = list(check_files(root, workers))
+    findings = list(check_files(root, workers, tick))
     damaged = {finding.subset for finding in findings}
     counts = {"subsets": 0, "episodes": 0, "steps": 0}
     if damaged & {MANIFEST, INDEX}:
@@ -243,7 +246,7 @@ def verify(
     return Verification(counts, tuple(findings), incomplete, release.manifest.digest)
 
 
-def _check_subset(work: tuple[Subset, str | None], tick: Callable[[str], None]) -> list[Finding]:
+def _check_subset(work: tuple[Subset, str | None], tick: Tick) -> list[Finding]:
     subset, backgrounds = work
     tick(subset.name)
     try:

@@ -6,12 +6,12 @@ digests, a sample of them or all.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.fetch import Source
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.verify import Verification, subset_of
@@ -29,7 +29,7 @@ def verify_url(
     url: str,
     options: dict[str, Any] | None = None,
     everything: bool = False,
-    tick: Callable[[str], None] = lambda path: None,
+    tick: Tick = ignore,
     workers: int = WORKERS,
 ) -> Verification:
     """Check a published release where it is.
@@ -37,7 +37,7 @@ def verify_url(
     Args:
       options: of fsspec.
       everything: read all files, not a sample.
-      tick: told each file that was read.
+      tick: told 1 for each file.
       workers: files at once.
 
     Raises:
@@ -62,7 +62,8 @@ def verify_url(
             return None
         return Finding("files", subset_of(source.manifest, file.path), f"{file.path} does not have its digest")
 
-    findings += [found for found in in_parallel(look, chosen, workers, lambda _: tick("")) if found]
+    expect(tick, len(chosen))
+    findings += [found for found in in_parallel(look, chosen, workers, lambda _: tick(1)) if found]
     counts = {"subsets": 0, "episodes": 0, "steps": 0, "files": len(chosen)}
     try:
         release = open_release(url, options)

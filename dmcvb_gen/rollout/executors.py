@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from dmcvb_gen.pool import Needs, Tick, Workers, ignore, open_pool
+from dmcvb_gen.pool import Needs, Tick, Workers, expect, ignore, open_pool
 from dmcvb_gen.rollout.jobs import Job
+from dmcvb_gen.rollout.painting import frame_count
 from dmcvb_gen.rollout.site import leave
 from dmcvb_gen.rollout.worker import JobResult, run_job
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
@@ -24,7 +26,8 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: Tick = ignore) -> 
     Args:
       workers: processes, each with physics on one core; 1 works in this process, with physics on all cores; or a Ray
         cluster.
-      tick: told how many frames were painted since the last call.
+      tick: told how many frames were painted since the last call; it expects full episodes at first, and then such as
+        those that are done (mazes end early).
 
     Raises:
       StoreError: a worker was killed (often for memory); what was committed is safe.
@@ -34,12 +37,49 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: Tick = ignore) -> 
     with open_pool(workers, tick=tick, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
         for job in jobs:
             pool.submit(job, run_job, job, os.cpu_count() or 1 if alone else 1)
+        expected = _Expected(jobs)
+        expect(tick, expected.frames)
         try:
-            for _, result in pool.results():
+            for job, result in pool.results():
+                expected.done(job, result)
+                expect(tick, expected.frames)
                 yield result
         finally:
             for site in {job.site for job in jobs}:
                 leave(site)
+
+
+class _Expected:
+    """How many frames jobs paint, all in all: full episodes where none is known, then such as those that are done."""
+
+    def __init__(self, jobs: Sequence[Job]):
+        self._open: Counter = Counter()
+        self._ended: Counter = Counter()
+        self._painted: Counter = Counter()
+        for job in jobs:
+            self._open[self._kind(job)] += self._planned(job)
+
+    def done(self, job: Job, result: JobResult) -> None:
+        """A job ended: others of its task and level end as early."""
+        kind, planned, episodes = self._kind(job), self._planned(job), len(job.episodes) * len(job.subsets)
+        self._open[kind] -= planned
+        self._ended[kind] += planned
+        self._painted[kind] += round(planned * (result.steps + episodes) / (job.frames + episodes))
+
+    @property
+    def frames(self) -> int:
+        shares = {kind: self._painted[kind] / planned for kind, planned in self._ended.items()}
+        to_come = (planned * shares.get(kind, 1) for kind, planned in self._open.items())
+        return sum(self._painted.values()) + round(sum(to_come))
+
+    @staticmethod
+    def _kind(job: Job) -> tuple[str, str]:
+        return job.subsets[0].task, job.subsets[0].level
+
+    @staticmethod
+    def _planned(job: Job) -> int:
+        count = len(job.episodes)
+        return sum(frame_count(record, count * record.max_steps, count) for record in job.subsets)
 
 
 def needs_of(jobs: Sequence[Job]) -> Needs:

@@ -121,6 +121,11 @@ def exogenous_of(
     return make_exogenous(task, setting, padded, generators, backgrounds, split=record.split)
 
 
+def frame_count(record: SubsetRecord, steps: int, episodes: int) -> int:
+    """How many frames a tick is told of for some episodes of a subset: of each view, where it has pictures."""
+    return (steps + episodes) * (len(record.views) if record.pixels else 1)
+
+
 def paint(
     task: Task,
     renderer: Renderer,

@@ -12,7 +12,7 @@ from typing import Any
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
 from dmcvb_gen.names import select
-from dmcvb_gen.pool import Workers, ignore, open_pool
+from dmcvb_gen.pool import Tick, Workers, expect, ignore, open_pool
 from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.store.manifest import Manifest
@@ -131,7 +131,7 @@ def export(
     video: bool = False,
     workers: Workers = 1,
     storage_options: dict | None = None,
-    tick: Callable[[int], None] = ignore,
+    tick: Tick = ignore,
 ) -> list[Path]:
     """Write subsets in another format; each is there whole, or not at all. Run again, it goes on where it stopped.
 
@@ -170,6 +170,7 @@ def export(
         for part, folder in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
     ]
     todo = [work for work in works if not work.done]
+    expect(tick, sum(len(episodes) for work in todo for _, episodes in work.subsets))
     with open_pool(workers, tick=tick, most=len(todo)) as pool:
         for work in todo:
             pool.submit(work.folder, _write, work)
@@ -224,7 +225,7 @@ def _episodes(release: ReleaseReader, name: str, asked: tuple[int, int] | None) 
     return tuple(wanted)
 
 
-def _write(work: _Work, tick: Callable[[int], None] = ignore) -> None:
+def _write(work: _Work, tick: Tick = ignore) -> None:
     """Write one folder, whole or not at all."""
     release = open_for_reading(work.path, work.storage_options)
     sources = [Source(release, release[name], list(episodes), tick) for name, episodes in work.subsets]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.pool import ignore
+from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.export import FORMATS
 from dmcvb_gen.release.hub import client_errors, new_api, newest_of
 from dmcvb_gen.release.publish import Moved
@@ -34,7 +33,7 @@ def publish_export(
     *,
     options: dict[str, Any] | None = None,
     workers: int = 8,
-    tick: Callable[[int], None] = ignore,
+    tick: Tick = ignore,
     api: Any = None,
 ) -> Moved:
     """Put an export at a URL; run again after an interruption, it goes on.
@@ -57,6 +56,7 @@ def publish_export(
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     records = [_record(path, folder) for path in paths]
     total = sum(record.bytes for record in records)
+    expect(tick, len(records))
     if url.startswith("hf://"):
         _to_hub(folder, kind, url, api)
         tick(len(records))

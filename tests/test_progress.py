@@ -1,0 +1,108 @@
+"""Progress: a bar on a terminal and rare lines in a log, that know how much is to come; for both families."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import common, main
+from dmcvb_gen.release.paint import without_pictures
+from dmcvb_gen.store import open_release
+
+LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
+TASKS = ("walker-walk", "ant-maze-empty7x7")
+
+
+def commands(task, folder):
+    """Command lines that show a bar, in an order in which they can be run."""
+    release = folder / "made"
+    yield "rollout", task, "--episodes", "3", "--max-steps", "5", "--out", release
+    yield "rollout", task, "--episodes", "2", "--max-steps", "5", "--out", folder / "never", "--dry-run"
+    yield "rollout", task, "--episodes", "2", "--max-steps", "5", "--out", folder / "bare", "--no-pixels"
+    yield "paint", folder / "bare"
+    yield "verify", release
+    yield "regenerate", release, "--check"
+    yield "repaint", release, "--size", "32", "--out", folder / "repainted"
+    yield "publish", release, f"file:{folder / 'published'}"
+    yield "verify", f"file:{folder / 'published'}"
+    yield "fetch", f"file:{folder / 'published'}", "--out", folder / "fetched"
+    without_pictures(release, folder / "light")
+    yield "publish", folder / "light", f"file:{folder / 'published-light'}"
+    yield "fetch", f"file:{folder / 'published-light'}", "--out", folder / "painted", "--paint"
+    yield "export", release, "--to", "npz", "--out", folder / "exported"
+    yield "publish", folder / "exported", f"file:{folder / 'published-export'}"
+
+
+def errors_of(words):
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert result.exit_code == 0, (words, result.output)
+    return result.stderr
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, task):
+    monkeypatch.setattr(common, "LOG_SECONDS", 0)
+    for words in commands(task, tmp_path):
+        told = errors_of(words)
+        unknown = re.compile(r"\| 0(\.00)?/\? ")  # of a bar that was not told yet, before anything is done
+        shown = [line for line in told.splitlines() if ("%|" in line or "/?" in line) and not unknown.search(line)]
+        lines = [LINE.match(line) for line in shown]
+        assert lines and all(lines) and "\r" not in told, (words, told)
+        assert lines[-1]["done"] == lines[-1]["all"] and lines[-1]["done"].strip("0."), (words, told)
+
+
+@pytest.mark.parametrize("release", ("small_release", "small_mazes"))
+def test_a_log_gets_nothing_of_a_quick_command(request, tmp_path, release):
+    assert "%|" not in errors_of(["publish", request.getfixturevalue(release), f"file:{tmp_path}"])
+
+
+def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
+    """Experts are at the goal long before the time limit."""
+    told = []
+
+    class Told:
+        def __call__(self, frames):
+            told.append(("frames", frames))
+
+        def expect(self, frames):
+            told.append(("expected", frames))
+
+    from dmcvb_gen.rollout.executors import run_jobs
+    from dmcvb_gen.rollout.plan import make_plan, prepare
+    from dmcvb_gen.rollout.recipe import single_recipe
+
+    fields = {"episodes": 3, "episodes_per_shard": 1}
+    recipe = single_recipe(["ant-maze-empty7x7"], ["expert"], ["visible"], name="early", subset_fields=fields, size=16)
+    plan = prepare(make_plan(recipe, tmp_path / "early"))
+    list(run_jobs(plan.jobs, 1, Told()))
+    subset = open_release(tmp_path / "early")["ant-maze-empty7x7/expert/visible"]
+    expected = [frames for what, frames in told if what == "expected"]
+    frames = sum(frames for what, frames in told if what == "frames")
+    views = len(subset.record.views)
+    assert frames == expected[-1] == views * (subset.steps + 3) < expected[0] == views * 3 * 601
+    first = subset.read("length", [0])[0] + 1
+    assert expected[1] == pytest.approx(3 * views * first, abs=3)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_a_terminal_gets_a_bar(small_release):
+    import pty
+    import termios
+
+    master, slave = pty.openpty()
+    termios.tcsetwinsize(slave, (24, 100))
+    command = [sys.executable, "-m", "dmcvb_gen", "verify", str(small_release)]
+    with subprocess.Popen(command, stderr=slave, stdout=subprocess.DEVNULL) as process:
+        os.close(slave)
+        shown = b""
+        while True:
+            try:
+                shown += os.read(master, 4096)
+            except OSError:  # Linux's end of file
+                break
+    os.close(master)
+    states = shown.decode().split("\r")
+    assert process.returncode == 0 and len(states) > 2 and "100%" in states[-2] and "checks" in states[-2]
