@@ -36,8 +36,12 @@ def commands(task, folder):
     yield "publish", folder / "exported", f"file:{folder / 'published-export'}"
 
 
+def invoke(words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
 def errors_of(words):
-    result = CliRunner().invoke(main, [str(word) for word in words])
+    result = invoke(words)
     assert result.exit_code == 0, (words, result.output)
     return result.stderr
 
@@ -57,6 +61,18 @@ def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, 
 @pytest.mark.parametrize("release", ("small_release", "small_mazes"))
 def test_a_log_gets_nothing_of_a_quick_command(request, tmp_path, release):
     assert "%|" not in errors_of(["publish", request.getfixturevalue(release), f"file:{tmp_path}"])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_scores_are_told_while_other_cells_train(tmp_path, monkeypatch, task):
+    monkeypatch.setattr(common, "LOG_SECONDS", 0)
+    release, report = str(tmp_path / "made"), str(tmp_path / "report")
+    assert invoke(["rollout", task, "--episodes", "4", "--max-steps", "12", "--out", release]).exit_code == 0
+    asked = ["--profile", "smoke", "--agents", "bc,state-bc", "--train-unsound", "--out", report]
+    told = invoke(["validate", release, *asked]).output.splitlines()
+    scores = [place for place, line in enumerate(told) if "[smoke]" in line]
+    training = [place for place, line in enumerate(told) if re.match(r".*bc.*%\|", line)]
+    assert len(scores) == 2 and scores[0] < max(training), told
 
 
 def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):

@@ -73,6 +73,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
             checking=lambda name: bar.set_description(f"checking {name}"),
             total=bar.reset,
             training=lambda what, steps: (bar.set_description(what, refresh=False), bar.update(steps)),
+            done=lambda cell, facts: None if as_json else _show_score(cell, facts, setup.profile),
         )
         result = run(
             path,
@@ -91,25 +92,29 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
     context.exit(0 if result.sound and result.complete and not (strict and result.warnings) else 1)
 
 
-def _show(result, profile) -> None:
+def _show_score(cell, facts, profile) -> None:
+    """A cell's score, as soon as it is there."""
     from dmcvb_gen.names import task_folder
 
+    if "error" in facts:
+        return  # told at the end, where it is not overlooked
+    score, paper = facts["score"], facts["paper"]
+    beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if paper else ""
+    where = f"{task_folder(cell.task)} {cell.policy_label}/{cell.setting}"
+    goal = "" if score["success"] is None else f", success {100 * score['success']:.0f} %"
+    goal += "" if score["speed"] is None else f" at {score['speed']:.2f} m/s"
+    score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]"
+    with ProgressBar.external_write_mode():
+        click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
+
+
+def _show(result, profile) -> None:
     for finding in result.structure.findings[:50]:
         click.echo(f"FAIL {finding}")
     for cell, error in result.failed:
         click.echo(f"FAIL {cell.id}: {error}")
     for finding in result.warnings:
         click.echo(f"warning: {finding}")
-    for cell, facts in result.results:
-        if "error" in facts:
-            continue
-        score, paper = facts["score"], facts["paper"]
-        beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if paper else ""
-        where = f"{task_folder(cell.task)} {cell.policy_label}/{cell.setting}"
-        goal = "" if score["success"] is None else f", success {100 * score['success']:.0f} %"
-        goal += "" if score["speed"] is None else f" at {score['speed']:.2f} m/s"
-        score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]"
-        click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
     for entry in result.missing:
         if entry.subsets:
             names = ", ".join(entry.subsets)
