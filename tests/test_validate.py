@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -77,7 +78,8 @@ def test_subsets_are_checked_side_by_side_and_only_those_asked_for(whole, tmp_pa
     rewrite(folder, damaged, color)
     release, looked_at = only(open_release(folder), [damaged, other]), []
     alone, beside = check_structure(release, tick=looked_at.append), check_structure(release, workers=2)
-    assert rest and set(looked_at) == {damaged, other} and alone.checked["subsets"] == 2
+    told = Counter(looked_at)  # once for its bytes, which are checked everywhere
+    assert rest and {name for name in told if told[name] > 1} == {damaged, other} and alone.checked["subsets"] == 2
     assert {finding.subset for finding in alone.findings} == {damaged}
     assert (beside.findings, beside.warnings, beside.checked) == (alone.findings, alone.warnings, alone.checked)
 

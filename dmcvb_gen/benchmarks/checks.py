@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
-from dmcvb_gen.pool import Workers, in_order, open_pool
+from dmcvb_gen.pool import Tick, Workers, ignore, in_order, open_pool
 from dmcvb_gen.readers.painted import PaintedSubset
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.paint import drift
@@ -169,14 +169,14 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
 def check_structure(
     release: Release,
     backgrounds: str | None = None,
-    tick: Callable[[str], None] = lambda subset: None,
+    tick: Tick = ignore,
     workers: Workers = 1,
 ) -> Structure:
     """All checks of a local release, or of some of its subsets.
 
     Args:
       backgrounds: where the manifest's videos are now, if they moved.
-      tick: told the subset that is looked at.
+      tick: told the subset that is looked at: for the bytes of each few shards, for values, for labels.
       workers: processes, or a Ray cluster that sees the folder; a subset each.
 
     Raises:
@@ -198,7 +198,7 @@ def check_structure(
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)
 
 
-def _check_subset(subset: Subset, tick: Callable[[str], None]) -> tuple[list[Finding], list[Finding]]:
+def _check_subset(subset: Subset, tick: Tick) -> tuple[list[Finding], list[Finding]]:
     """What is wrong, and what is odd."""
     tick(subset.name)
     found = [*check_policy_returns(subset), *check_labels(subset), *check_pictures(subset)]
