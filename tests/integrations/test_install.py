@@ -7,9 +7,13 @@ import subprocess
 import sys
 import sysconfig
 import zipfile
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "filelock", "tenacity", "h5py")
@@ -36,6 +40,17 @@ def release(tmp_path_factory):
         [sys.executable, "-m", "dmcvb_gen", "rollout", *asked, "--out", str(out)], check=True, cwd=out.parent
     )
     return out
+
+
+def test_the_pinned_versions_are_for_every_python_3_11():
+    """One that wants a later patch than the system's has the installer search without end for another way."""
+    pins = (ROOT / "scripts" / "constraints.txt").read_text().splitlines()[1:]
+    pinned = {canonicalize_name(name): version for name, _, version in (pin.partition("==") for pin in pins)}
+    named = ((found, pinned.get(canonicalize_name(found.metadata["Name"]))) for found in distributions())
+    here = [found for found, version in named if version and Version(found.version).public == version]
+    assert len(here) > 100, "the tests' machine is not set up by scripts/setup.sh"
+    too_new = {found.name: found.metadata["Requires-Python"] for found in here}
+    assert {name: asks for name, asks in too_new.items() if not SpecifierSet(asks or "").contains("3.11.0")} == {}
 
 
 def test_the_wheel_carries_every_data_file(wheel):
