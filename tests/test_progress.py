@@ -106,7 +106,6 @@ def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
     assert expected[1] == pytest.approx(3 * views * first, abs=3)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
 def test_a_terminal_gets_a_bar(small_release):
     import pty
     import termios
