@@ -11,6 +11,9 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import common, main
 from dmcvb_gen.release.paint import without_pictures
+from dmcvb_gen.rollout.executors import run_jobs
+from dmcvb_gen.rollout.plan import make_plan, prepare
+from dmcvb_gen.rollout.recipe import single_recipe
 from dmcvb_gen.store import open_release
 
 LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
@@ -88,10 +91,6 @@ def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
 
         def expect(self, frames):
             told.append(("expected", frames))
-
-    from dmcvb_gen.rollout.executors import run_jobs
-    from dmcvb_gen.rollout.plan import make_plan, prepare
-    from dmcvb_gen.rollout.recipe import single_recipe
 
     fields = {"episodes": 3, "episodes_per_shard": 1}
     recipe = single_recipe(["ant-maze-empty7x7"], ["expert"], ["visible"], name="early", subset_fields=fields, size=16)

@@ -164,7 +164,7 @@ def _run(plan, workers, as_json, whole=True):
     with _told_when_stopped(), _progress(plan, as_json) as bar:
         finished = 0
         for result in run_jobs(plan.jobs, workers, bar):
-            finished += sum(commit.episodes[1] - commit.episodes[0] for commit in result.commits)
+            finished += sum(commit.episode_count for commit in result.commits)
             steps += result.steps
             for part, value in result.seconds.items():
                 seconds[part] = seconds.get(part, 0.0) + value

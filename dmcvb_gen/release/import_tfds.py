@@ -217,7 +217,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _episodes_to_come(record: SubsetRecord, out: Path) -> int:
-    return record.episodes - sum(len(range(*commit.episodes)) for commit in read_commits(out, record).values())
+    return record.episodes - sum(commit.episode_count for commit in read_commits(out, record).values())
 
 
 def _import_subset(source: _Source, out: Path, tick: Tick) -> None:

@@ -241,7 +241,7 @@ class Studio:
     def expect(self, commits: Iterable[CommitRecord]) -> None:
         """Tell the painter's tick how many frames the shards of some commit records have."""
         records = {record.name: record for record in self.manifest.subsets}
-        frames = (frame_count(records[c.subset], c.steps, len(range(*c.episodes))) for c in commits)
+        frames = (frame_count(records[c.subset], c.steps, c.episode_count) for c in commits)
         expect(self.painter.tick, sum(frames))
 
     def paint(self, arriving: queue.SimpleQueue) -> Iterator[tuple[str, bool, bool]]:

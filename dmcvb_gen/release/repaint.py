@@ -152,7 +152,7 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
         for job in make_jobs(manifest, todo, site, inputs, request.device)
     ]
     commits = [(pairs[name].record, pairs[name].source.commits[shard]) for name, shard in todo]
-    expect(tick, sum(frame_count(record, commit.steps, len(range(*commit.episodes))) for record, commit in commits))
+    expect(tick, sum(frame_count(record, commit.steps, commit.episode_count) for record, commit in commits))
     try:
         for _ in run_all(paint_shards, jobs, workers, tick=tick):
             pass

@@ -78,6 +78,10 @@ class CommitRecord(_Model):
     painted: bool = True
     pictures: tuple[FileRecord, ...] = ()
 
+    @property
+    def episode_count(self) -> int:
+        return self.episodes[1] - self.episodes[0]
+
     def same_data(self, other: CommitRecord) -> bool:
         """Whether both stand for the same bytes, wherever they were made."""
         return self.model_copy(update={"environment": {}}) == other.model_copy(update={"environment": {}})
