@@ -340,6 +340,15 @@ def test_an_unknown_option_is_refused_with_the_known_ones(name):
         parse_agent(name)
 
 
+@pytest.mark.parametrize("name, cure", [
+    ("bc:k=5", "id\\+bc:k=5"), ("lfd+bc:k=10,sample", "leave them out"), ("state-bc:k=3", "leave them out"),
+    ("state-bc:frames=1", "not stacked"), ("id+bc:sample", "k=2 or more"),
+])  # fmt: skip
+def test_an_option_that_an_agent_does_not_hear_is_refused(name, cure):
+    with pytest.raises(DmcvbError, match=cure):
+        parse_agent(name)
+
+
 # -- DINO -----------------------------------------------------------------------------------------
 
 

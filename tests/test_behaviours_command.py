@@ -65,6 +65,16 @@ def test_paths_of_a_maze_are_painted(tmp_path):
     assert [path.name for path in (tmp_path / "p").iterdir()] == ["ant-maze-easy7x7a.png"]
 
 
+def test_what_goes_unheard_or_is_not_there_is_refused_before_any_work(tmp_path):
+    for arguments, words in (
+        (["evaluate-behaviour", "walker-walk", "--pictures", tmp_path / "p"], "and walker-walk is none"),
+        (["train-behaviour", "walker-walk", "--resume", "--out", tmp_path / "none"], "holds no run to go on with"),
+    ):
+        result = CliRunner().invoke(main, [*map(str, arguments)])
+        assert result.exit_code == 2 and words in result.output and result.output.count("\n") == 1, result.output
+    assert not list(tmp_path.iterdir())
+
+
 def evaluated(*arguments):
     result = CliRunner().invoke(main, ["evaluate-behaviour", *map(str, arguments)])
     assert result.exit_code == 0, result.output

@@ -18,7 +18,7 @@ from dmcvb_gen.agents.data import (
     normalize_pixels,
     training_views,
 )
-from dmcvb_gen.benchmarks.cells import train_settings
+from dmcvb_gen.benchmarks.cells import _DataCache, train_settings
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
@@ -92,6 +92,11 @@ def test_b2_learns_encoders_from_mixed_and_policies_from_twenty_expert_episodes(
     assert labels == {("bc", "expert", "none")} | {
         ("bc", label, setting) for label in ("20 expert", "20 expert+mixed") for setting in ("none", "dynamic")
     }
+
+
+def test_b2_names_as_many_episodes_as_there_are():
+    cells, _ = plan_benchmark("b2", release_of("walker-walk/expert/none", "walker-walk/mixed/none", episodes=10))
+    assert {cell.policy_label for cell in cells} == {"expert", "10 expert", "10 expert+mixed"}
 
 
 def test_b2_without_mixed_says_how_to_make_it():
@@ -407,10 +412,12 @@ def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_releas
     assert "error" not in result and not log.exists()
 
 
-def compared(task, pairs, benchmark="b1"):
+def compared(task, pairs, benchmark="b1", setting="x"):
     """What `compare` says of agents' mean scores."""
-    part = (Part(f"{task}/expert/x"),)
-    results = [(Cell(benchmark, task, "x", parse_agent(name), part), {"score": {"mean": mean}}) for name, mean in pairs]
+    part = (Part(f"{task}/expert/{setting}"),)
+    results = [
+        (Cell(benchmark, task, setting, parse_agent(name), part), {"score": {"mean": mean}}) for name, mean in pairs
+    ]
     return {cell.agent.name: compare(cell, results) for cell, _ in results}
 
 
@@ -421,6 +428,36 @@ def test_a_negative_return_is_set_beside_its_reference_by_the_difference():
     assert walker["share"] == 0.5
     fixed = compared(MAZE, [("bc", -60.0), ("id+bc", -45.0)], "b3")["id+bc"]
     assert fixed["difference"] == 15.0 and fixed["reference"] == "BC on these episodes"
+
+
+def test_ablations_are_set_beside_bc_on_all_of_the_expert_without_distractors():
+    frames = compared("walker-walk", [("bc", 800.0), ("bc:frames=1", 400.0)], "ablations", "none")["bc:frames=1"]
+    assert (frames["share"], frames["reference"]) == (0.5, "BC on all of expert/none")
+    maze = compared(MAZE, [("bc", -60.0), ("id+bc:k=5", -45.0)], "ablations", "visible")["id+bc:k=5"]
+    assert (maze["difference"], maze["reference"]) == (15.0, "BC on all of expert/visible")
+
+
+def test_a_cells_seconds_are_those_of_all_its_sessions(small_release, tmp_path, monkeypatch):
+    points = [{"step": 10, "score": {"mean": 1.0, "seconds": 20.0}, "seconds": 100.0}]
+    monkeypatch.setattr("dmcvb_gen.benchmarks.cells.train", lambda *args, **options: points)  # the rest was made before
+    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    [(_, result)] = list(run_cells(Setup(str(small_release), str(tmp_path), PROFILES["smoke"]), cells))
+    seconds = result["seconds"]
+    assert (seconds["training"], seconds["evaluation"]) == (80, 20) and seconds["all"] >= 100
+    assert result["steps_per_second"] == PROFILES["smoke"].state_steps / 80
+
+
+def test_data_that_grew_or_look_otherwise_are_read_again(small_release):
+    release, part = open_release(small_release), (Part("walker-walk/random/none"),)
+    setup, cache = Setup(str(small_release), "out", PROFILES["smoke"]), _DataCache()
+    subset = release[part[0].subset]
+    half = Subset(subset.root, subset.record, {0: subset.commits[0]}, {})
+    less = Release(release.root, release.manifest, {subset.name: half})
+    assert [len(cache.get(setup, one, part, False, 3).lengths) for one in (less, less, release)] == [2, 2, 3]
+    before = cache._data
+    assert cache.get(setup, release, part, False, 3) and cache._data is before
+    cache.get(dataclasses.replace(setup, backgrounds="elsewhere"), release, part, False, 3)
+    assert cache._data is not before
 
 
 def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():

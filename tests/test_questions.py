@@ -16,7 +16,8 @@ def result(agent, setting, returns, *, benchmark="b1", learns="expert", encoder=
     """A result as `report.json` has it, with what questions are asked of."""
     cell = {"benchmark": benchmark, "task": "walker-walk", "setting": setting, "agent_name": agent}
     cell |= {"policy_label": learns, "pretrain_label": encoder}
-    return {"cell": cell, "score": {"returns": returns}, "data": {"mean": data}, "profile": {"scores": scores}, **more}
+    facts = {"cell": cell, "score": {"returns": returns, "limit": 500}, "data": {"mean": data, "limit": 500}}
+    return facts | {"profile": {"scores": scores}, "episodes": 3, "seed": 0, "digests": {"one": "d1"}} | more
 
 
 def near(mean):
@@ -40,7 +41,21 @@ def test_states_near_their_data():
     assert answers_of(result("state-bc", "none", near(97)))[where] == "yes"
     assert answers_of(result("state-bc", "none", near(80)))[where] == "no"
     assert answers_of(result("state-bc", "none", [20.0, 160.0, 90.0]))[where] == "open"  # 10 below, but 40 uncertain
-    assert answers_of(result("state-bc", "none", near(-104), data=-100.0))[where] == "yes"
+    assert answers_of(result("state-bc", "none", near(-101), data=-100.0))[where] == "yes"
+
+
+@pytest.mark.parametrize("mean, error, answer", [(902, 15, "open"), (880, 30, "open"), (905, 40, "open"),
+                                                 (935, 10, "yes"), (870, 10, "no")])  # fmt: skip
+def test_the_edge_of_near_counts_from_two_errors_on(mean, error, answer):
+    returns = [mean - error * 3**0.5, mean, mean + error * 3**0.5]  # whose mean has that standard error
+    found = ask([result("state-bc", "none", returns, data=950.0)])
+    assert [one.answer for one in found if one.question == "state"] == [answer]
+
+
+def test_returns_of_episodes_cut_elsewhere_are_not_compared_with_their_data():
+    cut_at_twice_that = {"score": {"returns": near(-80), "limit": 1200}}
+    [answer] = ask([result("state-bc", "visible", [], data=-100.0, **cut_at_twice_that)])
+    assert answer.answer == "open" and "cut at other lengths" in answer.numbers
 
 
 def test_id_is_compared_with_pictures_alone_and_not_without_distractors():
@@ -97,23 +112,30 @@ def write(folder, profile, *results, release="walkers"):
     folder.mkdir()
     marked = [one | {"fingerprint": f"{folder}, {index}"} for index, one in enumerate(results)]
     facts = {"profile": {"name": profile}, "results": marked, "release": {"name": release, "version": "1.0.0"}}
+    facts |= {"settings": {"seed": 0}}
     (folder / "report.json").write_text(json.dumps(facts))
     return str(folder)
 
 
 def test_command(tmp_path):
-    both = [write(tmp_path / str(i), "quick", result("state-bc", "none", near(96 + i))) for i in (0, 1)]
+    both = [write(tmp_path / str(i), "quick", result("state-bc", "none", near(98 + i), seed=i)) for i in (0, 1)]
     shown = CliRunner().invoke(main, ["questions", *both])
-    assert shown.exit_code == 0 and "seeds: 96.0, 97.0" in shown.output and "  yes  walker-walk expert" in shown.output
+    assert shown.exit_code == 0 and "seeds: 98.0, 99.0" in shown.output and "  yes  walker-walk expert" in shown.output
     facts = json.loads(CliRunner().invoke(main, ["questions", *both, "--json"]).output)
-    assert facts["scores"][0]["seeds"] == [96, 97] and facts["answers"][0]["answer"] == "yes"
+    assert facts["scores"][0]["seeds"] == [98, 99] and facts["answers"][0]["answer"] == "yes"
     assert len(read_reports([*both, both[0]])) == 2  # a report that is named twice is no second seed
     other = write(tmp_path / "other", "paper", result("state-bc", "none", near(97)))
     elsewhere = write(tmp_path / "elsewhere", "quick", result("bc", "none", near(1)), release="cheetahs")
     assert len(read_reports([*both, elsewhere])) == 3
-    data = write(tmp_path / "data", "quick", result("state-bc", "none", near(97)), release="cheetahs")
-    with pytest.raises(DmcvbError, match="different data are no two seeds: cheetahs 1.0.0, walkers 1.0.0"):
+    data = write(tmp_path / "data", "quick", result("state-bc", "none", near(97), seed=2), release="cheetahs")
+    with pytest.raises(DmcvbError, match="different data are no two seeds: cheetahs 1.0.0, 3 episodes; walkers 1.0.0"):
         read_reports([*both, data])
+    grown = write(tmp_path / "grown", "quick", result("state-bc", "none", near(97), seed=2, digests={"one": "d2"}))
+    with pytest.raises(DmcvbError, match="no two seeds: walkers 1.0.0, digest d1; walkers 1.0.0, digest d2"):
+        read_reports([*both, grown])
+    again = write(tmp_path / "again", "quick", result("state-bc", "none", near(97), seed=1))
+    with pytest.raises(DmcvbError, match=r"walker-walk expert, none twice with seed 1, in .*1, .*again; a second"):
+        read_reports([*both, again])
     refused = CliRunner().invoke(main, ["questions", *both, other])
     assert refused.exit_code == 2 and "different profiles" in refused.output and refused.output.count("\n") == 1
 

@@ -164,6 +164,8 @@ def test_a_maze_medium_is_nearest_to_the_papers_row():
         picked[task_id] = goal
     assert picked == {"ant-maze-empty7x7": -172.2, "ant-maze-easy7x7b": -131.1, "ant-maze-medium7x7c": -176.0}
     assert medium_return("walker-walk") is None and medium_return("ant-maze-mine:***/*.*/***") is None
+    for other in ("ant-maze-medium:***/*.*/***", "ant-maze-empty7x7@geodesic"):  # the user's own, and another reward
+        assert medium_return(other) is None
     high = [point for point in curve if point[1] > -120]
     found = pick_checkpoints(high, -450.0, converge(STEPS, returns), measure, levels=MAZE_LEVELS, medium=-176.0)
     assert "-176.0 +- 35.2" in found.reasons["medium"]

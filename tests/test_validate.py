@@ -190,7 +190,14 @@ def test_many_histograms_and_learning_curves_stand_in_several_figures(release, s
     cell = plan_benchmark("b1", open_release(release), ["bc"])[0][0]
     point = {"step": 1, "loss": 1.0, "score": {"mean": 1.0, "stderr": 0.1}}
     cells = [dataclasses.replace(cell, setting=f"setting{number}") for number in range(2 * CURVE_LINES + 1)]
-    figures = list(curve_figures([(cell, {"curve": [point], "data": {"mean": 1.0}}) for cell in cells], "smoke"))
+    data = {"mean": 1.0, "limit": 500}
+    results = [
+        (cell, {"curve": [point], "data": data, "score": {"limit": 500 + number}}) for number, cell in enumerate(cells)
+    ]
+    figures = list(curve_figures(results, "smoke"))
+    lines = [axis.get_lines() for figure in figures for axis in figure.axes if "return" in axis.get_title()]
+    labels = [[line.get_label() for line in drawn] for drawn in lines]
+    assert ["data" in drawn for drawn in labels] == [True] + (len(cells) - 1) * [False]  # only of like episodes
     assert [len(figure.axes) for figure in figures] == [2 * CURVE_LINES, 2 * CURVE_LINES, 2]
 
 
@@ -212,6 +219,10 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--agents", "bcc"), "state-bc"),
         ((release, "--benchmark", "b9"), "ablations"),
         ((release, "--benchmark", "b3"), "--fixed-goals"),
+        ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; leave it out"),
+        ((release, "--agents", "bc:k=5"), "leave them out"),
+        ((release, "--checks-only", "--agents", "bc"), "--checks-only trains nothing; leave out --agents"),
+        ((release, "--checks-only", "--benchmark", "b2"), "leave out --benchmark"),
         ((release, "--only", "cheetah-run/*"), NAME),
         ((tmp_path,), "no release"),
     ):
@@ -355,6 +366,11 @@ def test_returns_unlike_the_policys_own_fail(release):
     [finding] = check_policy_returns(with_policy(subset, mean=5000.0, std=5.0, mode="mean"))
     assert finding.check == "returns" and "its file says 5000.0" in finding.message
     assert not list(check_policy_returns(with_policy(subset, mode="sampled")))  # not comparable
+    elsewhere = with_policy(subset, mode="mean")
+    [policy] = elsewhere.record.policies
+    policies = (policy.model_copy(update={"header": policy.header | {"task": "cheetah-run"}}),)
+    elsewhere.record = elsewhere.record.model_copy(update={"policies": policies})
+    assert not list(check_policy_returns(elsewhere))  # an ant's policy walks in mazes that it was not measured in
 
 
 def test_returns_unlike_the_papers_are_a_warning(release, small_release):

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from dmcvb_gen.agents.data import Source, load_data
+from dmcvb_gen.benchmarks.cells import data_score
 from dmcvb_gen.benchmarks.checks import check_labels, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.cli import main
@@ -54,7 +56,7 @@ def test_a_look_that_is_no_look_of_the_maze_is_found(release):
 
 def test_episodes_of_fixed_goals_are_not_held_to_returns_over_random_ones(release):
     said = {"mean": -1.0, "std": 0.1, "episodes": 100, "mode": "sampled"}
-    policy = PolicyRecord(name="other", digest="x", header={"evaluation": said})
+    policy = PolicyRecord(name="other", digest="x", header={"task": TINY, "evaluation": said})
     found = {}
     for setting in ("visible", "fixed"):
         subset = open_release(release)[f"{NAME}/{setting}"]
@@ -93,18 +95,26 @@ def test_a_maze_release_goes_through_b1_and_b3(report):
     assert "ant-maze-tiny/expert/visible" in result.output  # B1 would have the paper's levels too
 
 
+def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(release):
+    subset, task = open_release(release)[f"{NAME}/visible"], get_task(TINY)
+    data = load_data([Source(subset)], pixels=False, seed=0)
+    first, ends = np.cumsum(data.lengths + 1) - data.lengths - 1, np.cumsum(data.lengths + 1) - 1
+    data.discount[ends - 1] = 0  # as if the ant had got there
+    state = data.state[first].numpy() * data.normalization.std.numpy() + data.normalization.mean.numpy()
+    assert state == pytest.approx(subset.read("state")[:, 0], abs=1e-4)
+    straight = np.linalg.norm(subset.read("state")[:, 0, task.state_slices["target_vector"]], axis=1)
+    score = data_score(subset, data)
+    assert score.success == 1
+    assert score.speed == pytest.approx((straight / (data.lengths * 2 * task.control_timestep)).mean(), rel=1e-4)
+
+
 def test_maze_scores_have_reward_success_and_speed_beside_the_datas_own(report, release):
     facts = json.loads((report[0] / "report.json").read_text())
     [score] = [r for r in facts["results"] if r["cell"]["agent_name"] == "state-bc"]
-    subset, task = open_release(release)[f"{NAME}/visible"], get_task(TINY)
+    subset = open_release(release)[f"{NAME}/visible"]
     reached = subset.read("terminated")
     assert score["data"]["success"] == reached.mean() and score["data"]["limit"] == subset.record.max_steps
-    if reached.any():
-        away = subset.read("state")[:, 0, task.state_slices["distance_to_target"]][:, 0]
-        speed = (away / (subset.lengths * 2 * task.control_timestep))[reached].mean()
-        assert score["data"]["speed"] == pytest.approx(speed, rel=1e-4)
-    else:
-        assert score["data"]["speed"] is None
+    assert (score["data"]["speed"] is None) == (not reached.any())
     assert score["score"]["success"] is not None and score["score"]["limit"] == 10  # smoke's
     page = (report[0] / "report.html").read_text()
     assert "success" in page and "Evaluations are cut at 10 agent steps" in page

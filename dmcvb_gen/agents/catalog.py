@@ -85,7 +85,7 @@ def parse_agent(name: str) -> Agent:
     """The agent of a name.
 
     Raises:
-      UnknownNameError, DmcvbError: no such agent or option.
+      UnknownNameError, DmcvbError: no such agent or option, or one that this agent has no use for.
     """
     base, _, options = name.strip().lower().partition(":")
     base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
@@ -100,10 +100,23 @@ def parse_agent(name: str) -> Agent:
             values["stack" if key == "frames" else "k"] = int(value)
         else:
             raise DmcvbError(f"agent {name!r}: {option!r} is not an option; known: frames=1..64, k=1..64, sample")
-    pretrain, plus, policy = base.rpartition("+")
     if base.startswith("state-"):
-        return Agent(base.removeprefix("state-"), sees_state=True, **values)
-    return Agent(policy, pretrain if plus else None, **values)
+        agent = Agent(base.removeprefix("state-"), sees_state=True, **values)
+    else:
+        pretrain, plus, policy = base.rpartition("+")
+        agent = Agent(policy, pretrain if plus else None, **values)
+    _check_heard(agent, name)
+    return agent
+
+
+def _check_heard(agent: Agent, name: str) -> None:
+    """Refuse options that would make another name of the same training."""
+    if agent.sees_state and agent.stack != FRAMES:
+        raise DmcvbError(f"agent {name!r}: states are not stacked; leave frames=... out")
+    if agent.pretrain != "id" and (agent.k != 1 or agent.sample_k):
+        raise DmcvbError(f"agent {name!r}: k and sample are of inverse dynamics (id+bc:k=5); leave them out")
+    if agent.sample_k and agent.k == 1:
+        raise DmcvbError(f"agent {name!r}: sample draws k from 1 to a largest one; give it, k=2 or more")
 
 
 def make_encoder(

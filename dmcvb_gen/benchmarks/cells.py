@@ -31,6 +31,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json
 from dmcvb_gen.pool import ignore
 from dmcvb_gen.store import Release, Subset
+from dmcvb_gen.store.writer import subset_digest
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
@@ -45,7 +46,8 @@ class _DataCache:
         self._key, self._data = None, None
 
     def get(self, setup: Setup, release: Release, parts: Sequence[Part], pixels: bool, stack: int) -> TrainingData:
-        key = (setup.root, setup.seed, tuple(parts), setup.device, setup.memory)
+        digests = tuple(subset_digest(release[part.subset].commits) for part in parts)  # a release may have grown
+        key = (setup.root, setup.seed, tuple(parts), digests, setup.backgrounds, setup.device, setup.memory)
         if self._key is None or self._key[0] != key or (pixels and not self._key[1]):
             self._key = self._data = None  # free the old pictures before new ones are read
             sources = [Source(release[p.subset], p.share, p.episodes, p.goal_pair) for p in parts]
@@ -99,7 +101,6 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: Tick = ignore) -> dic
     encoder = make_encoder(work.agent, data, architecture=network)
     learner = make_pretrainer(work.agent, encoder, data, network).to(setup.device)
     folder = setup.encoders / f"{work.id}.{mark[:12]}.run"
-    started = time.perf_counter()
     curve = train(
         learner,
         data,
@@ -110,7 +111,7 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: Tick = ignore) -> dic
     )
     with replacing(weights_path) as path:
         save_file({name: value.cpu().contiguous() for name, value in encoder.state_dict().items()}, str(path))
-    facts = {"fingerprint": mark, "curve": curve, "seconds": time.perf_counter() - started}
+    facts = {"fingerprint": mark, "curve": curve, "seconds": curve[-1]["seconds"]}
     write_json(facts_path, facts)
     _clear(folder)
     return facts
@@ -155,14 +156,17 @@ def run_cell(setup: Setup, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:
     curve, trained = _train_policy(setup, cell, subset, data, policy, folder, tick)
     inspected = time.perf_counter()
     inspection = inspect(setup, policy.encoder, data, cell, tick) if pixels and setup.profile.readout_steps else None
-    evaluating = sum(point["score"]["seconds"] for point in curve if "score" in point)
+    ended, evaluating = time.perf_counter(), sum(point["score"]["seconds"] for point in curve if "score" in point)
+    before_stop = max(0.0, curve[-1]["seconds"] - trained)
     seconds = {
-        "training": trained - evaluating,
+        "training": curve[-1]["seconds"] - evaluating,
         "evaluation": evaluating,
-        "inspection": time.perf_counter() - inspected,
-        "all": time.perf_counter() - started,
+        "inspection": ended - inspected,
+        "all": before_stop + ended - started,
     }
-    result = {"fingerprint": mark} | _facts(setup, cell, subset, data, curve, seconds)
+    digests = {name: subset_digest(release[name].commits) for name in cell.subsets}
+    result = {"fingerprint": mark, "seed": setup.seed, "digests": digests}
+    result |= _facts(setup, cell, subset, data, curve, seconds)
     result["pretraining"] = pretrained and {key: pretrained[key] for key in ("curve", "seconds")}
     result["inspection"] = inspection
     write_json(path, result)
@@ -181,7 +185,7 @@ def _make_policy(setup: Setup, cell: Cell, before: Pretraining | None, data: Tra
 def _train_policy(
     setup: Setup, cell: Cell, subset: Subset, data: TrainingData, policy: Policy, folder: Path, tick: Tick
 ) -> tuple[Curve, float]:
-    """Train a cell's policy, with its online evaluations; gives the curve and the seconds of both."""
+    """Train a cell's policy, with its online evaluations; gives the curve and the seconds since it was last stopped."""
     profile, pixels, pair = setup.profile, not cell.agent.sees_state, cell.policy[0].goal_pair
     evaluator = Evaluator(
         subset,
@@ -270,12 +274,13 @@ def data_score(subset: Subset, data: TrainingData) -> DataScore:
     """The score of training data, in the measures that policies are scored in."""
     task = get_task(subset.task)
     success = speed = None
-    part = task.state_slices.get("distance_to_target")
+    part = task.state_slices.get("target_vector")
     if part is not None:
         ends = np.cumsum(data.lengths + 1) - 1
         first = torch.as_tensor(ends - data.lengths, device=data.device)
-        normal, column = data.normalization, part.start
-        distance = (data.state[first, column].cpu() * normal.std[column].cpu() + normal.mean[column].cpu()).numpy()
+        normal = data.normalization
+        to_goal = data.state[first][:, part].cpu() * normal.std[part].cpu() + normal.mean[part].cpu()
+        distance = to_goal.norm(dim=1).numpy()
         reached = (data.discount[torch.as_tensor(ends - 1, device=data.device)] == 0).cpu().numpy()
         success, speed = float(reached.mean()), goal_speed(distance, data.lengths, reached, task)
     return DataScore(float(data.returns.mean()), success, speed, subset.record.max_steps)

@@ -58,8 +58,8 @@ class Structure:
 def check_policy_returns(subset: Subset) -> Iterator[Finding]:
     """Each policy's episodes return what its file says it returned when it was evaluated.
 
-    That was over random starts and goals and the task's own time limit: episodes of fixed ones, or of other length,
-    return what those are worth.
+    That was over random starts and goals, in the policy's own maze, with the task's own time limit: episodes of fixed
+    ones, in other mazes or of other length return what those are worth.
     """
     if not _comparable(subset):
         return
@@ -67,7 +67,7 @@ def check_policy_returns(subset: Subset) -> Iterator[Finding]:
     for index, policy in enumerate(subset.record.policies):
         said, returns = policy.header.get("evaluation"), subset.returns[behaviour == index]
         mode = "mean" if subset.record.deterministic else "sampled"
-        if not said or not len(returns) or said["mode"] != mode:
+        if not said or not len(returns) or said["mode"] != mode or policy.header.get("task") != subset.task:
             continue
         spread = max(said["std"], float(returns.std()))
         tolerance = STANDARD_ERRORS * spread * math.sqrt(1 / len(returns) + 1 / said["episodes"])

@@ -100,7 +100,7 @@ def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, ta
     """Mean speed towards the goal of the episodes that reached it, m/s; None where none did.
 
     Args:
-      distance: (episode,) to the goal at the start, as the task measures it, meters.
+      distance: (episode,) to the goal at the start in a straight line, meters.
       length: (episode,) agent steps. reached: (episode,) bool.
     """
     seconds = length * ACTION_REPEAT * task.control_timestep

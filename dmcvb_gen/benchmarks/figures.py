@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.tables import Cell
-from dmcvb_gen.names import task_folder
+from dmcvb_gen.names import FIXED, task_folder
 from dmcvb_gen.store import Release
 
 DPI = 110
@@ -64,7 +64,7 @@ def _return_figure(release: Release, names: Sequence[str]) -> Figure:
         axis.set_title(shown, fontsize=9)
         axis.set(xlabel="return", ylabel="episodes")
         axis.yaxis.set_major_locator(MaxNLocator(integer=True))
-        paper = paper_returns(subset.task, subset.level)
+        paper = None if subset.setting == FIXED else paper_returns(subset.task, subset.level)
         if paper:
             low = -0.12 * axis.get_ylim()[1]
             axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)
@@ -91,13 +91,14 @@ def _curve_figure(groups: Sequence[Sequence], colors: Mapping[str, str], profile
         loss, score = (figure.add_subplot(len(groups), 2, 2 * line + column) for column in (1, 2))
         for cell, result in members:
             _draw_curve(loss, score, label_of(cell), colors[label_of(cell)], result["curve"])
-        data = members[0][1]["data"]["mean"]
-        score.axhline(data, color="gray", linestyle="--", linewidth=1, label="data")
+        evaluated, data = members[0][1]["score"], members[0][1]["data"]
+        if evaluated["limit"] == data["limit"]:  # else their returns cannot be compared
+            score.axhline(data["mean"], color="gray", linestyle="--", linewidth=1, label="data")
         loss.set(
             title=f"{place_of(members[0][0])}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log"
         )
         score.set(title=f"online return [{profile}]", xlabel="Adam step")
-        if data > 0:
+        if data["mean"] > 0:
             score.set_ylim(bottom=0)
         for axis in (loss, score):
             axis.title.set_fontsize(9)

@@ -46,12 +46,14 @@ class Pooled:
     Attributes:
       mean, stderr: of the returns. seeds: each seed's mean.
       data: mean return of what the policy learned from.
+      like_data: the policy's episodes were cut where the data's were, so that their returns can be compared.
     """
 
     mean: float
     stderr: float
     seeds: tuple[float, ...]
     data: float
+    like_data: bool = True
 
     def __str__(self) -> str:
         return f"{self.mean:.1f} +- {self.stderr:.1f}"
@@ -80,11 +82,13 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     """The results of reports (folders that `validate` wrote), each once.
 
     Raises:
-      DmcvbError: there is no report, or two were made with different profiles, or one cell of theirs of different data.
+      DmcvbError: there is no report, or two were made with different profiles, or one cell of theirs of different data
+        or twice of one seed.
     """
     results: dict[str, dict[str, Any]] = {}
     profiles: dict[str, str | Path] = {}
-    releases: dict[Place, set[str]] = {}
+    data: dict[tuple[Place, str], set[str]] = {}
+    seeds: dict[tuple[Place, int], dict[str, str | Path]] = {}
     for folder in folders:
         path = Path(folder) / "report.json"
         try:
@@ -93,15 +97,27 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
             profiles[facts["profile"]["name"]] = folder
             for result in facts["results"]:
                 results[result["fingerprint"]] = result
-                releases.setdefault(_place(result), set()).add(release)
+                place = _place(result)
+                data.setdefault((place, "size"), set()).add(f"{release}, {result['episodes']} episodes")
+                if "digests" in result:  # those of earlier versions have none
+                    digests = ", ".join(digest[:12] for digest in result["digests"].values())
+                    data.setdefault((place, "digests"), set()).add(f"{release}, digest {digests}")
+                seed = result.get("seed", facts["settings"]["seed"])
+                seeds.setdefault((place, seed), {})[result["fingerprint"]] = folder
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DmcvbError(f"cannot read {path} ({type(error).__name__}); dmcvb-gen validate writes it") from None
     if len(profiles) > 1:
         named = ", ".join(f"{folder} ({profile})" for profile, folder in profiles.items())
         raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")
-    mixed = next((names for names in releases.values() if len(names) > 1), None)
+    mixed = next((names for names in data.values() if len(names) > 1), None)
     if mixed:
-        raise DmcvbError(f"scores of one cell on different data are no two seeds: {', '.join(sorted(mixed))}")
+        raise DmcvbError(f"scores of one cell on different data are no two seeds: {'; '.join(sorted(mixed))}")
+    twice = next(((key, named) for key, named in seeds.items() if len(named) > 1), None)
+    if twice:
+        ((place, seed), named) = twice
+        folders = ", ".join(map(str, dict.fromkeys(named.values())))
+        what = f"{place.agent} on {place.task} {place.learns_from}, {place.setting}"
+        raise DmcvbError(f"{what} twice with seed {seed}, in {folders}; a second seed is --seed 1")
     return list(results.values())
 
 
@@ -125,7 +141,8 @@ def _pool(results: Sequence[Mapping[str, Any]]) -> Pooled:
     within = returns.std(ddof=1) / math.sqrt(len(returns)) if len(returns) > 1 else math.inf
     between = seeds.std(ddof=1) / math.sqrt(len(seeds)) if len(seeds) > 1 else 0.0
     data = float(np.mean([result["data"]["mean"] for result in results]))
-    return Pooled(float(returns.mean()), float(max(within, between)), tuple(seeds.tolist()), data)
+    like_data = all(result["score"].get("limit") == result["data"].get("limit") for result in results)
+    return Pooled(float(returns.mean()), float(max(within, between)), tuple(seeds.tolist()), data, like_data)
 
 
 def _judge(more: Pooled, less: Pooled) -> tuple[str, str]:
@@ -166,10 +183,11 @@ def _order(scores: Scores) -> Iterator[Answer]:
 def _state(scores: Scores) -> Iterator[Answer]:
     for place, score in scores.items():
         if place.benchmark == "b1" and place.agent == "state-bc":
-            away = abs(score.mean - score.data)
-            near = away <= NEAR * abs(score.data)
-            answer = YES if near else NO if away > ERRORS * score.stderr else OPEN
+            within = NEAR * abs(score.data) - abs(score.mean - score.data)
+            answer = OPEN if abs(within) < ERRORS * score.stderr else YES if within > 0 else NO
             numbers = f"{score}, data {score.data:.1f}; difference {score.mean - score.data:+.1f}"
+            if not score.like_data:
+                answer, numbers = OPEN, f"{numbers}, of episodes that were cut at other lengths"
             yield Answer("state", f"{place.task} {place.learns_from}", answer, numbers)
 
 

@@ -146,11 +146,12 @@ def plan_benchmark(
 
     Args:
       name: one of `BENCHMARKS`.
-      agents: names instead of the benchmark's own.
+      agents: names instead of the benchmark's own. B2 and B3 compare encoders: of these, they take those that have one
+        of their own, beside BC without.
       left_out: subsets that are there but that the user left out of `release`.
 
     Raises:
-      UnknownNameError: no such benchmark or agent.
+      DmcvbError: no such benchmark or agent.
     """
     makers = {"b1": _b1, "b2": _b2, "b3": _b3, "ablations": _ablations}
     if name not in makers:
@@ -193,6 +194,11 @@ class _Shelf:
     def parts(self, task: str, levels: Iterable[str], setting: str, **share: Any) -> tuple[Part, ...] | None:
         names = self.find(task, levels, setting)
         return names and tuple(Part(name, **share) for name in names)
+
+    def first(self, task: str, level: str, setting: str, most: int) -> tuple[Part, ...] | None:
+        """Some episodes of a subset, all of them where it has no more than that."""
+        names = self.find(task, [level], setting)
+        return names and tuple(Part(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
 
     def pairs(self, name: str) -> tuple[int, ...]:
         """The goal pairs of a fixed-goal subset whose episodes are all there; the others are noted."""
@@ -262,7 +268,7 @@ def _b2(shelf: _Shelf, agents: list[Agent]):
         if full:
             yield Cell("b2", task, "none", reference, full)  # scores are shares of this one
         for setting in shelf.settings(task):
-            few = shelf.parts(task, ["expert"], setting, episodes=FEW_EPISODES)
+            few = shelf.first(task, "expert", setting, FEW_EPISODES)
             mixed = shelf.parts(task, ["mixed"], setting)
             if not few:
                 continue

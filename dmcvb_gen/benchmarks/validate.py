@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
@@ -162,6 +163,13 @@ def _plan(
             raise DmcvbError(f"benchmark {name} has no data in {chosen.root}; {cure}")
         cells += found
         missing += lacking
+    used = {cell.agent for cell in cells}
+    idle = [name for name in agents if (agent := parse_agent(name)).pretrain is None and agent not in used]
+    if benchmarks and idle:
+        raise DmcvbError(
+            f"{' and '.join(benchmarks)} set agents with a pre-trained encoder beside bc, and {', '.join(idle)} "
+            "has none; leave it out, or add --benchmark b1"
+        )
     return cells, missing
 
 

@@ -45,6 +45,8 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     get_task(task)
     folder = out or Path("runs") / task
     found = read_config(folder) if resume else None
+    if resume and found is None:
+        raise DmcvbError(f"{folder} holds no run to go on with; give its folder with --out, or leave out --resume")
     algorithm = algo or (found.algorithm if found else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
     configuration = run_config(task, algorithm, parse_settings(pairs, config, algorithm), found, **given)
@@ -140,6 +142,8 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
     from dmcvb_gen.behaviours.policies.paper import paper_returns
     from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
     from dmcvb_gen.behaviours.policies.simulate import simulate
+    from dmcvb_gen.errors import DmcvbError
+    from dmcvb_gen.names import ANT_MAZE, family_of
     from dmcvb_gen.rollout.info import return_statistics
     from dmcvb_gen.tasks import get_task, task_ids
     from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
@@ -149,8 +153,10 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
         named = [level for level in levels if level != "random"]
         files = [path for level in named for path in resolve_policies("", level, behaviour)]
         tasks = tasks or sorted({read_header(path).task for path in files})
-    rows = []
-    for task_id in tasks or [task_id for task_id in task_ids() if bundled_levels(task_id)]:
+    tasks, rows = tasks or [task_id for task_id in task_ids() if bundled_levels(task_id)], []
+    if pictures and not any(family_of(task_id) == ANT_MAZE for task_id in tasks):
+        raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(tasks)} is none; leave it out")
+    for task_id in tasks:
         task, panels = get_task(task_id), {}
         for level in levels or [*bundled_levels(task_id), "random"]:
             if level == "random":

@@ -9,6 +9,13 @@ import click
 
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
+from dmcvb_gen.cli.unheard import given_options, refuse
+
+TRAINING = (
+    *("benchmarks", "agents", "profile", "scale", "seed"),
+    *("train_unsound", "threads", "device", "compile", "dino_weights"),
+)
+"""Options of `validate` that say what is trained, and how."""
 
 
 @click.command()
@@ -51,6 +58,8 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
     from dmcvb_gen.benchmarks.validate import validate as run
     from dmcvb_gen.errors import DmcvbError
 
+    if checks_only:
+        refuse(context, given_options(context), TRAINING, "--checks-only trains nothing")
     if options["device"] == "cuda":
         import torch
 

@@ -21,7 +21,7 @@ from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import remove_partial, replacing, write_text
-from dmcvb_gen.names import ANT_MAZE, distractor_of
+from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
 from dmcvb_gen.readers.painted import Painting, painted_release
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
@@ -181,6 +181,9 @@ def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
     held = "pixels and states"
     if not manifest.imported:
         held = "pixels, states, full physics states and the labels of every visual distractor"
+    if not any(record.pixels for record in manifest.subsets):
+        held = "states, full physics states and the labels of every visual distractor, from which `dmcvb-gen paint` "
+        held += "makes the pictures"
     text = (
         f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with {held}: "
         f"{len(facts['subsets'])} subsets, "
@@ -353,7 +356,8 @@ def _distractors(manifest: Manifest) -> list[str]:
         rows.append((name, f"s = {s:g}", place, paint, sky))
     lines = _table(("setting", "scale", "camera", "colors", "background"), rows) if rows else []
     if any(record.family == ANT_MAZE for record in manifest.subsets):
-        lines += ["", "Mazes vary in the style of walls and floor, drawn for each episode (label `exogenous/style`)."]
+        label = "" if manifest.imported else " (label `exogenous/style`)"
+        lines += ["", f"Mazes vary in the style of walls and floor, drawn for each episode{label}."]
     return lines + ["", "A tick is a control step, two in a step. Distractors never touch physics or rewards."]
 
 
@@ -425,16 +429,16 @@ def plot_returns(release: Release, path: Path) -> None:
     """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each."""
     from matplotlib.figure import Figure
 
-    groups: dict[tuple[str, str], list[np.ndarray]] = {}
+    groups: dict[tuple[str, str, bool], list[np.ndarray]] = {}
     for subset in release.subsets.values():
-        groups.setdefault((subset.task, subset.level), []).append(subset.returns)
+        groups.setdefault((subset.task, subset.level, subset.setting == FIXED), []).append(subset.returns)
     boxes, labels, shades = [], [], []
-    for (task, level), values in groups.items():
+    for (task, level, fixed), values in groups.items():
         low, p25, median, p75, high = np.quantile(np.concatenate(values), (0, 0.25, 0.5, 0.75, 1))
         boxes.append(dict(whislo=low, q1=p25, med=median, q3=p75, whishi=high, fliers=[]))
-        labels.append(f"{task} {level}")
+        labels.append(f"{task} {level}" + (f" {FIXED}" if fixed else ""))
         shades.append("tab:blue")
-        paper = paper_returns(task, level)
+        paper = None if fixed else paper_returns(task, level)  # its goals are random
         if paper:
             keys = dict(whislo="min", q1="p25", med="median", q3="p75", whishi="max")
             boxes.append({name: paper[key] for name, key in keys.items()} | {"fliers": []})

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
-from dmcvb_gen.names import DIFFICULTIES, DISTRACTOR_KINDS, GOAL_MODES, LEVELS
+from dmcvb_gen.names import DIFFICULTIES, DISTRACTOR_KINDS, FIXED, GOAL_MODES, LEVELS
 from dmcvb_gen.store import open_release
 from dmcvb_gen.version import __version__
 
@@ -44,7 +44,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 renderer=subset.record.renderer.get("name"),
                 digest=subset.record.digest,
                 returns=return_statistics(subset.returns),
-                paper=paper_returns(subset.task, subset.level),
+                paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
             )
         )
     return dict(

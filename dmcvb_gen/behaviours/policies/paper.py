@@ -6,7 +6,7 @@ import csv
 import functools
 from importlib import resources
 
-from dmcvb_gen.names import MazeName
+from dmcvb_gen.names import REWARDS, MazeName
 
 MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "medium": "ant-maze/multi-obstacle"}
 """Layout's difficulty -> the paper's row, which pools the layouts of a difficulty."""
@@ -23,12 +23,11 @@ def _table() -> dict[tuple[str, str], dict[str, float]]:
 
 
 def paper_task(task_id: str) -> str:
-    """The name of a task's row: mazes are pooled by difficulty."""
+    """The name of a task's row: the paper's mazes, with its reward, are pooled by difficulty."""
     maze = MazeName.parse(task_id)
-    for difficulty, row in MAZE_GROUPS.items():
-        if maze and maze.layout.startswith(difficulty):
-            return row
-    return task_id
+    if not maze or maze.rows or maze.reward not in (None, REWARDS[0]):
+        return task_id
+    return next((row for difficulty, row in MAZE_GROUPS.items() if maze.layout.startswith(difficulty)), task_id)
 
 
 def paper_returns(task_id: str, level: str) -> dict[str, float] | None:
