@@ -73,10 +73,6 @@ def small_release(tmp_path_factory):
     return folder
 
 
-TINY_MAZE = "ant-maze-tiny:****/*..*/****"
-"""Two cells: even random actions find the goal now and then."""
-
-
 @pytest.fixture(scope="session")
 def small_mazes(tmp_path_factory):
     """Folder of a finished release of a maze: the goal visible, hidden, and fixed with the start; 2 episodes each."""

@@ -156,6 +156,7 @@ def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     for state in states["state"]:
         goal = task.layout.grid(state[task.state_slices["target_position"]][None, :2])[0]
         assert tuple(int(x) for x in np.rint(goal)) == pairs[1][1]
+    assert DistractedEnv(maze, "fixed", goal_pair=3, views=views, **SMALL).reset(seed=0)[1] == {"goal_pair": 3}
     with pytest.raises(DmcvbError, match="give 0 for the first"):
         DistractedEnv(maze, "fixed", goal_pair=-1)
 

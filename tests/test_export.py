@@ -254,6 +254,16 @@ def test_an_imported_release_keeps_its_pictures(imported, tmp_path):
         dmcvb_gen.open(str(imported), paint=True)
 
 
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_an_imported_release_is_exported_to_lerobot(imported, dmcvb_mazes, tmp_path, family):
+    folder = imported
+    if family == "mazes":
+        import_tfds(dmcvb_mazes, folder := tmp_path / "r")
+    for out in export(str(folder), "lerobot", tmp_path / "out"):
+        info = json.loads((out / "meta/info.json").read_text())
+        assert info["fps"] == 20
+
+
 def check_imported_card(folder):
     """Its card is written, fits, and claims nothing that it has not."""
     write_card(folder)
@@ -262,6 +272,7 @@ def check_imported_card(folder):
     assert "Imported by dmcvb-gen" in text and "those of the imported data" in text
     for claim in ("regenerate", "full physics states", "`exogenous/`", "`physics`", "None samples", "seed None"):
         assert claim not in text, claim
+    assert "exogenous/style" not in text
     assert "can be made again from them" not in metadata and "roll out" not in metadata
     return level_statistics(open_release(folder))
 

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 import dmcvb_gen
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.readers import source as source_module
+from dmcvb_gen.readers.blocks import stream
 from dmcvb_gen.store import open_release
 
 NAME = "walker-walk/random/dynamic"
@@ -174,6 +175,50 @@ def test_ranks_get_equally_many_episodes_and_share_none(subset):
     assert [len(share) for share in pairs] == [500, 500]  # 3 episodes, 2 ranks: one episode waits for another epoch
     with pytest.raises(DmcvbError, match="fewer ranks"):
         next(subset.batches(5, rank=0, world=4))
+
+
+def test_numbers_below_one_are_refused_by_name(subset):
+    for make, words in (
+        (lambda: next(subset.batches(8, stack=0)), "stack=0"),
+        (lambda: next(subset.batches(0)), "batch_size=0"),
+        (lambda: next(subset.batches(8, buffer=0)), "buffer=0"),
+        (lambda: subset.source(stack=-1), "stack=-1"),
+        (lambda: subset.torch("steps", stack=0), "stack=0"),
+    ):
+        with pytest.raises(DmcvbError, match=f"{words}: give at least 1"):
+            make()
+
+
+@pytest.mark.parametrize("drop_last", [False, True])
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("batch_size", [None, 8])
+def test_ranks_get_equally_many_batches_of_episodes_that_differ_in_length(subset, drop_last, workers, batch_size):
+    class Uneven:
+        """The subset, as a maze's whose ants arrive: episodes of 500, 70 and 41 steps, and another of 200."""
+
+        episodes, lengths = np.arange(4), np.array([500, 70, 41, 200])
+        record, name = subset.record, subset.name
+
+        def __getattr__(self, name):
+            return getattr(subset, name)
+
+        def episode(self, index, arrays):
+            values = subset.episode(min(index, 2), arrays) | {"length": self.lengths[index]}
+            length = self.lengths[index]
+            rows = {"state": length + 1, "action": length, "reward": length, "discount": length}
+            return {name: value[: rows[name]] if name in rows else value for name, value in values.items()}
+
+    counts, steps = [], []
+    for rank in range(2):
+        parts = [
+            list(stream(Uneven(), batch_size=batch_size, pictures=(), rank=rank, world=2, worker=worker,
+                        workers=workers, drop_last=drop_last))
+            for worker in range(workers)
+        ]  # fmt: skip
+        counts.append(sum(map(len, parts)))
+        steps += [(int(e), int(s)) for part in parts for b in part
+                  for e, s in zip(np.atleast_1d(b["episode"]), np.atleast_1d(b["step"]), strict=True)]  # fmt: skip
+    assert counts[0] == counts[1] > 0 and len(set(steps)) == len(steps)
 
 
 def test_random_steps_work_in_loader_workers_and_survive_pickling(subset):

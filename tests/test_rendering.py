@@ -137,10 +137,25 @@ def test_depth_and_segmentation_of_the_renderers_agree(task_id, other):
         renderer.close()
     same = found[other]["segmentation"] == found["opengl"]["segmentation"]
     assert same.mean() > 0.93
+    for name, parts in found.items():  # OpenGL's depth at a body's edge is of another sample
+        assert ((parts["depth"] == 0) == (parts["segmentation"] == -1)).mean() > 0.98, name
     # Warp's labels are of a pixel's first sample, so the floor seen at a low angle is at another distance.
-    both = same & (found[other]["segmentation"] > 0)  # 0 is the floor
+    both = same & (found[other]["segmentation"] > 0) & (found["opengl"]["depth"] > 0)  # 0 is the floor
     ratio = found[other]["depth"][both] / found["opengl"]["depth"][both]
     assert len(ratio) > 20 and np.median(np.abs(ratio - 1)) < 0.02
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_labels_leave_a_hidden_goal_out_as_its_pictures_do(name):
+    task, setting, physics, labels = frames_of("ant-maze-empty7x7", "none", 2)
+    renderer = renderer_of(name, task, setting)
+    shown, hidden = (renderer.render_labels(physics, labels, hide_goal=hide) for hide in (False, True))
+    renderer.close()
+    goal = np.isin(shown["segmentation"], task.goal_geoms)
+    assert goal.any() and not np.isin(hidden["segmentation"], task.goal_geoms).any()
+    for label in ("segmentation", "depth"):  # but for OpenGL's edges
+        assert (shown[label][~goal] == hidden[label][~goal]).mean() > 0.999
+    assert (hidden["depth"][goal] > shown["depth"][goal] - 1e-3).mean() > 0.9  # what lies behind it
 
 
 @needs_opengl

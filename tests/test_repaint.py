@@ -23,6 +23,7 @@ from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.store import open_release
+from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
 from tests.faults.commands import GRACE, session
 
@@ -120,6 +121,16 @@ def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, n
 
 
 @pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")
+def test_labels_of_hidden_goals_do_not_show_them(small_mazes, tmp_path):
+    repaint(Repainting(small_mazes, tmp_path / "r", size=24, labels=["segmentation"]))
+    seen = {}
+    for name, subset in open_release(tmp_path / "r").subsets.items():
+        arrays = [array for array in subset.arrays if array.startswith("segmentation")]
+        goal = get_task(subset.task).goal_geoms
+        seen[name.rsplit("/")[-1]] = any(np.isin(subset.read(array, [0]), goal).any() for array in arrays)
+    assert seen == {"visible": True, "hidden": False, "fixed": False}
+
+
 def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "native")
@@ -138,7 +149,25 @@ def test_an_interrupted_repaint_goes_on(small_release, dynamic, tmp_path, no_sim
     assert manifest.complete and manifest.subsets[0].digest == open_release(dynamic).manifest.subsets[0].digest
 
 
-def test_mistakes_are_refused_before_any_painting(small_release, tmp_path):
+def test_a_folder_with_another_release_is_left_alone(small_release, small_mazes, dynamic, tmp_path):
+    shutil.copytree(small_mazes, tmp_path / "mazes")
+    shutil.copytree(dynamic, tmp_path / "dynamic")
+    for folder, request in (
+        ("mazes", dict(only=["*/*/none"], distractor="dynamic")),
+        ("dynamic", dict(only=["*/*/none"], distractor="dynamic", labels=["depth"])),
+    ):
+        before = (tmp_path / folder / "manifest.json").read_bytes()
+        with pytest.raises(StoreError, match="is not this repaint; give another --out"):
+            repaint(Repainting(small_release, tmp_path / folder, **request))
+        assert (tmp_path / folder / "manifest.json").read_bytes() == before and verify(tmp_path / folder).sound
+
+
+def test_mistakes_are_refused_before_any_painting(small_release, small_mazes, tmp_path):
+    for options in (dict(difficulty="hard"), dict(backgrounds="builtin")):
+        with pytest.raises(RecipeError, match="is of distractors, and what is painted here has none"):
+            repaint(Repainting(small_release, tmp_path / "r", ["*/*/none"], **options))
+    with pytest.raises(RecipeError, match="--backgrounds is of distractors"):
+        repaint(Repainting(small_mazes, tmp_path / "r", backgrounds="builtin"))
     with pytest.raises(RecipeError, match="both become walker-walk/random/static.*--only"):
         repaint(Repainting(small_release, tmp_path / "r", distractor="static"))
     with pytest.raises(DmcvbError, match="8 to 1024"):

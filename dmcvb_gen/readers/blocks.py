@@ -6,6 +6,7 @@ shuffled order, holds `buffer` of them in memory, and mixes their steps.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -13,6 +14,17 @@ import numpy as np
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.store import Subset
 from dmcvb_gen.store.pictures import shown
+
+
+def check_count(name: str, value: int) -> int:
+    """`value`.
+
+    Raises:
+      DmcvbError: it is below 1.
+    """
+    if value < 1:
+        raise DmcvbError(f"{name}={value}: give at least 1")
+    return value
 
 
 def choose(subset: Subset, episodes: Iterable[int] | None) -> np.ndarray:
@@ -90,7 +102,7 @@ class Block:
 
 
 def share(episodes: np.ndarray, rank: int, world: int, worker: int = 0, workers: int = 1) -> np.ndarray:
-    """The episodes of one rank and worker; ranks get equally many, so that none waits for another.
+    """The episodes of one rank and worker; ranks get equally many.
 
     Raises:
       DmcvbError: there are fewer episodes than ranks.
@@ -128,18 +140,59 @@ def stream(
       pictures: views (or their arrays), in this order; by default all that the subset shows; () reads states alone.
       shuffle: mix episodes, and steps among the `buffer` episodes in memory; the same for the same seed, epoch and
         number of workers.
-      rank, world, worker, workers: this process's share of the episodes.
+      rank, world, worker, workers: this process's share of the episodes. All ranks give as many batches as the one
+        whose episodes have the fewest steps (mazes' differ in length), so that none waits for another.
       drop_last: leave out a batch that is not full.
+
+    Raises:
+      DmcvbError: a number below 1, or fewer episodes than ranks.
     """
+    for name, value in (("stack", stack), ("buffer", buffer), ("batch_size", 1 if batch_size is None else batch_size)):
+        check_count(name, value)
     chosen = choose(subset, episodes)
     names = shown(subset, pictures).arrays
     order = np.random.default_rng([seed, epoch, 0]).permutation(chosen) if shuffle else chosen
+    most = None
+    if world > 1:
+        most = _batches(subset, order, batch_size or 1, world, workers, drop_last)[rank][worker]
     order = share(order, rank, world, worker, workers)
     mixer = np.random.default_rng([seed, epoch, 1 + rank * workers + worker])
+    items = _mixed(subset, order, names, mixer if shuffle else None, batch_size, stack, next_step, buffer, drop_last)
+    yield from itertools.islice(items, most)
+
+
+def _batches(
+    subset: Subset, order: np.ndarray, batch_size: int, world: int, workers: int, drop_last: bool
+) -> list[list[int]]:
+    """How many batches each rank's workers give: as many a rank as the shortest rank has."""
+    lengths = dict(zip(subset.episodes.tolist(), subset.lengths.tolist(), strict=True))
+    counts = []
+    for rank in range(world):
+        steps = [
+            sum(lengths[int(episode)] for episode in share(order, rank, world, worker, workers))
+            for worker in range(workers)
+        ]
+        counts.append([count // batch_size if drop_last else -(-count // batch_size) for count in steps])
+    fewest = min(map(sum, counts))
+    return [np.diff(np.minimum(np.cumsum([0, *own]), fewest)).tolist() for own in counts]
+
+
+def _mixed(
+    subset: Subset,
+    order: np.ndarray,
+    names: Sequence[str],
+    mixer: np.random.Generator | None,
+    batch_size: int | None,
+    stack: int,
+    next_step: bool,
+    buffer: int,
+    drop_last: bool,
+) -> Iterator[dict[str, np.ndarray]]:
+    """The steps of episodes in their order, `buffer` episodes at a time, these mixed if there is a mixer."""
     rest: list[dict[str, np.ndarray]] = []
     for first in range(0, len(order), buffer):
         block = Block(subset, order[first : first + buffer], names, stack, next_step)
-        steps = mixer.permutation(len(block)) if shuffle else np.arange(len(block))
+        steps = np.arange(len(block)) if mixer is None else mixer.permutation(len(block))
         if batch_size is None:
             for step in steps:
                 yield {name: value[0] for name, value in block.gather(np.array([step])).items()}

@@ -97,6 +97,7 @@ class _Stage:
         self.pictures = Pictures(self.task.views, hides_goal(setting)).select(scene.views)
         self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if setting == FIXED else None
+        self._first_pair = scene.goal_pair or 0
         check_size(scene.size)
         check_renderer(scene.renderer)
         self.backgrounds = None if self.setting.kind == "none" else load_backgrounds(scene.backgrounds, scene.split)
@@ -132,7 +133,7 @@ class _Stage:
             number = int(self.started[place])
             self._episodes[place] = seed, number
             if self.pairs:
-                self.goal_pair[place] = number % len(self.pairs)
+                self.goal_pair[place] = self._first_pair + number % len(self.pairs)
             self.started[place] += 1
             self.frame[place] = 0
         streams = {
@@ -141,7 +142,7 @@ class _Stage:
         }
         initial = [streams["initial_state"][place] for place in places]
         if self.pairs:
-            pairs = [self.pairs[self.goal_pair[place]] for place in places]
+            pairs = [self.pairs[self.goal_pair[place] - self._first_pair] for place in places]
             self.state = self.batch.reset_fixed(initial, pairs, places)
         else:
             self.state = self.batch.reset(initial, places)

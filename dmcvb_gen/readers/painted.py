@@ -120,6 +120,11 @@ class PaintedSubset(SubsetReader):
         self.epoch = epoch
 
     @property
+    def shown_epoch(self) -> int:
+        """The epoch whose distractors the pictures show; 0 where they are those of the data."""
+        return self.epoch if self.painting.distractors == RESAMPLED else 0
+
+    @property
     def picture_names(self) -> tuple[str, ...]:
         """All arrays that can be painted."""
         task, views = get_task(self.task), self.record.views
@@ -152,7 +157,7 @@ class PaintedSubset(SubsetReader):
         """
         if episode not in self.episodes:
             raise StoreError(f"{self.name} has no episode {episode}; it has {len(self.episodes)} episodes")
-        epoch = self.epoch if self.painting.distractors == RESAMPLED else 0
+        epoch = self.shown_epoch
         keys = {name: (episode, epoch, name) for name in (self.picture_names if arrays is None else arrays)}
         with self._lock:
             found = {name: self._kept[key] for name, key in keys.items() if key in self._kept}

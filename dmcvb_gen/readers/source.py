@@ -6,14 +6,13 @@ A `StepSource` has `__len__` and `__getitem__`, which is what Grain (`grain.MapD
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.readers.blocks import Block, choose, stack_channels
+from dmcvb_gen.readers.blocks import Block, check_count, choose, stack_channels
 from dmcvb_gen.store import Subset
 from dmcvb_gen.store.pictures import shown
 
@@ -52,7 +51,7 @@ class StepSource:
         next_step: bool = False,
         in_memory: bool | None = None,
     ):
-        self.subset, self.stack, self.next_step = subset, stack, next_step
+        self.subset, self.stack, self.next_step = subset, check_count("stack", stack), next_step
         self.pictures = shown(subset, pictures).arrays
         self.episodes = choose(subset, episodes)
         by_episode = dict(zip(subset.episodes.tolist(), subset.lengths.tolist(), strict=True))
@@ -62,6 +61,7 @@ class StepSource:
             size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3
             in_memory = size <= SHARE_OF_MEMORY * free_memory()
         self.in_memory = in_memory
+        self._held: tuple[int, Block] | None = None
 
     def __len__(self) -> int:
         return int(self._ends[-1]) if len(self._ends) else 0
@@ -92,15 +92,19 @@ class StepSource:
         items = [self._read(int(place)) for place in places]
         return {name: np.stack([item[name] for item in items]) for name in items[0]}
 
-    @functools.cached_property
+    @property
     def block(self) -> Block:
-        """All steps, in memory."""
-        return Block(self.subset, self.episodes, self.pictures, self.stack, self.next_step)
+        """All steps, in memory; read again where the subset's distractors have become those of another epoch."""
+        epoch = getattr(self.subset, "shown_epoch", 0)
+        if self._held is None or self._held[0] != epoch:
+            self._held = None  # free the old pictures before new ones are painted
+            self._held = epoch, Block(self.subset, self.episodes, self.pictures, self.stack, self.next_step)
+        return self._held[1]
 
     def __getstate__(
         self,
     ) -> dict[str, Any]:  # what is held is read again where the source lands: quicker than sending it
-        return {name: value for name, value in self.__dict__.items() if name != "block"}
+        return self.__dict__ | {"_held": None}
 
     def _read(self, place: int) -> dict[str, np.ndarray]:
         number = int(np.searchsorted(self._ends, place, side="right"))

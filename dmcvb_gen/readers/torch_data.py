@@ -26,6 +26,27 @@ def _tensors(values: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     return {name: _tensor(value) for name, value in values.items()}
 
 
+class _Epochs:
+    """An epoch that a loader's persistent workers see too: in shared memory, as they keep the data they began with."""
+
+    def __init__(self, subset: Subset, first: int = 0):
+        self._subset, self._set = subset, first
+        self._epoch = torch.tensor(first).share_memory_()
+
+    @property
+    def number(self) -> int:
+        return int(self._epoch)
+
+    def set(self, epoch: int) -> None:
+        self._epoch.fill_(epoch)
+
+    def take(self) -> None:
+        """Let the subset know (one with fresh distractors), in whichever process reads it."""
+        if self.number != self._set:
+            self._set = self.number
+            getattr(self._subset, "set_epoch", lambda epoch: None)(self._set)
+
+
 class StepDataset(Dataset):
     """Any step at random: frame stack, state, action, reward, discount (see `source.StepSource`), as tensors.
 
@@ -37,17 +58,23 @@ class StepDataset(Dataset):
     """
 
     def __init__(self, subset: Subset, **options: Any):
-        self.source = StepSource(subset, **options)
+        self.source, self._epochs = StepSource(subset, **options), _Epochs(subset)
         if self.source.in_memory:
             _ = self.source.block  # read now, so that workers that are forked share it
 
     def __len__(self) -> int:
         return len(self.source)
 
+    def set_epoch(self, epoch: int) -> None:
+        """Show other distractors, if the subset's are fresh, in a loader's workers too."""
+        self._epochs.set(epoch)
+
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        self._epochs.take()
         return _tensors(self.source[index])
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, torch.Tensor]]:
+        self._epochs.take()
         batch = _tensors(self.source.gather(indices))
         return [{name: value[row] for name, value in batch.items()} for row in range(len(indices))]
 
@@ -67,12 +94,17 @@ class EpisodeDataset(Dataset):
         pictures: Sequence[str] | None = None,
     ):
         self.subset, self.pictures = subset, shown(subset, pictures).arrays
-        self.episodes = choose(subset, episodes)
+        self.episodes, self._epochs = choose(subset, episodes), _Epochs(subset)
 
     def __len__(self) -> int:
         return len(self.episodes)
 
+    def set_epoch(self, epoch: int) -> None:
+        """Show other distractors, if the subset's are fresh, in a loader's workers too."""
+        self._epochs.set(epoch)
+
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        self._epochs.take()
         episode = int(self.episodes[index])
         values = self.subset.episode(episode, ["state", "action", "reward", "discount", *self.pictures])
         if self.pictures:
@@ -94,21 +126,22 @@ class StreamDataset(IterableDataset):
 
     def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options: Any):
         self.subset, self.options = subset, options
-        # In shared memory: a loader's persistent workers keep the data set that they were started with.
-        self._epoch = torch.tensor(options.pop("epoch", 0)).share_memory_()
+        self._epochs = _Epochs(subset, options.pop("epoch", 0))
         running = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else torch.distributed.get_rank() if running else 0
         self.world = world if world is not None else torch.distributed.get_world_size() if running else 1
 
     @property
     def epoch(self) -> int:
-        return int(self._epoch)
+        return self._epochs.number
 
     def set_epoch(self, epoch: int) -> None:
-        """Take another order (and the same one for the same number), in a loader's workers too."""
-        self._epoch.fill_(epoch)
+        """Take another order (and the same one for the same number), and show other distractors, if the subset's are
+        fresh; in a loader's workers too."""
+        self._epochs.set(epoch)
 
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
+        self._epochs.take()
         worker = get_worker_info()
         place = (worker.id, worker.num_workers) if worker else (0, 1)
         items = stream(

@@ -7,6 +7,7 @@ the very bytes that rolling it out would have given.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, family_of, select
+from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, distractor_of, family_of, select
 from dmcvb_gen.pool import Tick, Workers, expect, ignore, run_all
 from dmcvb_gen.release.shards import damage
 from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
@@ -37,7 +38,7 @@ from dmcvb_gen.rollout.worker import make_shard
 from dmcvb_gen.store import Release, open_release
 from dmcvb_gen.store.manifest import MANIFEST, Addition, CommitRecord, Manifest, SubsetRecord, environment
 from dmcvb_gen.store.pictures import stored_pictures, view_arrays
-from dmcvb_gen.store.reader import Subset
+from dmcvb_gen.store.reader import Subset, load_manifest
 from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
 from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
@@ -137,7 +138,10 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
                 f"{taken.source.name} and {name} would both become {pair.record.name}; "
                 f"choose one with --only, e.g. '*/*/{pair.source.setting}'"
             )
-    manifest = start_release(out, _new_manifest(release, pairs, request))
+    _check_heard(request, [pair.record for pair in pairs.values()])
+    new = _new_manifest(release, pairs, request)
+    _check_out(out, new)
+    manifest = start_release(out, new)
     todo: dict[tuple[str, int], SubsetRecord] = {}
     for pair in pairs.values():
         record, shape = pair.record, EpisodeShape.of(get_task(pair.record.task))
@@ -159,6 +163,23 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
     finally:
         leave(site)
     return finish_release(out, manifest)
+
+
+def _check_heard(request: Repainting, records: Sequence[SubsetRecord]) -> None:
+    """Refuse options of distractors that none of the new subsets has."""
+    kinds = {distractor_of(record.task, record.setting).kind for record in records}
+    for name in ("difficulty", "backgrounds"):
+        if getattr(request, name) and kinds <= {"none"}:
+            raise RecipeError(f"--{name} is of distractors, and what is painted here has none; leave it out")
+
+
+def _check_out(out: Path, new: Manifest) -> None:
+    """Refuse a folder that holds any release but this very repaint, begun before."""
+    if not (out / MANIFEST).exists():
+        return
+    _, there = load_manifest(out)
+    if list(there.lineage) != json.loads(new.model_dump_json())["lineage"]:
+        raise StoreError(f"{out} holds {there.name} {there.version}, which is not this repaint; give another --out")
 
 
 def _source(request: Repainting) -> Release:
@@ -335,17 +356,20 @@ def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tup
         yield from label_arrays(exogenous, length, rows)
         yield from values.items()
         for label in labels:
-            yield from _label_pictures(task, renderer, physics, exogenous, length, rows, label)
+            yield from _label_pictures(task, renderer, physics, exogenous, length, rows, label, record.hidden_goal)
 
     return make_shard(job.site, record, job.shard, arrays(), length, job.device)
 
 
-def _label_pictures(task, renderer, physics, exogenous, length, rows, label) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, (episode, rows, size, size)) of depth or segmentation, a view each."""
+def _label_pictures(
+    task, renderer, physics, exogenous, length, rows, label, hide_goal
+) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, (episode, rows, size, size)) of depth or segmentation, a view each, of what the subset's pictures show."""
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
     for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
         out = np.zeros((len(physics), rows, renderer.size, renderer.size), LABEL_TYPES[label])
         for first in range(0, len(episode), LABEL_FRAMES):
             e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
-            out[e, r] = renderer.render_labels(physics[e, r], exogenous[e, r], [view])[label][:, 0]
+            found = renderer.render_labels(physics[e, r], exogenous[e, r], [view], hide_goal)
+            out[e, r] = found[label][:, 0]
         yield name, out

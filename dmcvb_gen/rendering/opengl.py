@@ -123,7 +123,11 @@ class OpenglRenderer(Renderer):
         return out
 
     def render_labels(
-        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
@@ -133,10 +137,12 @@ class OpenglRenderer(Renderer):
         near = self._model.vis.map.znear * self._model.stat.extent
         far = self._model.vis.map.zfar * self._model.stat.extent
         for frame in range(len(physics)):
-            self._pose(physics[frame], exogenous, frame, False)
+            self._pose(physics[frame], exogenous, frame, hide_goal)
             for column, view in enumerate(indices):
                 raw = np.empty((self.size, self.size), np.float32)
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0  # which has a depth of its own
                 self._shoot(view, exogenous.camera_position[frame], rotations[frame], depth=raw)
+                self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
                 meters = near * far / (far - raw[::-1].astype(np.float64) * (far - near))
                 depth[frame, column] = np.where(raw[::-1] >= 1, 0, meters)
                 self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1

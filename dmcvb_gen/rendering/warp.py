@@ -215,7 +215,11 @@ class WarpRenderer(Renderer):
         return out
 
     def render_labels(
-        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
@@ -223,7 +227,7 @@ class WarpRenderer(Renderer):
         for part, worlds in self._parts(len(physics)):
             for column, view in enumerate(indices):
                 _, depth[part, column], segmentation[part, column] = self._launch(
-                    physics[part], exogenous[part], view, False, worlds, labels=True
+                    physics[part], exogenous[part], view, hide_goal, worlds, labels=True
                 )
         return {"depth": depth, "segmentation": segmentation}
 

@@ -5,6 +5,7 @@ What a rollout, a repaint, a check and a reader that paints on read have in comm
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
@@ -77,11 +78,17 @@ class RendererCache:
         key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
         key += (backgrounds, record.split, device)
         if key not in self._made:
-            for renderer, _ in self._made.values():
-                renderer.close()
-            self._made.clear()
+            self.close()
             self._made[key] = renderer_for(record, backgrounds, record.split, device)
+            atexit.unregister(self.close)
+            atexit.register(self.close)  # now, before OpenGL's library ends: it may have come with this renderer
         return self._made[key]
+
+    def close(self) -> None:
+        """Free what is held."""
+        for renderer, _ in self._made.values():
+            renderer.close()
+        self._made.clear()
 
 
 renderers = RendererCache()

@@ -24,6 +24,10 @@ class Stored:
     def views(self):
         return VIEWS if self.name.startswith("ant-maze") else ("pixels",)
 
+    @property
+    def max_steps(self):
+        return 600 if self.name.startswith("ant-maze") else 500
+
     def episode(self, index):
         """(length, arrays by name, "pixels" (L + 1, view, size, size, 3)), without the goal where it must be hidden."""
         group = zarr.open_group(str(self.folder / f"{self.name}.zarr"), mode="r")

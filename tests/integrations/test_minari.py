@@ -6,9 +6,14 @@ import minari
 import numpy as np
 import pytest
 from minari.cli import app
+from PIL import Image
 from typer.testing import CliRunner
 
+import dmcvb_gen
 from dmcvb_gen.release.export import export
+from dmcvb_gen.release.export.references import reference_returns
+from dmcvb_gen.tasks import get_task
+from tests.conftest import roll_out, small_recipe
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +51,7 @@ def test_episodes_have_the_pictures_that_the_subset_is_about(datasets, stored):
             assert len(episode.actions) == length and episode.terminations[-1] == terminated != episode.truncations[-1]
 
 
-def test_environments_are_recovered_with_the_spaces_of_the_data(datasets):
+def test_environments_are_recovered_with_the_spaces_of_the_data(datasets, stored):
     for name, dataset_id in datasets.items():
         dataset = minari.load_dataset(dataset_id)
         for evaluation, split in ((False, "train"), (True, "val")):
@@ -54,8 +59,50 @@ def test_environments_are_recovered_with_the_spaces_of_the_data(datasets):
             assert env.observation_space == dataset.observation_space, name
             assert env.action_space == dataset.action_space
             assert env.unwrapped._stage.split == split
+            assert env.unwrapped._stage.max_steps == stored[name].max_steps
             assert env.unwrapped._stage.pictures.hide_goal == name.endswith(("hidden", "fixed"))
             env.close()
+
+
+def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_given(tmp_path, monkeypatch):
+    for split, grey in (("train", 10), ("val", 250)):
+        (tmp_path / "videos" / split / "one").mkdir(parents=True)
+        for frame in range(3):
+            picture = Image.fromarray(np.full((256, 256, 3), (grey, 0, 255 - grey), np.uint8))
+            picture.save(tmp_path / "videos" / split / "one" / f"{frame}.png")
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "static", "episodes": 1, "max_steps": 3}
+    recipe = small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "videos"), split="val", size=32)
+    videos = roll_out(recipe, tmp_path / "r").subsets[0].backgrounds["source"]
+    export(str(tmp_path / "r"), "minari", tmp_path / "out")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
+    dataset = minari.load_dataset("dmcvb_gen/walker-walk/random-static-v0")
+    assert f"recover_environment(backgrounds=FOLDER), the release's {videos}" in dataset.storage.metadata["description"]
+    assert str(tmp_path) not in str(dataset.storage.metadata)
+    [episode] = dataset.iterate_episodes()
+    colors = []
+    for folder in (None, tmp_path / "r" / videos):
+        env = dataset.recover_environment(**({"backgrounds": str(folder)} if folder else {}))
+        assert env.unwrapped._stage.split == "val"
+        colors.append(env.reset(seed=0)[0]["pixels"][0].mean(axis=0))  # the topmost line: sky
+        env.close()
+    sky = episode.observations["pixels"][0, 0].mean(axis=0)
+    assert np.abs(colors[1] - sky).max() < 5 < np.abs(colors[0] - sky).max()
+
+
+def test_references_are_of_episodes_as_long_as_the_datas(small_mazes, tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 10}
+    roll_out(small_recipe(subsets=[pattern]), tmp_path / "short")
+    release = dmcvb_gen.open(str(tmp_path / "short"))
+    record = release["walker-walk/random/none"].record
+    assert reference_returns(release, record) == {}  # the package's expert was measured over 500 steps
+    expert = record.model_copy(update={"level": "expert"})
+    release.subsets["x"] = type(release["walker-walk/random/none"])("x", expert, {}, {})
+    release.subsets["x"].__dict__["returns"] = np.array([15.0])
+    found = reference_returns(release, record)
+    assert found["ref_max_score"] == 15 and 0 < found["ref_min_score"] < 10
+    mazes = dmcvb_gen.open(str(small_mazes))
+    whole = mazes["ant-maze-tiny/random/visible"].record
+    assert whole.max_steps == get_task(whole.task).max_steps and reference_returns(mazes, whole) == {}  # no expert
 
 
 def test_scores_are_normalized_between_random_and_expert(datasets):

@@ -70,7 +70,12 @@ class Source:
 
     @property
     def steps_per_second(self) -> float:
-        return 1 / float(self.subset.attrs["seconds_per_step"])
+        said = self.subset.attrs.get("seconds_per_step")
+        if said is None:  # imported; only this needs the tasks, and what they are made of
+            from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+
+            said = ACTION_REPEAT * get_task(self.subset.task).control_timestep
+        return 1 / float(said)
 
     @property
     def pictures(self) -> Pictures:

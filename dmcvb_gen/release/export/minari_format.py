@@ -21,6 +21,7 @@ from dmcvb_gen.readers.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.readers.release import ReleaseReader
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.references import reference_returns
+from dmcvb_gen.rollout.jobs import BUILTIN
 from dmcvb_gen.version import __version__
 
 
@@ -43,7 +44,7 @@ def write(source: Source, folder: Path) -> None:
         folder / "data",
         observation_space=spaces.Dict({"pixels": picture, "state": state}),
         action_space=spaces.Box(-1.0, 1.0, (subset.array("action").shape[-1],), np.float32),
-        env_spec=_environment(source, "train"),
+        env_spec=_environment(source, source.subset.record.split),
         data_format="hdf5",
         jpeg_encoding=False,
     )
@@ -54,7 +55,7 @@ def write(source: Source, folder: Path) -> None:
         "algorithm_name": ", ".join(algorithms) or subset.level,
         "author": set(source.manifest.authors),
         "code_permalink": source.manifest.generator,
-        "description": source.description,
+        "description": source.description + _about_videos(source),
         "requirements": [f"dmcvb-gen>={__version__}"],
         "eval_env_spec": _environment(source, "val").to_json(),
         **reference_returns(source.release, subset.record),
@@ -68,7 +69,10 @@ def write(source: Source, folder: Path) -> None:
 
 
 def _environment(source: Source, split: str) -> EnvSpec:
-    """The environment that shows what the data show, with their videos and styles ("train") or others ("val")."""
+    """The environment of the data, with videos and styles of a split: the data's own, or those kept for evaluation.
+
+    Episodes are cut where the data's are, and so compare with the reference scores.
+    """
     record = source.subset.record
     maze = record.family == ANT_MAZE
     setting = record.setting if maze else DistractorSetting.parse(record.setting).kind
@@ -85,8 +89,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
         options["difficulty"] = DistractorSetting.parse(record.setting).difficulty
     if maze:
         options["views"] = list(source.views)
-    if split == "train":
-        options["max_steps"] = record.max_steps
+    options["max_steps"] = record.max_steps
     if record.setting == FIXED:
         options |= {
             "fixed_goals": record.fixed_goals,
@@ -97,6 +100,14 @@ def _environment(source: Source, split: str) -> EnvSpec:
     spec = EnvSpec(name, entry_point=registered.entry_point if registered else ENTRY_POINT, kwargs=options)
     spec.order_enforce, spec.disable_env_checker = True, True
     return spec
+
+
+def _about_videos(source: Source) -> str:
+    """What is said of videos that the package does not bring: where they lie now is nothing to publish."""
+    videos = (source.subset.record.backgrounds or {}).get("source", BUILTIN)
+    if videos == BUILTIN:
+        return ""
+    return f"; with its videos: recover_environment(backgrounds=FOLDER), the release's {videos}"
 
 
 def _buffer(number: int, episode: ExportEpisode) -> EpisodeBuffer:

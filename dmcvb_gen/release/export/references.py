@@ -19,26 +19,29 @@ RANDOM_EPISODES, SEED, NAMES = 10, 0, ("reference",)
 def reference_returns(release: ReleaseReader, record: SubsetRecord) -> dict[str, float]:
     """`ref_min_score` and `ref_max_score`: mean returns of random actions and of the expert; nothing if one is unknown.
 
-    Those of the release's own subsets of the same task and setting; else random actions are simulated, and the
-    package's expert says what it was measured to return.
+    Both of episodes that are cut where the subset's are. Those of the release's own subsets of the same task and
+    setting; else random actions are simulated, and the package's expert says what it was measured to return.
     """
     low, high = (_own(release, record, level) for level in ("random", "expert"))
     if record.setting != FIXED:  # its pairs of start and goal have returns of their own
-        low = _simulated(record.task) if low is None else low
-        high = _bundled(record.task) if high is None else high
+        if high is None and record.max_steps == get_task(record.task).max_steps:
+            high = _bundled(record.task)
+        if low is None and high is not None:
+            low = _simulated(record.task, record.max_steps)
     return {} if low is None or high is None else {"ref_min_score": low, "ref_max_score": high}
 
 
 def _own(release: ReleaseReader, record: SubsetRecord, level: str) -> float | None:
     for subset in release.subsets.values():
-        if (subset.task, subset.level, subset.setting) == (record.task, level, record.setting):
+        like = (subset.task, subset.level, subset.setting) == (record.task, level, record.setting)
+        if like and subset.record.max_steps == record.max_steps and len(subset.returns):
             return float(subset.returns.mean())
     return None
 
 
-def _simulated(task_id: str) -> float:
-    task = get_task(task_id)
-    found = simulate(task, [random_policy(task)], list(range(RANDOM_EPISODES)), SEED, (*NAMES, task_id))
+def _simulated(task_id: str, max_steps: int) -> float:
+    task, names = get_task(task_id), (*NAMES, task_id)
+    found = simulate(task, [random_policy(task)], list(range(RANDOM_EPISODES)), SEED, names, max_steps=max_steps)
     return float(found.reward.astype("float64").sum(axis=1).mean())
 
 

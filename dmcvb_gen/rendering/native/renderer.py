@@ -28,6 +28,10 @@ CHUNK = 256
 """Frames whose poses are held at a time."""
 
 
+OUT_OF_SIGHT = -1e6
+"""Height of a goal that labels are to leave out, meters: below every floor."""
+
+
 class NativeRenderer(Renderer):
     """See the package and `Renderer`. One thread at a time may use a renderer; several renderers work side by side."""
 
@@ -100,7 +104,11 @@ class NativeRenderer(Renderer):
         return out[0], out[1]
 
     def render_labels(
-        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+        self,
+        physics: np.ndarray,
+        exogenous: Exogenous,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
@@ -108,6 +116,8 @@ class NativeRenderer(Renderer):
         depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
         numbers = np.append(self._scene.geoms, -1).astype(np.int16)
         for rows, poses in self._parts(physics, exogenous):
+            if hide_goal:
+                poses["geom_xpos"][:, list(self.task.goal_geoms), 2] = OUT_OF_SIGHT
             deep = np.empty((len(rows), self.size, self.size), np.float32)
             geom = np.empty((len(rows), self.size, self.size), np.int16)
             for column, view in enumerate(indices):
