@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import subprocess
+import threading
 import time
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import write_bytes
 from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.pool import Ray
 from dmcvb_gen.rollout.executors import run_jobs
@@ -260,6 +262,25 @@ def test_nobody_at_the_address_is_one_line(tmp_path, monkeypatch):
 # -- batch systems --------------------------------------------------------------------------------
 
 
+def test_a_folder_is_listed_while_others_write_into_it(whole, tmp_path):
+    name = next(path.relative_to(whole) for path in sorted((whole / "commits").rglob("*.json")))
+    data, path, ended = (whole / name).read_bytes(), tmp_path / "r" / name, threading.Event()
+    write_bytes(path, data)
+
+    def write():
+        while not ended.is_set():
+            write_bytes(path, data)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        for _ in range(300):
+            assert set(FolderSite(tmp_path / "r").listing()) == {name.as_posix()}
+    finally:
+        ended.set()
+        writer.join()
+
+
 def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
     arguments = ["rollout", "--recipe", str(recipe_file), "--out", "s3://bucket/x", "--workers", "4"]
     script = CliRunner().invoke(main, [*arguments, "--slurm-script", "3"]).output
@@ -269,8 +290,10 @@ def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
     bin_.mkdir()
     for name in ("dmcvb-gen", "sbatch"):
         (bin_ / name).write_text(f'#!/bin/bash\necho {name} "$@" >> {tmp_path}/log\n')
-        (bin_ / name).chmod(0o755)
-    for task in (1, 2, 3):
+    (bin_ / "squeue").write_text(f'#!/bin/bash\n[ "$2" = --name=dmcvb-gen-finish-7 ] && grep sbatch {tmp_path}/log\n')
+    for path in bin_.iterdir():
+        path.chmod(0o755)
+    for task in (1, 2, 3, 1):  # the first one is requeued
         environment = os.environ | {"PATH": f"{bin_}:{os.environ['PATH']}", "SLURM_ARRAY_JOB_ID": "7"}
         environment["SLURM_ARRAY_TASK_ID"] = str(task)
         subprocess.run(["bash", str(tmp_path / "job.sh")], check=True, env=environment)
@@ -278,7 +301,16 @@ def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
     base = f"dmcvb-gen rollout --recipe {recipe_file} --workers 4 --out s3://bucket/x"
     assert called[0] == f"{base} --init" and called[1].startswith("sbatch --dependency=afterok:7")
     assert called[1].endswith(f"--wrap={base} --finish")
-    assert called[2:] == [f"{base} --part {task}/3" for task in (1, 2, 3)]
+    assert called[2:] == [*(f"{base} --part {task}/3" for task in (1, 2, 3)), f"{base} --init", f"{base} --part 1/3"]
+
+
+def test_no_slurm_script_is_printed_for_what_each_task_would_refuse(tmp_path):
+    for arguments in (
+        ["walker-wlak"],
+        ["walker-walk", "--distractor", "static", "--backgrounds", str(tmp_path / "no")],
+    ):
+        result = CliRunner().invoke(main, ["rollout", *arguments, "--out", "s3://bucket/x", "--slurm-script", "3"])
+        assert result.exit_code == 2 and "#SBATCH" not in result.output
 
 
 # -- Ray ------------------------------------------------------------------------------------------

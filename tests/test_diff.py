@@ -34,6 +34,12 @@ def test_another_seed_changes_arrays_and_missing_episodes_are_counted(maze_relea
     result = CliRunner().invoke(main, ["diff", str(small_release), str(tmp_path / "copy"), "--json"])
     assert result.exit_code == 1
     assert json.loads(result.output) == [{"subset": NAME, "message": "episodes that are there: 3 and 2"}]
+    shutil.copytree(maze_release, tmp_path / "a")
+    shutil.copytree(maze_release, tmp_path / "b")
+    for folder, shard in (("a", 0), ("b", 1)):
+        (tmp_path / folder / commit_path(MAZE, shard)).unlink()
+    [alone] = diff(tmp_path / "a", tmp_path / "b")
+    assert str(alone) == f"{MAZE}: only one has shards of the episodes 0:1, 1:2"
     found = [str(difference) for difference in diff(small_release, maze_release)]
     assert f"{NAME}: only in the first" in found and f"{MAZE}: only in the second" in found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 
 import numpy as np
@@ -180,6 +181,39 @@ def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
     assert np.array_equal(before, subset.read(array, [0]))
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
+def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made, kind, workers):
+    import torch
+
+    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
+    few = [int(subset.episodes[0])]
+    data = subset.torch(kind, episodes=few, **({"batch_size": 4, "shuffle": False} if kind == "stream" else {}))
+    loader = torch.utils.data.DataLoader(
+        data, batch_size=None if kind == "stream" else 1, num_workers=workers, persistent_workers=workers > 0
+    )
+    seen = []
+    for epoch in (0, 1, 0):
+        data.set_epoch(epoch)
+        seen.append([(batch["pixels"].numpy().copy(), batch["state"].numpy().copy()) for batch in loader])
+    assert len(seen[0]) == len(seen[1]) == len(seen[2]) > 0
+    first, second, third = ([np.concatenate([np.ravel(b[i]) for b in part]) for i in (0, 1)] for part in seen)
+    if kind != "stream":  # which takes another order besides
+        assert np.array_equal(first[1], second[1])
+    assert not np.array_equal(first[0], second[0]) and np.array_equal(first[0], third[0])
+
+
+def test_a_source_in_memory_shows_the_subsets_epoch(made):
+    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
+    source = subset.source(episodes=[int(subset.episodes[0])])
+    before = source[3]["pixels"]
+    assert source.in_memory and source.block is source.block
+    subset.set_epoch(1)
+    assert (source[3]["pixels"] != before).any()
+    subset.set_epoch(0)
+    assert np.array_equal(source[3]["pixels"], before)
+
+
 def test_painted_episodes_are_kept_while_there_is_room(made):
     subset = next(iter(dmcvb_gen.open(str(made / "light"), paint=True).subsets.values()))
     name = subset.picture_names[0]
@@ -218,6 +252,46 @@ def test_a_release_travels_without_pictures_and_is_painted_where_it_arrives(made
     part = run("fetch", url, "--episodes", "0:1", "--paint", "--out", tmp_path / "part")
     assert part.exit_code == 0, part.output
     assert all(list(s.episodes) == [0, 1] and s.pixel_arrays for s in open_release(tmp_path / "part").subsets.values())
+
+
+def test_a_release_that_travels_light_has_a_card_of_its_own(made, tmp_path):
+    shutil.copytree(made / "painted", tmp_path / "r")
+    assert run("card", tmp_path / "r").exit_code == 0
+    for moved in (True, False):
+        sent = run("publish", tmp_path / "r", f"file:{tmp_path / 'there'}", "--no-pixels", "--json")
+        assert sent.exit_code == 0 and (json.loads(sent.stdout)["moved"] > 0) == moved, sent.output
+    assert run("fetch", f"file:{tmp_path / 'there'}", "--out", tmp_path / "here").exit_code == 0
+    checked = run("card", tmp_path / "here", "--check")
+    assert checked.exit_code == 0, checked.output
+    assert "`dmcvb-gen paint` makes the pictures" in (tmp_path / "here/README.md").read_text()
+    assert "`dmcvb-gen paint` makes" not in (tmp_path / "r/README.md").read_text()
+
+
+def test_a_release_that_travels_light_can_be_checked_and_repaired(made, tmp_path):
+    url = f"file:{tmp_path / 'there'}"
+    assert run("publish", made / "painted", url, "--no-pixels").exit_code == 0
+    assert run("fetch", url, "--out", tmp_path / "here").exit_code == 0
+    assert run("regenerate", tmp_path / "here", "--check").exit_code == 0
+    [*_, state] = sorted(tmp_path.glob("here/*/*/*.zarr/state/c/*/**/*"))
+    state.write_bytes(state.read_bytes()[:-9])
+    assert run("regenerate", tmp_path / "here").exit_code == 0 == run("verify", tmp_path / "here").exit_code
+    assert run("paint", tmp_path / "here", "--episodes", "0:1").exit_code == 0
+    checked = run("regenerate", tmp_path / "here", "--check")
+    assert checked.exit_code == 0, checked.output
+
+
+def test_labels_travel_with_a_light_release_and_are_read_there(made, tmp_path):
+    assert run("repaint", made / "painted", "--label", "depth", "--out", tmp_path / "r").exit_code == 0
+    url = f"file:{tmp_path / 'there'}"
+    assert run("publish", tmp_path / "r", url, "--no-pixels").exit_code == 0
+    assert run("fetch", url, "--out", tmp_path / "light").exit_code == 0
+    assert run("fetch", url, "--paint", "--out", tmp_path / "painted").exit_code == 0
+    for name, subset in open_release(tmp_path / "r").subsets.items():
+        depths = [array for array in subset.arrays if array.startswith("depth")]
+        assert depths
+        for folder in ("light", "painted"):
+            for array in depths:
+                assert np.array_equal(open_release(tmp_path / folder)[name].read(array), subset.read(array))
 
 
 @pytest.fixture(scope="module")

@@ -23,13 +23,14 @@ from click.testing import CliRunner
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import CLAIM, publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.recipe import expand, load_recipe
 from dmcvb_gen.store import open_release, transfer
-from dmcvb_gen.store.index import INDEX
+from dmcvb_gen.store.index import INDEX, card_files
 from dmcvb_gen.store.manifest import commit_path
 from dmcvb_gen.store.remote import public, reason
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
@@ -305,6 +306,25 @@ def test_two_publishers_at_once_leave_one_whole_release(s3, tiny, copy, tmp_path
     assert sorted(type(result).__name__ for result in results.values()) == ["Moved", "StoreError"]
     fetch("s3://bucket/x", tmp_path / "r", options=s3.options)
     assert verify(tmp_path / "r").sound
+
+
+def test_a_card_goes_up_with_its_release_and_one_of_another_version_does_not(copy, tmp_path):
+    there = tmp_path / "there"
+    publish(copy, f"file:{there}")
+    assert not (there / "README.md").exists()
+    write_card(copy)
+    assert publish(copy, f"file:{there}").moved == len(card_files(copy)) > 3
+    assert publish(copy, f"file:{there}").moved == 0
+    assert (there / "README.md").read_bytes() == (copy / "README.md").read_bytes()
+    fetch(f"file:{there}", tmp_path / "back")
+    assert check_card(tmp_path / "back") == [] and verify(tmp_path / "back").sound
+    text = (copy / "README.md").read_text()
+    (copy / "README.md").write_text("a card of before")
+    with pytest.raises(StoreError, match="is of another version; run `dmcvb-gen card"):
+        publish(copy, f"file:{tmp_path / 'elsewhere'}")
+    (copy / "README.md").write_text(f"{text}more")
+    with pytest.raises(StoreError, match="does not have its digest; run `dmcvb-gen card`"):
+        publish(copy, f"file:{tmp_path / 'elsewhere'}")
 
 
 def test_a_plain_folder_is_a_target_too(tiny, tmp_path):

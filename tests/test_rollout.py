@@ -25,12 +25,14 @@ from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
 from dmcvb_gen.names import LOCOMOTION, family_of
 from dmcvb_gen.release.regenerate import Regeneration
+from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.rollout import estimate as estimating
 from dmcvb_gen.rollout.estimate import estimate, measurements
 from dmcvb_gen.rollout.plan import make_plan, prepare
 from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.manifest import parse_manifest
 from dmcvb_gen.tasks import get_task
 from tests.conftest import TINY_MAZE, roll_out, small_recipe
 
@@ -108,6 +110,13 @@ def test_killed_again_and_again_it_goes_on_and_ends_with_the_same_bytes(tmp_path
     subprocess.run([*COMMAND, "--out", str(broken)], check=True, **quiet)
     first, second = open_release(tmp_path / "whole").manifest, open_release(broken).manifest
     assert second.complete and digests(first) == digests(second)
+
+
+@pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
+def test_opengl_in_this_process_ends_without_a_word_of_its_own(tmp_path):
+    options = ["--renderer", "opengl", "--episodes", "1", "--max-steps", "2", "--size", "16", "--workers", "1"]
+    done = subprocess.run([*COMMAND, *options, "--out", str(tmp_path / "r")], capture_output=True, text=True)
+    assert done.returncode == 0 and "Traceback" not in done.stderr and "Exception" not in done.stderr, done.stderr
 
 
 @pytest.mark.slow
@@ -367,6 +376,14 @@ def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_thi
     assert load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "val").digest == (
         load_backgrounds("builtin", "val").digest
     )
+
+
+@pytest.mark.parametrize("source", ["../outside", "a/../../outside", "backgrounds/..", ""])
+def test_videos_that_would_be_written_elsewhere_are_refused(small_release, source):
+    facts = json.loads((small_release / "manifest.json").read_text())
+    facts["subsets"][1]["backgrounds"] |= {"source": source}
+    with pytest.raises(StoreError, match="backgrounds"):
+        parse_manifest(json.dumps(facts).encode())
 
 
 def test_the_manifest_names_everything_needed_to_make_it_again(small_release):

@@ -150,6 +150,13 @@ def test_a_nan_state_is_found_with_its_step(copy):
     assert [(finding.episode, finding.step) for finding in found] == [(2, 123)]
 
 
+def test_returns_of_longer_episodes_may_be_higher(tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 1, "max_steps": 600}
+    roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "long")
+    assert open_release(tmp_path / "long")["walker-walk/expert/none"].returns.max() > 1000
+    assert verify(tmp_path / "long").sound
+
+
 def test_a_return_that_does_not_match_is_found(copy):
     def inflate(group):
         returns = group["return"][:]

@@ -72,9 +72,12 @@ SLURM = """#!/bin/bash
 #SBATCH --open-mode=append
 set -euo pipefail
 
-if [ "${{SLURM_ARRAY_TASK_ID:?submit this with sbatch}}" = 1 ] && [ "${{SLURM_RESTART_COUNT:-0}}" = 0 ]; then
+if [ "${{SLURM_ARRAY_TASK_ID:?submit this with sbatch}}" = 1 ]; then
   {init}
-  sbatch --dependency="afterok:$SLURM_ARRAY_JOB_ID" --job-name={name}-finish --requeue --wrap={finish}
+  finish="{name}-finish-$SLURM_ARRAY_JOB_ID"
+  if [ -z "$(squeue --noheader --name="$finish")" ]; then # not there from before a requeue
+    sbatch --dependency="afterok:$SLURM_ARRAY_JOB_ID" --job-name="$finish" --requeue --wrap={finish}
+  fi
 fi
 exec {work} --part "$SLURM_ARRAY_TASK_ID/{count}"
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -254,6 +255,7 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
 @contextlib.contextmanager
 def _left_behind(path):
     """A copy (of links) of a release without its pictures, beside it."""
+    from dmcvb_gen.release.card import CROISSANT, README, write_card
     from dmcvb_gen.release.paint import without_pictures
     from dmcvb_gen.store.remote import storage_errors
 
@@ -262,6 +264,9 @@ def _left_behind(path):
         made = tempfile.TemporaryDirectory(dir=folder.resolve().parent, prefix=f".{folder.name}-light-")
     with made as light:
         without_pictures(folder, light)
+        if (folder / README).is_file():  # its own card says what it has
+            shutil.copyfile(folder / CROISSANT, Path(light) / CROISSANT)  # which knows the day and the place
+            write_card(light)
         yield light
 
 

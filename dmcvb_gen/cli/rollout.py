@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import time
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from dmcvb_gen.names import (
     family_of,
     task_folder,
 )
-from dmcvb_gen.store.remote import public
+from dmcvb_gen.store.remote import is_url, public
 
 
 def _out_default(name: str) -> str:
@@ -109,7 +110,7 @@ def rollout(
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
     from dmcvb_gen.rollout.estimate import raw_bytes
-    from dmcvb_gen.rollout.plan import finish_site, make_plan, prepare
+    from dmcvb_gen.rollout.plan import describe, finish_site, make_plan, prepare
     from dmcvb_gen.rollout.site import site_of
 
     check_way(context)
@@ -118,6 +119,8 @@ def rollout(
     options["renderer"] = "warp" if by_warp else options["renderer"]
     chosen = _recipe(context, options, going_on=bool(out))
     if options["slurm_script"]:
+        if chosen:
+            describe(chosen, device, not no_pixels)  # or says why each task would be refused
         return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
     scratch = (options["scratch"], options["scratch_size"])
     site = site_of(out or _out_default(chosen.name), options["options"], *scratch, workers)
@@ -190,7 +193,9 @@ def _run(plan, workers, as_json, whole=True):
     kept = f", {plan.done} shards were there already" if plan.done else ""
     rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
     click.echo(f"{place}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
-    click.echo(f"Look at it: dmcvb-gen info {place}; dmcvb-gen preview {place}")
+    named = shlex.quote(str(place))
+    painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
+    click.echo(f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else ""))
 
 
 def parse_range(text: str | None) -> tuple[int, int] | None:
@@ -383,6 +388,7 @@ def _show_plan(plan, cost, workers, as_json):
     for name, (episodes, steps, size, hours) in rows.items():
         table.add_row(name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
     console = Console()
+    console.width = max(console.width, 110)  # names of subsets are not cut, piped into a file either
     console.print(table)
     spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
     console.print(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,18 +74,24 @@ def _shards(one: Subset, other: Subset) -> list[Difference]:
     """Shards of the same episodes that have other bytes, and in which arrays."""
     mine = {commit.episodes: commit for commit in one.commits.values()}
     theirs = {commit.episodes: commit for commit in other.commits.values()}
+    found = []
+    alone = sorted(mine.keys() ^ theirs.keys())
+    if alone and len(one.episodes) == len(other.episodes):  # else their number has been said
+        found.append(Difference(one.name, f"only one has shards of the episodes {_spans(alone)}"))
     arrays: dict[str, list[tuple[int, int]]] = {}
     for episodes in sorted(mine.keys() & theirs.keys()):
         files = [_digests(mine[episodes]), _digests(theirs[episodes])]
         for array in sorted(files[0].keys() | files[1].keys()):
             if files[0].get(array) != files[1].get(array):
                 arrays.setdefault(array, []).append(episodes)
-    found = []
     for array, spans in arrays.items():
-        named = ", ".join(f"{first}:{last}" for first, last in spans[:SHOWN])
-        more = f" and {len(spans) - SHOWN} shards more" if len(spans) > SHOWN else ""
-        found.append(Difference(one.name, f"{array} has other bytes in the episodes {named}{more}"))
+        found.append(Difference(one.name, f"{array} has other bytes in the episodes {_spans(spans)}"))
     return found
+
+
+def _spans(spans: Sequence[tuple[int, int]]) -> str:
+    named = ", ".join(f"{first}:{last}" for first, last in spans[:SHOWN])
+    return named + (f" and {len(spans) - SHOWN} shards more" if len(spans) > SHOWN else "")
 
 
 def _digests(commit: CommitRecord) -> dict[str, str]:

@@ -20,7 +20,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, sha256_file
 from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.store.growth import is_grown_from
-from dmcvb_gen.store.index import INDEX, Index, is_replaced, keeps, parse_index
+from dmcvb_gen.store.index import INDEX, Index, is_card, is_replaced, keeps, parse_index
 from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest, parse_manifest, subset_path
 from dmcvb_gen.store.remote import is_refusal, reason, refused, storage_errors
 from dmcvb_gen.store.shards import ShardKey
@@ -204,9 +204,8 @@ def _check_local(root: Path, file: FileRecord) -> None:
     with storage_errors(root / file.path):
         digest = sha256_file(root / file.path)
     if digest != file.sha256:
-        raise StoreError(
-            f"{root / file.path} does not have its digest; run `dmcvb-gen regenerate` on the release first"
-        )
+        cure = "card" if is_card(file.path) else "regenerate"
+        raise StoreError(f"{root / file.path} does not have its digest; run `dmcvb-gen {cure}` on the release first")
 
 
 def _digests(path: Path) -> set[str]:

@@ -31,7 +31,7 @@ from dmcvb_gen.rollout.painting import frame_count, paint, renderers
 from dmcvb_gen.rollout.plan import painting_facts, subset_attributes
 from dmcvb_gen.rollout.recipe import check_size
 from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.index import INDEX, refuse_altered_folder
+from dmcvb_gen.store.index import INDEX, ZARR_JSON, refuse_altered_folder
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
@@ -456,8 +456,11 @@ def replace_pixels(record: SubsetRecord) -> SubsetRecord:
 
 def _strip(root: Path, subset: Subset, out: Path) -> None:
     """Link a subset's files but its pictures, and write records that know the digests of those."""
-    folders = {subset.paths[name] for name in subset.arrays if picture_of(name) is not None}
     start = f"{subset.name}.zarr/"
+    folders = {subset.paths[name] for name in subset.arrays if picture_of(name) is not None}
+    for path in set(subset.paths.values()) - folders:
+        name = f"{start}{path}/{ZARR_JSON}"
+        copy_file(root / name, out / name)
     for shard, commit in subset.commits.items():
         left = [file for file in commit.files if file.path.removeprefix(start).split("/c/")[0] in folders]
         kept = [file for file in commit.files if file not in left]

@@ -105,8 +105,9 @@ def publish(
         return Moved(len(index.files), total, publish_to_hub(root, manifest, index, url, tick))
     filesystem, base = file_system(url, options)
     place = public(url)
-    before = _published(filesystem, place, base, index, manifest)
-    if before == ():
+    _check_card(root, manifest)
+    before, same = _published(filesystem, place, base, index, manifest)
+    if same and before is not None and set(index.files) <= set(before):
         return Moved(len(index.files), total, 0)
     fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
     fresh = fresh and before is None and read_object(filesystem, place, f"{base}/{INDEX}") is None
@@ -132,23 +133,38 @@ def publish(
     return Moved(len(index.files), total, sum(results))
 
 
+def _check_card(root: Path, manifest: Manifest) -> None:
+    """Refuse a card of another version: a release that has grown since."""
+    page = root / "README.md"
+    with storage_errors(page):
+        old = page.is_file() and str(manifest.digest) not in page.read_text(errors="replace")
+    if old:
+        raise StoreError(f"the card of {root} is of another version; run `dmcvb-gen card {root}` first")
+
+
 def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     """Files in the order in which they go up: new ones first, then those that take the place of an older version's."""
     late = [file for file in todo if is_replaced(file.path)]
     return [part for part in ([file for file in todo if file not in set(late)], late) if part]
 
 
-def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tuple[FileRecord, ...] | None:
-    """The files of an older version that this one has grown from; () for this very one, None where none is.
+def _published(
+    filesystem, place, base, index: Index, manifest: Manifest
+) -> tuple[tuple[FileRecord, ...] | None, bool]:
+    """The files that are listed there, and whether the manifest there is this one, not one that it has grown from.
+
+    Returns:
+      (files, same); (None, False) where no release is.
 
     Raises:
       StoreError: another release is there.
     """
     found = read_object(filesystem, place, f"{base}/{MANIFEST}")
     if found is None:
-        return None
+        return None, False
     if files.sha256_bytes(found) == index.manifest_sha256:
-        return ()
+        listed = read_object(filesystem, place, f"{base}/{INDEX}")
+        return index.files if listed is None else parse_index(listed, f"{place}/{INDEX}").files, True
     what = "something else"
     try:
         other = parse_manifest(found, f"{place}/{MANIFEST}")
@@ -156,7 +172,7 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
         if is_grown_from(manifest, other):
             before = parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
             if keeps(index, before):
-                return before
+                return before, False
     except StoreError:
         pass
     raise StoreError(

@@ -34,6 +34,7 @@ from dmcvb_gen.rollout.plan import copy_inputs, create_groups
 from dmcvb_gen.rollout.site import FolderSite
 from dmcvb_gen.store.index import ZARR_JSON, restore_index, restored_commit, trusted_index
 from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
+from dmcvb_gen.store.pictures import SHOWN
 from dmcvb_gen.store.reader import load_manifest
 from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
@@ -181,7 +182,7 @@ class Regeneration:
                 record = shards[commit.subset, commit.shard]
                 promised = known.commit(record, commit.shard)
                 held.add(commit)
-                equal = None if promised is None else promised.same_data(commit)
+                equal = None if promised is None else _agree(promised, commit)
                 was = known.damage(record, commit.shard)
                 outcomes.append(_outcome(root, folder, record, commit, was, equal))
                 for file in commit.files:
@@ -237,7 +238,7 @@ class Regeneration:
                 held.add(commit)
                 waiting.append((record, commit, was))
             else:
-                settle(record, commit, was, None if promised is None else promised.same_data(commit))
+                settle(record, commit, was, None if promised is None else _agree(promised, commit))
         verdicts = {record.name: held.equal(record) for record, _, _ in waiting}
         for record, commit, was in waiting:
             settle(record, commit, was, verdicts[record.name])
@@ -272,7 +273,7 @@ class Regeneration:
         for commit in commits:
             record = shards[commit.subset, commit.shard]
             promised = known.commit(record, commit.shard)
-            equal = promised.same_data(commit) if promised else None
+            equal = _agree(promised, commit) if promised else None
             if promised is None and record.digest and digests[record.name]:
                 equal = digests[record.name] == record.digest
             outcomes.append(_outcome(root, out, record, commit, None, equal))
@@ -281,14 +282,29 @@ class Regeneration:
     def _make(self, manifest, shards, folder, tick, copy=False) -> Iterator[CommitRecord]:
         """Make shards in `folder` (with the policies and videos that they come from, if they are to be copied)."""
         check_makeable(manifest)
+        root, _ = load_manifest(self.root)
         records = _unique(shards.values())
-        inputs = release_inputs(Path(self.root), records, self.backgrounds)
+        inputs = release_inputs(root, records, self.backgrounds)
         if copy:
             copy_inputs(folder, records, inputs)
         for result in run_jobs(
             make_jobs(manifest, shards, FolderSite(folder), inputs, self.device), self.workers, tick
         ):
             yield from result.commits
+
+
+def _agree(promised: CommitRecord, made: CommitRecord) -> bool:
+    """Whether a shard has the bytes that it should have; pictures that only one of both knows do not count."""
+    files = [{file.path: file for file in (*commit.pictures, *commit.files)} for commit in (promised, made)]
+    start = len(subset_path(made.subset)) + 1
+    alone = {path[start:].split("/c/")[0] for path in files[0].keys() ^ files[1].keys()}
+    bare = {"files": (), "pictures": (), "painted": True}
+    rest = [commit.model_copy(update=bare) for commit in (promised, made)]
+    return (
+        rest[0].same_data(rest[1])
+        and all(name.startswith(SHOWN) for name in alone)  # all kinds of pictures do
+        and all(files[0][path] == files[1][path] for path in files[0].keys() & files[1].keys())
+    )
 
 
 def check_makeable(manifest: Manifest) -> None:

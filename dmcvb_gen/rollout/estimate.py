@@ -70,7 +70,7 @@ class Estimate:
     rates: dict[str, Rate]
 
     def seconds(self, workers: int) -> float:
-        return self.core_seconds / max(workers, 1)
+        return self.core_seconds / max(min(workers, self.jobs), 1)  # a job is one worker's
 
 
 @dataclass(frozen=True)

@@ -390,8 +390,9 @@ def copy_inputs(root: Path, records: Iterable[SubsetRecord], inputs: Mapping[str
             for policy, source in zip(record.policies, inputs[record.name].policies, strict=True):
                 if policy.path and not (root / policy.path).exists():
                     copy_file(source, root / policy.path)
-            if record.backgrounds and record.backgrounds["source"] != BUILTIN:
-                _copy_videos(inputs[record.name].backgrounds, root / record.backgrounds["source"])
+            videos = (record.backgrounds or {}).get("source", BUILTIN)
+            if videos != BUILTIN and not Path(videos).is_absolute():  # absolute: releases of version 1 hold no copies
+                _copy_videos(inputs[record.name].backgrounds, root / videos)
     except OSError as error:
         raise StoreError(f"cannot write to {root}: {error.strerror or error}; choose a writable --out") from None
 

@@ -193,9 +193,16 @@ class FolderSite(Site):
 
     def listing(self):
         with storage_errors(self.root):
-            found = {path.relative_to(self.root).as_posix(): path for path in self.root.rglob("*") if path.is_file()}
-            stats = {name: path.stat() for name, path in found.items() if not name.startswith(".")}
-            return {name: Listed(stat.st_size, stat.st_mtime) for name, stat in stats.items()}
+            found = {}
+            for folder, folders, names in os.walk(self.root):  # passes over what others remove meanwhile
+                folders[:] = [name for name in folders if not name.startswith(".")]
+                for name in names:
+                    path = Path(folder) / name
+                    with contextlib.suppress(FileNotFoundError):
+                        if not name.startswith("."):  # of files in the making
+                            stat = path.stat()
+                            found[path.relative_to(self.root).as_posix()] = Listed(stat.st_size, stat.st_mtime)
+            return found
 
     def metadata(self, record, folder):
         for path in metadata_paths(self.root, record):

@@ -134,6 +134,14 @@ class SubsetRecord(_Model):
     digest: Digest | None = None
     only_shown: bool = False
 
+    @pydantic.field_validator("backgrounds")
+    @classmethod
+    def _stays_inside(cls, backgrounds: dict[str, Any] | None) -> dict[str, Any] | None:
+        source = (backgrounds or {}).get("source")
+        if source is not None and not Path(str(source)).is_absolute():  # absolute: in releases of version 1, only read
+            check_relative_path(str(source))
+        return backgrounds
+
     @property
     def imported(self) -> bool:
         """Whether it came from DMC-VB's published data, which have no physics states and no labels: nothing of it can

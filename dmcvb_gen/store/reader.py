@@ -345,8 +345,10 @@ def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
       root: the folder, or a manifest's file, whose folder may hold nothing else.
 
     Raises:
-      StoreError: there is none, it is damaged or cannot be read.
+      StoreError: there is none, it is a URL, damaged, or cannot be read.
     """
+    if is_url(str(root)):
+        raise StoreError(f"{public(str(root))} is not a local folder; fetch it first")
     root = Path(root)
     with storage_errors(root):
         if root.is_file():

@@ -13,6 +13,7 @@ import fsspec
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import remove_partial, replacing, sha256_file
+from dmcvb_gen.store.index import is_card
 from dmcvb_gen.store.manifest import FileRecord
 from dmcvb_gen.store.remote import NO_ROOM, is_refusal, reason, refused, storage_errors
 
@@ -135,7 +136,8 @@ def upload(
     with storage_errors(local):
         sound = local.is_file() and local.stat().st_size == record.bytes and sha256_file(local) == record.sha256
     if not sound:
-        raise StoreError(f"{local} does not have its digest; run `dmcvb-gen regenerate` on the release first")
+        cure = "card" if is_card(record.path) else "regenerate"
+        raise StoreError(f"{local} does not have its digest; run `dmcvb-gen {cure}` on the release first")
     options: dict[str, Any] = {"chunksize": PART} if protocol(filesystem) in ("s3", "s3a") else {}
 
     looked = not fresh

@@ -19,6 +19,7 @@ import zarr
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, copy_file, parse_json, remove_partial, sha256_file
+from dmcvb_gen.names import LABEL_TYPES
 from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import INDEX, ZARR_JSON, metadata_paths, refuse_altered_folder, write_release
 from dmcvb_gen.store.manifest import (
@@ -156,7 +157,7 @@ def _put_metadata(folder: Path, path: Path, keep: bool = False) -> None:
 
 
 def add_arrays(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
-    """Give a subset that has shards already more arrays (metadata alone); its data stay as they are.
+    """Give a subset that has shards already more arrays (metadata alone); its data, and labels a pixel, stay.
 
     Args:
       specs: of all arrays that the subset then has.
@@ -178,6 +179,9 @@ def _write_metadata(path: Path, specs: tuple[ArraySpec, ...], attributes: dict, 
         group = zarr.create_group(folder, attributes=attributes, overwrite=True)
         version = attributes.get("schema_version", SCHEMA_VERSION)
         create_arrays(group, specs, *shape, schema_version=version)  # type: ignore[misc]
+        for label in LABEL_TYPES:
+            for there in path.glob(f"{label}*/**/{ZARR_JSON}"):
+                copy_file(there, Path(folder) / there.relative_to(path))
         _put_metadata(Path(folder), path, keep)
 
 
