@@ -148,9 +148,7 @@ def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     return [part for part in ([file for file in todo if file not in set(late)], late) if part]
 
 
-def _published(
-    filesystem, place, base, index: Index, manifest: Manifest
-) -> tuple[tuple[FileRecord, ...] | None, bool]:
+def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tuple[tuple[FileRecord, ...] | None, bool]:
     """The files that are listed there, and whether the manifest there is this one, not one that it has grown from.
 
     Returns:
