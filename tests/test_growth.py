@@ -16,7 +16,9 @@ from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.plan import make_plan, prepare
+from dmcvb_gen.rollout.executors import run_jobs
+from dmcvb_gen.rollout.plan import finish, finish_site, make_plan, prepare
+from dmcvb_gen.rollout.site import site_of
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.growth import merged, next_version
 from dmcvb_gen.store.manifest import PolicyRecord
@@ -104,6 +106,9 @@ def test_damage_never_becomes_what_is_right(grown, tmp_path, name, damage):
         path.unlink()
     roll_out(walker(), tmp_path / "copy")  # nothing to do, and nothing done
     assert (tmp_path / "copy/manifest.json").read_bytes() == manifest and not verify(tmp_path / "copy").sound
+    for there in (tmp_path / "copy", f"file://{tmp_path}/copy"):
+        with pytest.raises(StoreError, match=f"{path.name}.*(damaged|missing); mend it first"):
+            finish_site(site_of(there, scratch=tmp_path / "scratch"))
     with pytest.raises(StoreError, match=f"{path.name}.*(damaged|missing); mend it first: dmcvb-gen regenerate"):
         prepare(make_plan(walker({"episodes": 3}), tmp_path / "copy"))
     Regeneration(tmp_path / "copy").repair()
@@ -182,6 +187,29 @@ def test_a_published_release_grows_by_its_new_shards_alone(grown, tmp_path):
     assert verify(tmp_path / "back").sound
     with pytest.raises(StoreError, match="never changes"):
         publish(grown.parent / "before", url)
+
+
+@pytest.mark.parametrize("bucket", [False, True], ids=["folder", "bucket"])
+def test_the_last_to_finish_keeps_what_others_added_meanwhile(tmp_path, bucket):
+    """Walker's rollout ends while somebody has begun to add a maze; then that one ends."""
+    there = f"file://{tmp_path}/r" if bucket else str(tmp_path / "r")
+    maze = small_recipe(seed=8, subsets=[{"tasks": TINY_MAZE, "levels": "random", "settings": "hidden", "episodes": 1}])
+
+    def begun(recipe):
+        return prepare(make_plan(recipe, site_of(there, scratch=tmp_path / "scratch")))
+
+    def done(plan):
+        for _ in run_jobs(plan.jobs):
+            pass
+        return finish(plan)
+
+    first = begun(walker())
+    second = begun(maze)
+    assert not done(first).complete and len(open_release(there).manifest.subsets) == 2
+    assert done(second).complete and verify(tmp_path / "r").sound
+    written = (tmp_path / "r/manifest.json").read_bytes()
+    assert finish_site(site_of(there, scratch=tmp_path / "scratch")).complete
+    assert (tmp_path / "r/manifest.json").read_bytes() == written
 
 
 def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there(grown, tmp_path, monkeypatch):

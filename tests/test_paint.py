@@ -15,7 +15,10 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.release import paint
+from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.paint import paint_release, without_pictures
+from dmcvb_gen.release.publish import publish
+from dmcvb_gen.release.verify import verify
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import write_release
 from dmcvb_gen.store.manifest import commit_path
@@ -90,10 +93,31 @@ def test_two_who_paint_a_release_end_in_what_one_ends_in(made, tmp_path, monkeyp
     assert {n: v for n, v in found.items() if n != ".lock"} == {n: v for n, v in wanted.items() if n != ".lock"}
 
 
+def test_the_last_painter_keeps_how_others_painted_meanwhile(made, tmp_path, monkeypatch):
+    """One subset at 40 pixels, painted by another while this one paints the other subset at 48."""
+    shutil_copy(made / "light", tmp_path / "copy")
+    mine, other = list(open_release(made / "light").subsets)
+    work = paint.paint_shard
+
+    def meanwhile(*arguments, **options):
+        monkeypatch.setattr(paint, "paint_shard", work)
+        (making := tmp_path / "copy" / f"{mine}.zarr/x.foreign.partial").touch()
+        paint_release(tmp_path / "copy", [other], painter=paint.Painter(look=paint.Look(size=40)))
+        assert making.exists()  # somebody is still at work
+        return work(*arguments, **options)
+
+    monkeypatch.setattr(paint, "paint_shard", meanwhile)
+    paint_release(tmp_path / "copy", [mine], painter=paint.Painter(look=paint.Look(size=48)))
+    release = open_release(tmp_path / "copy")
+    assert {name: subset.record.size for name, subset in release.subsets.items()} == {mine: 48, other: 40}
+    assert verify(tmp_path / "copy").sound and release.manifest.complete
+    assert not list((tmp_path / "copy").rglob("*.foreign.partial"))
+
+
 def test_painting_goes_on_where_it_was_stopped_before_the_digests(made, tmp_path, monkeypatch):
     shutil_copy(made / "light", tmp_path / "copy")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(paint, "finish_release", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(paint, "finish_together", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         paint_release(tmp_path / "copy")
     assert open_release(tmp_path / "copy").manifest.digest is None
     paint_release(tmp_path / "copy")
@@ -252,6 +276,30 @@ def test_a_release_travels_without_pictures_and_is_painted_where_it_arrives(made
     part = run("fetch", url, "--episodes", "0:1", "--paint", "--out", tmp_path / "part")
     assert part.exit_code == 0, part.output
     assert all(list(s.episodes) == [0, 1] and s.pixel_arrays for s in open_release(tmp_path / "part").subsets.values())
+
+
+def test_pictures_that_are_published_come_to_a_light_release(made, tmp_path):
+    url, here = f"file://{tmp_path}/there", tmp_path / "here"
+    publish(made / "painted", url)
+    shutil_copy(made / "light", here)
+    name, other = open_release(here).subsets
+    for only, whole in (([name], False), ([], True)):
+        fetch(url, here, only, None if whole else (0, 1))
+        release = open_release(here)
+        painted = {n: [s for s, c in sub.commits.items() if c.painted] for n, sub in release.subsets.items()}
+        assert painted == ({name: [0, 1], other: [0, 1]} if whole else {name: [0], other: []})
+        assert verify(here).sound and np.any(release[name].episode(0)[release[name].pixel_arrays[0]])
+    mine, theirs = files(here), files(made / "painted")
+    assert {n: v for n, v in mine.items() if n != ".lock"} == {n: v for n, v in theirs.items() if n != ".lock"}
+
+
+def test_a_part_of_the_published_pictures_and_the_rest_painted_are_the_release(made, tmp_path):
+    publish(made / "painted", f"file://{tmp_path}/there")
+    shutil_copy(made / "light", tmp_path / "here")
+    fetch(f"file://{tmp_path}/there", tmp_path / "here", episodes=(0, 1))
+    assert verify(tmp_path / "here").sound
+    done = paint_release(tmp_path / "here")
+    assert done.shards == 2 and done.manifest.digest == open_release(made / "painted").manifest.digest
 
 
 def test_a_release_that_travels_light_has_a_card_of_its_own(made, tmp_path):

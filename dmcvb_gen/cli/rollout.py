@@ -145,10 +145,7 @@ def _tell_begun(plan, as_json):
 
 
 def _finish(site, finish_site, as_json):
-    manifest = site.manifest()
-    if manifest is None:
-        raise click.UsageError(f"{site.place} holds no release; begin it with --init.")
-    manifest = finish_site(site, manifest)
+    manifest = finish_site(site)
     missing = [subset.name for subset in manifest.subsets if subset.digest is None]
     if as_json:
         print_json({"out": site.place, "complete": manifest.complete, "incomplete": missing})

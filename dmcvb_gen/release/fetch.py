@@ -256,7 +256,7 @@ class Arrival:
                 coming = [file for _, commit in arrival.commits.values() for file in commit.files]
                 expect(tick, sum(file.bytes for file in [*coming, *arrival._metadata]))
                 arrival._download([(None, file) for file in arrival._metadata], lambda key: None)
-                _write_part(out, source, arrival.local, only, episodes)
+                _write_part(out, source, arrival._base(), only, episodes)
                 yield arrival
 
     @property
@@ -277,7 +277,8 @@ class Arrival:
     def _keep_painted(self) -> None:
         """See which subsets were painted here: their metadata and the records of painted shards stay."""
         records = {record.name: record for record in self.source.manifest.subsets}
-        here = {r.name: r for r in (self.local.subsets if self.local else ()) if _bare(r) != _bare(records[r.name])}
+        local = self.local.subsets if self.local else ()
+        here = {r.name: r for r in local if r.pixels and _bare(r) != _bare(records[r.name])}
         folders = tuple(f"{subset_path(name)}/" for name in here)
         self._metadata = [
             file for file in self._metadata if not (file.path.startswith(folders) and file.path.endswith("/zarr.json"))
@@ -287,6 +288,14 @@ class Arrival:
                 published = self.commits.get((name, shard))
                 if published and commit.painted and set(published[1].files) <= set(commit.files):
                     self._kept[name, shard] = commit
+
+    def _base(self) -> Manifest:
+        """The manifest that is here; subsets without pictures, of which some come with them now, are the source's."""
+        if self.local is None:
+            return self.source.manifest
+        coming = {record.name: record for record in self.shards.values()}
+        subsets = [coming.get(r.name, r) if not r.pixels else r for r in self.local.subsets]
+        return self.local.model_copy(update={"subsets": tuple(subsets)})
 
     def _check_room(self, with_pictures: bool) -> None:
         wanted = [file for _, commit in self.commits.values() for file in commit.files] + self._metadata
@@ -359,7 +368,8 @@ class Arrival:
         manifest = local_manifest(out)
         commits = {record.name: read_commits(out, record) for record in source.manifest.subsets}
         whole = all(len(commits[record.name]) == shard_count(record) for record in source.manifest.subsets)
-        if whole and [*map(_bare, manifest.subsets)] == [*map(_bare, source.manifest.subsets)]:
+        as_there = all(c.painted == r.pixels for r in source.manifest.subsets for c in commits[r.name].values())
+        if whole and as_there and [*map(_bare, manifest.subsets)] == [*map(_bare, source.manifest.subsets)]:
             files.write_bytes(out / INDEX, source.index_text)
             files.write_bytes(out / MANIFEST, source.manifest_text)
             return source.manifest
@@ -441,9 +451,8 @@ def _is_strange(out: Path, manifest: Manifest) -> bool:
     return any(path.name not in ours | set(CARD_FILES) and path.suffix != files.PARTIAL for path in out.iterdir())
 
 
-def _write_part(out: Path, source: Source, local: Manifest | None, only, episodes) -> None:
+def _write_part(out: Path, source: Source, base: Manifest, only, episodes) -> None:
     """A manifest that says that this is a part, and which: what is here while files come, and until all are."""
-    base = local or source.manifest
     entry = {
         "kind": "fetch",
         "from": source.public_name,

@@ -46,7 +46,7 @@ from dmcvb_gen.store.reader import Subset
 from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import ShardKey, chosen_shards
-from dmcvb_gen.store.writer import add_arrays, finish_release, only_writer, write_pictures
+from dmcvb_gen.store.writer import add_arrays, finish_release, finish_together, only_writer, write_pictures
 from dmcvb_gen.tasks import get_task
 
 ABOUT_THE_PLACE = ("device",)
@@ -180,7 +180,7 @@ def paint_release(
         waiting.put(key)
     found = tuple(studio.paint(waiting))
     unfinished = todo or studio.manifest.digest is None  # or one who painted it all was stopped before the end
-    manifest = finish_release(root, studio.manifest) if unfinished else studio.manifest
+    manifest = finish_together(root) if unfinished else studio.manifest
     return studio.report(manifest, found)
 
 

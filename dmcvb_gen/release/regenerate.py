@@ -43,6 +43,7 @@ from dmcvb_gen.store.writer import (
     commit_path,
     find_array,
     finish_release,
+    finish_together,
     mark_created,
     read_commits,
     shard_count,
@@ -213,7 +214,7 @@ class Regeneration:
                     known.restore(folder, record)
             outcomes = self._repair(known, shards, folder, tick)
         if not manifest.complete and any(outcome.repaired for outcome in outcomes):
-            finish_release(root, manifest)
+            finish_together(root)
         elif manifest.complete:
             copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
             restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})

@@ -41,7 +41,7 @@ from dmcvb_gen.store.pictures import stored_pictures, view_arrays
 from dmcvb_gen.store.reader import Subset, load_manifest
 from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
-from dmcvb_gen.store.writer import create_subset, finish_release, read_commits, start_release
+from dmcvb_gen.store.writer import create_subset, finish_together, read_commits, start_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -162,7 +162,7 @@ def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> M
             pass
     finally:
         leave(site)
-    return finish_release(out, manifest)
+    return finish_together(out)
 
 
 def _check_heard(request: Repainting, records: Sequence[SubsetRecord]) -> None:

@@ -22,7 +22,15 @@ from dmcvb_gen.rollout.painting import check_renderer, renderer_for
 from dmcvb_gen.rollout.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.rollout.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.store.growth import merged
-from dmcvb_gen.store.index import INDEX, POLICIES, parse_index, refuse_altered, watched
+from dmcvb_gen.store.index import (
+    INDEX,
+    POLICIES,
+    parse_index,
+    refuse_altered,
+    refuse_altered_folder,
+    trusted_index,
+    watched,
+)
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     FileRecord,
@@ -36,7 +44,7 @@ from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.transfer import in_parallel
-from dmcvb_gen.store.writer import create_subset, finish_release, mark_created, start_release
+from dmcvb_gen.store.writer import create_subset, finish_release, finish_together, mark_created, start_release
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
@@ -444,7 +452,7 @@ def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any
 
 def finish(plan: Plan) -> Manifest:
     """Write the digests of what is whole into the manifest, when all workers are through."""
-    return plan.manifest if _is_done(plan.manifest, plan) else finish_site(plan.site, plan.manifest)
+    return plan.manifest if _is_done(plan.manifest, plan) else finish_site(plan.site)
 
 
 def _is_done(manifest: Manifest, plan: Plan) -> bool:
@@ -452,14 +460,25 @@ def _is_done(manifest: Manifest, plan: Plan) -> bool:
     return manifest.complete and manifest.digest is not None and not plan.jobs
 
 
-def finish_site(site: Site, manifest: Manifest) -> Manifest:
-    """Write a release's digests: of every file, of the subsets that are whole, and of all.
+def finish_site(site: Site) -> Manifest:
+    """Write a release's digests: of every file, of the subsets that are whole, and of all; those it has, it keeps.
 
     Raises:
-      StoreError: a file is missing, or the place cannot be written.
+      StoreError: nothing was begun there, a file is missing or not what it was, or the place cannot be written.
     """
+    manifest = site.manifest()
+    if manifest is None:
+        raise StoreError(f"{site.place} holds no release; begin it with --init")
     if isinstance(site, FolderSite):
-        return finish_release(site.root, manifest)
+        whole = manifest.complete and manifest.digest and trusted_index(site.root, manifest)
+        if not whole:
+            return finish_together(site.root)
+        refuse_altered_folder(site.root, manifest)
+        return manifest
+    bucket = cast(BucketSite, site)
+    _refuse_altered_bucket(bucket, manifest, {})
+    if manifest.complete and manifest.digest and site.read(INDEX):
+        return manifest
     commits = site.commits(manifest.subsets)
     with _desk(site) as mirror:
         shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
@@ -473,5 +492,5 @@ def finish_site(site: Site, manifest: Manifest) -> Manifest:
         in_parallel(bring, small, CONNECTIONS, ignore)
         manifest = finish_release(mirror, manifest, commits)
         for name in (INDEX, MANIFEST):
-            cast(BucketSite, site).write(name, (mirror / name).read_bytes())
+            bucket.write(name, (mirror / name).read_bytes())
     return manifest

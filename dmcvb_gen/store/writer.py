@@ -369,6 +369,19 @@ def finish_release(
     environments = tuple(environment for i, environment in enumerate(made) if environment not in made[:i])
     facts = {"subsets": tuple(subsets), "complete": complete, "environments": environments or manifest.environments}
     manifest = write_release(root, manifest.model_copy(update=facts), found)
+    painted = all(commit.painted for shards in found.values() for commit in shards.values())
     with storage_errors(root, "write to"):
-        remove_partial(root, foreign=complete)  # where all is committed, nobody has anything left to make
+        remove_partial(root, foreign=complete and painted)  # where all is there, nobody has anything left to make
     return manifest
+
+
+def finish_together(root: Path) -> Manifest:
+    """See `finish_release`; of what the manifest says by now, for releases that others may have grown meanwhile.
+
+    Raises:
+      StoreError: see there; or what the release has digests of already is not what it was.
+    """
+    with storage_errors(root, "write to"), only_writer(root, wait=LOCK_SECONDS):
+        manifest = local_manifest(root)
+        refuse_altered_folder(root, manifest)
+        return finish_release(root, manifest)
