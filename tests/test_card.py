@@ -139,7 +139,7 @@ def test_a_fitting_card_passes_and_a_lying_one_is_found(copy):
     assert any("episodes.parquet cannot be read" in finding for finding in check_card(copy))
     result = CliRunner().invoke(main, ["card", str(copy), "--check"])
     assert result.exit_code == 1 and "CHANGELOG.md does not speak of version 1.0.1" in result.output
-    assert "picture" in result.output
+    assert "contact_sheet.png is missing" in result.output
 
 
 def test_a_changelog_of_the_authors_is_kept(copy):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 from click.testing import CliRunner
@@ -44,7 +45,7 @@ def test_another_seed_changes_arrays_and_missing_episodes_are_counted(maze_relea
     assert f"{NAME}: only in the first" in found and f"{MAZE}: only in the second" in found
 
 
-def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tmp_path):
+def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tmp_path, monkeypatch):
     there = tmp_path / "there"
     publish(maze_release, f"file://{there}/mazes")
     (there / "half").mkdir()
@@ -64,6 +65,20 @@ def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tm
     shard.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     result = run(main, ["verify", url, "--all"])
     assert result.exit_code == 1 and f"{shard.relative_to(there / 'mazes')} does not have its digest" in result.output
+    shard.unlink()
+    monkeypatch.setattr("dmcvb_gen.release.verify_url.SAMPLE_FILES", 1)  # of many files, that is not among them
+    result = run(main, ["verify", url])
+    assert result.exit_code == 1 and f"{shard.relative_to(there / 'mazes')} is missing" in result.output
+    shard.write_bytes(data)
+    assert run(main, ["verify", url]).exit_code == 0
+    record = there / "mazes" / commit_path(MAZE, 0)
+    text = record.read_text()
+    record.write_text(text.replace('"bytes": ', '"bytes": 1', 1))
+    result = run(main, ["verify", url])
+    assert result.exit_code == 1 and "commit record and files.json do not agree about" in result.output
+    assert "do not give the digest" not in result.output  # which sizes are no part of
+    record.write_text(re.sub(r'"sha256": "....', '"sha256": "0000', text, count=1))
+    assert "do not give the digest" in run(main, ["verify", url]).output
     assert run(main, ["list", "--remote", f"file://{there}/half"]).exit_code == 2
 
 

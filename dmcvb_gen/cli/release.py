@@ -65,7 +65,7 @@ def verify(context, path, everything, backgrounds, workers, executor, ray_addres
         print_json(facts | {"checked": result.checked, "findings": findings, "incomplete": result.incomplete})
     else:
         _tell_verified(path, result)
-    context.exit(1 if not result.sound else 3 if result.incomplete else 0)
+    context.exit(1 if not result.sound else 0 if result.complete else 3)
 
 
 def _tell_verified(path, result):
@@ -81,6 +81,8 @@ def _tell_verified(path, result):
         here = result.checked["episodes"]
         planned = here + sum(planned - count for count, planned in result.incomplete.values())
         verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
+    elif result.sound and not result.finished:
+        verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
     click.echo(f"{path}: {verdict} ({checked})")
     if result.digest:
         click.echo(f"digest {result.digest}")
@@ -131,8 +133,9 @@ def regenerate(
 ):
     """Make a release's shards again from its manifest alone, bit for bit.
 
-    Repairs damaged and missing shards in place, unless --check or --out is given. Exit code 1 when a shard comes
-    out otherwise; what differs in the environment, and how far the values are, is said then.
+    Repairs damaged and missing shards in place, unless --check or --out is given; of a part that was fetched, what was
+    fetched. Exit code 1 when a shard comes out otherwise; what differs in the environment, and how far the values are,
+    is said then. With --check, 3 when all that are here came out right, and others are not here.
 
     \b
     dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
@@ -157,6 +160,7 @@ def regenerate(
                 "sound": outcome.sound,
                 "shards": [dataclasses.asdict(shard) for shard in outcome.shards],
                 "environment": outcome.environment,
+                "not_here": outcome.left,
             }
         )
     else:
@@ -168,8 +172,10 @@ def regenerate(
             if not outcome.environment:
                 click.echo("environment: the same versions and processor as when the release was made")
         count = len(outcome.shards)
-        click.echo(f"{out or path}: {count} shards made again" if count else f"{path}: nothing is damaged or missing")
-    context.exit(0 if outcome.sound else 1)
+        left = f"; {outcome.left} more are not here" if outcome.left else ""
+        nothing = "none of these shards is here" if outcome.left else "nothing is damaged or missing"
+        click.echo(f"{out or path}: {count} shards made again{left}" if count else f"{path}: {nothing}")
+    context.exit(1 if not outcome.sound else 3 if outcome.left else 0)
 
 
 @click.command()
@@ -282,22 +288,23 @@ def card(context, path, check, out, url, as_json):
 
     The table, card/episodes.parquet, has a row an episode with its first frame; `datasets.load_dataset` reads it.
 
-    With --check, exit code 1 when the card does not fit the data.
+    With --check, exit code 1 when the card does not fit the data, 3 when it fits the part that was fetched.
 
     \b
     dmcvb-gen card releases/mini
     """
-    from dmcvb_gen.release.card import check_card, write_card
+    from dmcvb_gen.release.card import check_card, left_unchecked, write_card
 
     if check:
         if out:
             raise click.UsageError("Give --check or --out, not both.")
-        findings = check_card(path)
+        findings, left = check_card(path), left_unchecked(path)
         if as_json:
             print_json(findings)
         else:
-            click.echo("\n".join(findings) or f"{path}: the card fits the release")
-        context.exit(1 if findings else 0)
+            fits = f"the episodes that are here; {left:,} are not" if left else "the release"
+            click.echo("\n".join(findings) or f"{path}: the card fits {fits}")
+        context.exit(1 if findings else 3 if left else 0)
     files = write_card(path, out, url)
     if as_json:
         return print_json([str(file) for file in files])

@@ -104,31 +104,64 @@ def _told(folder: Path, manifest: Manifest) -> Publication:
 def check_card(root: str | Path) -> list[str]:
     """What of a release's card is missing or does not fit its data, in words; empty when all is well.
 
+    Of a part that was fetched, whose card is that of the whole release, what is here is compared (`left_unchecked`).
+
     Raises:
       StoreError: there is no release, or it has no episodes.
     """
-    release, findings = _open(root), []
-    table = release.path / TABLE
-    problem = table_problem(release, table)
-    if problem:
-        findings.append(f"{TABLE} {problem}")
-    texts = {} if problem else _texts(release, table, _told(release.path, release.manifest))
-    for name in (README, CROISSANT, STATES):
-        path = release.path / name
-        if not path.is_file():
+    release = _open(root)
+    part = _is_of_the_whole(release)
+    findings, table = _check_changelog(release), release.path / TABLE
+    for name in (README, CROISSANT, STATES, SHEET, PLOT):
+        if not (release.path / name).is_file():
             findings.append(f"{name} is missing")
-        elif name in texts and path.read_bytes() != texts[name].encode():
-            line = _first_difference(path.read_text(errors="replace"), texts[name])
+    problem = table_problem(release, table, part)
+    if problem:
+        return [f"{TABLE} {problem}", *findings]
+    if part:
+        return findings + _check_digests(release)
+    for name, text in _texts(release, table, _told(release.path, release.manifest)).items():
+        path = release.path / name
+        if path.is_file() and path.read_bytes() != text.encode():
+            line = _first_difference(path.read_text(errors="replace"), text)
             findings.append(f"{name} does not fit the release at line {line}")
-    sheet = release.path / SHEET
-    if not sheet.is_file() or not (release.path / PLOT).is_file():
-        findings.append(f"a picture in {CARD_FOLDER}/ is missing")
-    elif not _shows(sheet, _sheet(release)):
+    if (release.path / SHEET).is_file() and not _shows(release.path / SHEET, _sheet(release)):
         findings.append(f"{SHEET} does not show the release's episodes")
-    changelog = release.path / CHANGELOG
-    if not changelog.is_file() or f"## {release.manifest.version}\n" not in changelog.read_text(errors="replace"):
-        findings.append(f"{CHANGELOG} does not speak of version {release.manifest.version}")
     return findings
+
+
+def left_unchecked(root: str | Path) -> int:
+    """How many episodes a release's card speaks of that are not here, because a part of it was fetched."""
+    release = open_release(root)
+    return sum(planned - here for here, planned in release.shortfalls.values()) if _is_of_the_whole(release) else 0
+
+
+def _is_of_the_whole(release: Release) -> bool:
+    """Whether a part was fetched, and the card that came with it is that of the whole release."""
+    try:
+        text = (release.path / README).read_text(errors="replace")
+    except OSError:
+        return False
+    parts = () if release.manifest.complete else release.manifest.lineage
+    digests = {entry.get("digest") for entry in parts if entry["kind"] == "fetch"} - {None}
+    return any(f"# digest {digest}" in text for digest in digests)
+
+
+def _check_digests(release: Release) -> list[str]:
+    """Subsets of a part whose digest the card of the whole says otherwise than the manifest."""
+    text = (release.path / README).read_text(errors="replace")
+    rows = {row.split("`")[1]: row for row in text.splitlines() if row.startswith("| `") and row.count("`") == 4}
+    return [
+        f"{README} says another digest of {record.name}"
+        for record in release.manifest.subsets
+        if record.digest and f"`{record.digest[:12]}`" not in rows.get(record.name, "")
+    ]
+
+
+def _check_changelog(release: Release) -> list[str]:
+    path, version = release.path / CHANGELOG, release.manifest.version
+    known = path.is_file() and f"## {version}\n" in path.read_text(errors="replace")
+    return [] if known else [f"{CHANGELOG} does not speak of version {version}"]
 
 
 def _shows(path: Path, pixels: np.ndarray) -> bool:

@@ -59,8 +59,12 @@ def write_table(release: Release, path: Path) -> None:
                 writer.write_table(pa.Table.from_pydict(_facts(subset, few) | _frames(subset, few), _schema()))
 
 
-def table_problem(release: Release, path: Path) -> str | None:
-    """What of a table does not fit its release, pictures aside; None when all is well."""
+def table_problem(release: Release, path: Path, part: bool = False) -> str | None:
+    """What of a table does not fit its release, pictures aside; None when all is well.
+
+    Args:
+      part: the table is of the whole release and some episodes are here: their rows are compared.
+    """
     if not path.is_file():
         return "is missing"
     names = [name for name in COLUMNS if name != "first_frame"]
@@ -70,8 +74,23 @@ def table_problem(release: Release, path: Path) -> str | None:
         return "cannot be read"
     plain = pa.schema([(name, COLUMNS[name][0]) for name in names])
     parts = [pa.Table.from_pydict(_facts(subset, subset.episodes), plain) for subset in release.subsets.values()]
-    fits = stored.cast(plain).equals(pa.concat_tables(parts)) if stored.schema.names == names else False
+    if stored.schema.names != names:
+        return "does not fit the release's episodes"
+    wanted, stored = pa.concat_tables(parts), stored.cast(plain)
+    if part:
+        stored = _rows_of(stored, wanted)
+    fits = stored.equals(wanted)
     return None if fits else "does not fit the release's episodes"
+
+
+def _rows_of(table: pa.Table, wanted: pa.Table) -> pa.Table:
+    """The rows of a table that speak of the same episodes as another one, in that one's order."""
+
+    def keys(table: pa.Table) -> list[tuple[str, int]]:
+        return list(zip(table["subset"].to_pylist(), table["episode"].to_pylist(), strict=True))
+
+    rows = {key: row for row, key in enumerate(keys(table))}
+    return table.take([rows[key] for key in keys(wanted) if key in rows])
 
 
 def header_facts(path: Path) -> dict[str, Any]:

@@ -108,10 +108,17 @@ class ShardOutcome:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcomes of all shards, and what is another version or device than when the release was made."""
+    """What became of a release.
+
+    Attributes:
+      shards: outcomes of all that were made.
+      environment: what is another version or device than when the release was made.
+      left: shards of a release that is not complete which are not here, and were not looked at.
+    """
 
     shards: tuple[ShardOutcome, ...]
     environment: dict[str, tuple[str, str]]
+    left: int = 0
 
     @property
     def sound(self) -> bool:
@@ -172,12 +179,15 @@ class Regeneration:
     def check(self, tick: Tick = ignore) -> Outcome:
         """Make shards again and compare their digests with the release; the release is not changed.
 
+        Of a part that was fetched, or a rollout that is not finished, the shards that are here are made.
+
         Raises:
           DmcvbError: the shards cannot be made here (policy, backgrounds or renderer missing).
         """
         root, manifest = load_manifest(self.root)
-        shards, known = chosen_shards(manifest, self.only, self.episodes), _Known(root, manifest)
-        outcomes, held = [], Held(known)
+        chosen, known = chosen_shards(manifest, self.only, self.episodes), _Known(root, manifest)
+        here = {k: r for k, r in chosen.items() if manifest.complete or (root / commit_path(*k)).is_file()}
+        outcomes, held, shards = [], Held(known), here
         with _Workshop(known, _unique(shards.values())) as folder:
             for commit in self._make(manifest, shards, folder, tick):
                 record = shards[commit.subset, commit.shard]
@@ -194,20 +204,21 @@ class Regeneration:
             else outcome
             for outcome in outcomes
         ]
-        return Outcome(tuple(outcomes), environment_difference(manifest))
+        return Outcome(tuple(outcomes), environment_difference(manifest), len(chosen) - len(here))
 
     def repair(self, tick: Tick = ignore) -> Outcome:
         """Make damaged and missing shards again, in place; sound ones are not touched.
 
         A shard is taken only if it has the bytes that its commit record (or the subset's digest) promises; where the
-        manifest promises nothing yet, because the release was never finished, it is taken as it is.
+        manifest promises nothing yet, because the release was never finished, it is taken as it is. Of a part that was
+        fetched, what was fetched is repaired, unless other shards are asked for.
 
         Raises: see `check`.
         """
         root, manifest = load_manifest(self.root)
-        wanted, known = chosen_shards(manifest, self.only, self.episodes), _Known(root, manifest)
+        wanted, known = self._wanted(manifest), _Known(root, manifest)
         shards = {key: record for key, record in wanted.items() if known.damage(record, key[1]) is not None}
-        records = _unique(chosen_shards(manifest, self.only).values())
+        records = _unique(wanted.values())
         with _Workshop(known, records) as folder:
             with storage_errors(root, "write to"):
                 for record in records:
@@ -219,6 +230,17 @@ class Regeneration:
             copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
             restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})
         return Outcome(tuple(outcomes), environment_difference(manifest))
+
+    def _wanted(self, manifest: Manifest) -> dict[tuple[str, int], SubsetRecord]:
+        """The shards that should be here."""
+        fetched = [entry for entry in manifest.lineage if entry["kind"] == "fetch"]
+        if self.only or self.episodes or manifest.complete or not fetched:
+            return chosen_shards(manifest, self.only, self.episodes)
+        wanted: dict[tuple[str, int], SubsetRecord] = {}
+        for entry in fetched:
+            span = entry.get("episodes")
+            wanted |= chosen_shards(manifest, entry.get("only", ()), tuple(span) if span else None)
+        return wanted
 
     def _repair(self, known: _Known, shards, folder, tick) -> list[ShardOutcome]:
         root, manifest = known.root, known.manifest

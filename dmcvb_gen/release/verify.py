@@ -50,12 +50,14 @@ class Verification:
       findings: what is wrong.
       incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
       digest: the release's root digest, None while it is made (and of version 1).
+      finished: whether its digests were written once everything was there.
     """
 
     checked: dict[str, int]
     findings: tuple[Finding, ...]
     incomplete: dict[str, tuple[int, int]] = field(default_factory=dict)
     digest: str | None = None
+    finished: bool = True
 
     @property
     def sound(self) -> bool:
@@ -65,7 +67,7 @@ class Verification:
     @property
     def complete(self) -> bool:
         """Whether everything that belongs to the release is here."""
-        return not self.incomplete
+        return self.finished and not self.incomplete
 
 
 # -- bytes ----------------------------------------------------------------------------------------
@@ -243,7 +245,9 @@ def verify(
     for found in in_order(_check_subset, works, workers, tick):
         findings += found
     incomplete = {name: count for name, count in release.shortfalls.items() if name not in damaged}
-    return Verification(counts, tuple(findings), incomplete, release.manifest.digest)
+    manifest = release.manifest
+    finished = manifest.complete and (manifest.digest is not None or manifest.schema_version == 1)
+    return Verification(counts, tuple(findings), incomplete, release.manifest.digest, finished)
 
 
 def _check_subset(work: tuple[Subset, str | None], tick: Tick) -> list[Finding]:

@@ -1,11 +1,12 @@
 """Is a published release what it says? A URL in, findings out; nothing is kept here.
 
 Manifest, index and commit records are read and held against one another; files are read and compared with their
-digests, a sample of them or all.
+digests, a sample of them or all; of the rest, that they are there at their size.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,10 @@ from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.verify import Verification, subset_of
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import INDEX, root_digest
-from dmcvb_gen.store.manifest import FileRecord
-from dmcvb_gen.store.transfer import in_parallel, remote_sha256, retry
+from dmcvb_gen.store.manifest import MANIFEST, FileRecord, shard_count
+from dmcvb_gen.store.reader import Subset
+from dmcvb_gen.store.transfer import in_parallel, list_files, remote_sha256, retry
+from dmcvb_gen.store.writer import subset_digest
 
 SAMPLE_FILES = 40
 """Files that are read where not all are asked for; spread evenly over the release."""
@@ -69,8 +72,41 @@ def verify_url(
         release = open_release(url, options)
     except StoreError as error:
         return Verification(counts, (*findings, Finding("files", "commits", str(error))))
+    findings += _missing(source, {file.path for file in chosen})
     for subset in release.subsets.values():
+        findings += _disagreements(source, subset)
         counts["subsets"] += 1
         counts["episodes"] += len(subset.episodes)
         counts["steps"] += subset.steps
     return Verification(counts, tuple(findings), release.shortfalls, release.manifest.digest)
+
+
+def _missing(source: Source, read: Collection[str]) -> list[Finding]:
+    """Files that the index lists and that are not there, or have another size, as far as the place can be listed."""
+    try:
+        there = list_files(source.filesystem, source.place, source.base.rstrip("/"))
+    except StoreError:
+        return []  # may be read and not listed; a sample was read
+    if MANIFEST not in there:
+        return []  # has no lists (HTTP)
+    sizes = {path: facts["size"] for path, facts in there.items()}
+    return [
+        Finding("files", subset_of(source.manifest, file.path), f"{file.path} is missing or has another size")
+        for file in source.index.files
+        if file.path not in read and sizes.get(file.path) != file.bytes
+    ]
+
+
+def _disagreements(source: Source, subset: Subset) -> list[Finding]:
+    """What the commit records of a subset say otherwise than the index or the manifest."""
+    listed = {file.path: file for file in source.index.files}
+    found = [
+        Finding("files", subset.name, f"shard {shard}: its commit record and {INDEX} do not agree about {file.path}")
+        for shard, commit in subset.commits.items()
+        for file in commit.files
+        if listed.get(file.path) != file
+    ]
+    whole = len(subset.commits) == shard_count(subset.record)
+    if whole and subset.record.digest not in (None, subset_digest(subset.commits)):
+        found.append(Finding("files", subset.name, "its commit records do not give the digest of the manifest"))
+    return found

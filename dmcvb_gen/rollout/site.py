@@ -44,7 +44,7 @@ from dmcvb_gen.store.manifest import (
     subset_path,
 )
 from dmcvb_gen.store.remote import file_system, is_url, public, storage_errors
-from dmcvb_gen.store.transfer import create_object, in_parallel, put_object, read_object, retry, upload
+from dmcvb_gen.store.transfer import create_object, in_parallel, list_files, put_object, read_object, retry, upload
 
 CONNECTIONS = 8
 """Files of a shard that are sent at once."""
@@ -272,16 +272,8 @@ class BucketSite(Site):
 
     def listing(self):
         filesystem, base = self._open()
-
-        def attempt():
-            filesystem.invalidate_cache()
-            try:
-                found = filesystem.find(base, detail=True)
-            except FileNotFoundError:
-                return {}
-            return {path[len(base) + 1 :]: Listed(facts["size"], _time_of(facts)) for path, facts in found.items()}
-
-        return retry(self.place, "the list of files", attempt, "read")
+        found = list_files(filesystem, self.place, base)
+        return {path: Listed(facts["size"], _time_of(facts)) for path, facts in found.items()}
 
     def metadata(self, record, folder):
         path = f"{subset_path(record.name)}/zarr.json"

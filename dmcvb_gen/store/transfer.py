@@ -170,6 +170,20 @@ def read_object(filesystem: fsspec.AbstractFileSystem, place: str, path: str) ->
     return retry(place, path.rsplit("/", 1)[-1], attempt, "read")
 
 
+def list_files(filesystem: fsspec.AbstractFileSystem, place: str, base: str) -> dict[str, dict[str, Any]]:
+    """Every file below a place: path in it -> what the store says of it ("size", ...); empty where nothing is."""
+
+    def attempt() -> dict[str, dict[str, Any]]:
+        filesystem.invalidate_cache()
+        try:
+            found = filesystem.find(base, detail=True)
+        except FileNotFoundError:
+            return {}
+        return {path[len(base) + 1 :]: facts for path, facts in found.items()}
+
+    return retry(place, "the list of files", attempt, "read")
+
+
 def put_object(filesystem: fsspec.AbstractFileSystem, path: str, data: bytes) -> None:
     """Write a small file, in place of what is there."""
     if protocol(filesystem) not in OBJECT_STORES:

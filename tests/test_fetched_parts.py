@@ -1,0 +1,101 @@
+"""A reviewer's way: a part of a published release is fetched, its card held against it, its shards made again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.fetch import fetch
+from dmcvb_gen.release.publish import publish
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.rollout.executors import run_jobs
+from dmcvb_gen.rollout.plan import make_plan, prepare
+from dmcvb_gen.store import open_release
+from tests.conftest import maze_recipe, rewrite, small_recipe
+
+WALKER = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "dynamic"], "episodes": 3}
+RECIPES = {
+    "walker": small_recipe(subsets=[WALKER | {"episodes_per_shard": 1}]),
+    "maze": maze_recipe(("visible", "hidden")),
+}
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module", params=RECIPES)
+def published(request, tmp_path_factory):
+    """URL of a release with a card."""
+    folder = tmp_path_factory.mktemp(request.param)
+    plan = prepare(make_plan(RECIPES[request.param], folder / "made"))
+    for _ in run_jobs(plan.jobs):
+        pass
+    unfinished = run("verify", folder / "made")
+    assert unfinished.exit_code == 3 and "not finished" in unfinished.output, unfinished.output
+    assert run("rollout", "--out", folder / "made", "--finish").exit_code == 0
+    assert run("verify", folder / "made").exit_code == 0
+    write_card(folder / "made")
+    publish(folder / "made", f"file:{folder / 'there'}")
+    return f"file:{folder / 'there'}"
+
+
+@pytest.fixture
+def part(published, tmp_path):
+    """Folder of a part of it: an episode of one subset."""
+    name = next(iter(open_release(published).subsets))
+    fetch(published, tmp_path / "part", [name], (0, 1))
+    return tmp_path / "part"
+
+
+def test_the_card_is_held_against_what_is_here(part):
+    result = run("card", part, "--check")
+    release = open_release(part)
+    [subset] = release.subsets.values()
+    left = sum(record.episodes for record in release.manifest.subsets) - len(subset.episodes)
+    assert result.exit_code == 3 and f"fits the episodes that are here; {left} are not" in result.output
+
+    def better(group):
+        group["reward"][0, 0] += 0.5
+        group["return"][0] += 0.5
+
+    text = (part / "README.md").read_text()
+    (part / "README.md").write_text(text.replace(f"`{subset.record.digest[:12]}`", "`0123456789ab`", 1))
+    assert check_card(part) == [f"README.md says another digest of {subset.name}"]
+    (part / "README.md").write_text(text)
+    rewrite(part, subset.name, better)
+    result = run("card", part, "--check")
+    assert result.exit_code == 1 and "card/episodes.parquet does not fit the release's episodes" in result.output
+    write_card(part)  # one of its own
+    assert check_card(part) == [] and run("card", part, "--check").exit_code == 0
+
+
+def test_what_is_here_is_made_again_and_nothing_else(part):
+    before = {path for path in part.rglob("*") if path.is_file()}
+    checked = run("regenerate", part, "--check", "--json")
+    told = json.loads(checked.stdout)
+    assert checked.exit_code == 3 and told["sound"] and told["not_here"] > 0, checked.output
+    assert [shard["equal"] for shard in told["shards"]] == [True]
+    other = open_release(part).manifest.subsets[-1].name
+    none = run("regenerate", part, "--check", "--only", other)
+    assert none.exit_code == 3 and "none of these shards is here" in none.output
+    [shard] = list(open_release(part).subsets.values())[0].commits.values()
+    (part / shard.files[0].path).unlink()
+    assert run("regenerate", part, "--check").exit_code == 1
+    repaired = run("regenerate", part)
+    assert repaired.exit_code == 0 and "1 shards made again" in repaired.output
+    assert {path for path in part.rglob("*") if path.is_file()} - {part / ".lock"} == before - {part / ".lock"}
+    assert verify(part).sound
+    more = run("regenerate", part, "--only", other)
+    assert more.exit_code == 0 and verify(part).sound and other in open_release(part).subsets
+
+
+def test_a_shard_that_is_lost_from_a_whole_release_is_no_part(published, tmp_path):
+    fetch(published, tmp_path / "whole")
+    shutil.rmtree(tmp_path / "whole" / "commits")
+    assert run("regenerate", tmp_path / "whole", "--check").exit_code == 1
