@@ -189,6 +189,39 @@ def test_a_published_release_grows_by_its_new_shards_alone(grown, tmp_path):
         publish(grown.parent / "before", url)
 
 
+MAZES = {"tasks": TINY_MAZE, "levels": "random", "settings": ["visible", "hidden"], "episodes_per_shard": 1}
+SETTINGS = {"settings": ["none", "static"]}
+
+
+@pytest.mark.parametrize("family", ["walker", "maze"])
+@pytest.mark.parametrize("bucket", [False, True], ids=["folder", "bucket"])
+def test_what_grows_by_parts_is_sound_at_every_moment(tmp_path, family, bucket):
+    """Two subsets of one episode grow to two: first the one, then another subset is asked for, then the rest."""
+    there = f"file://{tmp_path}/r" if bucket else str(tmp_path / "r")
+
+    def recipe(episodes, **changes):
+        pattern = (MAZES if family == "maze" else WALKER | SETTINGS) | {"episodes": episodes} | changes
+        return small_recipe(subsets=[pattern], size=16)
+
+    def done(recipe, only=(), shared=False):
+        site = site_of(there, scratch=tmp_path / "scratch")
+        plan = prepare(make_plan(recipe, site, only), shared=shared)
+        for _ in run_jobs(plan.jobs):
+            pass
+        finish(plan)
+        verified = verify(tmp_path / "r")
+        assert verified.sound, verified.findings
+        return verified.complete
+
+    assert done(recipe(1))
+    assert not done(recipe(2), only=["*/*/none", "*/*/hidden"][family == "maze" :][:1])
+    more = {"levels": "random"} | (
+        {"settings": "fixed", "fixed_goals": 1} if family == "maze" else {"settings": "dynamic"}
+    )
+    assert not done(recipe(1, **more), shared=True)
+    assert done(recipe(2))
+
+
 @pytest.mark.parametrize("bucket", [False, True], ids=["folder", "bucket"])
 def test_the_last_to_finish_keeps_what_others_added_meanwhile(tmp_path, bucket):
     """Walker's rollout ends while somebody has begun to add a maze; then that one ends."""

@@ -23,6 +23,7 @@ from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.cli import main
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
+from dmcvb_gen.files import write_json
 from dmcvb_gen.names import LOCOMOTION, family_of
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.rendering.opengl import unavailable
@@ -34,7 +35,7 @@ from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_manifest
 from dmcvb_gen.tasks import get_task
-from tests.conftest import TINY_MAZE, roll_out, small_recipe
+from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 
 
 def digests(manifest):
@@ -393,3 +394,27 @@ def test_the_manifest_names_everything_needed_to_make_it_again(small_release):
     assert len(subset["backgrounds"]["digest"]) == 64 and subset["digest"]
     assert {"mujoco", "numba", "numpy", "cpu", "system", "zarr"} <= set(data["environments"][0])
     assert make_recipe(data["recipe"]) == small_recipe()
+
+
+@pytest.mark.parametrize("task", ["walker-walk", "ant-maze-empty7x7"])
+def test_a_dry_run_for_a_bucket_knows_policies_and_videos_that_are_not_there_yet(tmp_path, task):
+    shutil.copytree(builtin_folder(), tmp_path / "videos")
+    own = shutil.copy(bundled_policies(task, "expert")[0], tmp_path / "own.safetensors")
+    videos = ["--distractor", "dynamic", "--backgrounds", str(tmp_path / "videos")] if task == "walker-walk" else []
+    asked = ["rollout", task, "--level", "expert", "--behaviour", str(own), *videos, "--episodes", "1", "--size", "16"]
+    sizes = ["--max-steps", "20", "--out", f"file://{tmp_path}/bucket", "--scratch", str(tmp_path / "scratch")]
+    result = CliRunner().invoke(main, [*asked, *sizes, "--dry-run", "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["steps"] > 0 and not (tmp_path / "bucket").exists()
+
+
+@pytest.mark.parametrize("recipe", [small_recipe, maze_recipe])
+def test_going_on_from_a_manifest_paints_where_it_was_begun(tmp_path, recipe):
+    folder = tmp_path / "r"
+    prepare(make_plan(recipe(), folder))
+    assert {job.device for job in make_plan(None, folder).jobs} == {"cpu"}
+    manifest = open_release(folder).manifest
+    records = tuple(r.model_copy(update={"renderer": r.renderer | {"device": "cuda"}}) for r in manifest.subsets)
+    write_json(folder / "manifest.json", manifest.model_copy(update={"subsets": records}))
+    assert {job.device for job in make_plan(None, folder).jobs} == {"cuda"}
+    assert {job.device for job in make_plan(None, folder, device="cpu").jobs} == {"cpu"}

@@ -126,7 +126,8 @@ def rollout(
     site = site_of(out or _out_default(chosen.name), options["options"], *scratch, workers)
     if finishing:
         return _finish(site, finish_site, as_json)
-    plan = make_plan(chosen, site, only, device, parse_range(episode_range), part or (1, 1), not no_pixels)
+    where = device if chosen or is_given(context, "device") else None  # else where it was begun
+    plan = make_plan(chosen, site, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
     if by_warp and chosen:
         click.echo(f"warp paints, as native does not on {device}", err=True)
     if dry_run:

@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -211,6 +211,7 @@ def estimate(plan: Plan, workers: int = 1, tick: Tick = ignore) -> Estimate:
     Raises:
       StoreError: a worker was killed.
     """
+    plan = _with_inputs(plan)
     cores = os.cpu_count() or 1
     workers = min(workers, cores)
     lengths: dict[tuple, list[int]] = {}
@@ -228,6 +229,14 @@ def estimate(plan: Plan, workers: int = 1, tick: Tick = ignore) -> Estimate:
             shared = seconds[_trajectory(record)] / len(job.subsets)
             rates.setdefault(record.name, Rate(painting + shared, size, means[_trajectory(record)]))
     return _extrapolate(plan, rates)
+
+
+def _with_inputs(plan: Plan) -> Plan:
+    """The plan with policies and videos as they are here: a bucket that is not begun has no copies yet."""
+    if plan.inputs is None:
+        return plan
+    jobs = (job if job.inputs else replace(job, inputs=plan.inputs[job.subsets[0].name]) for job in plan.jobs)
+    return replace(plan, jobs=tuple(jobs))
 
 
 def _extrapolate(plan: Plan, rates: dict[str, Rate]) -> Estimate:

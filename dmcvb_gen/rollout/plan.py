@@ -25,6 +25,7 @@ from dmcvb_gen.store.growth import merged
 from dmcvb_gen.store.index import (
     INDEX,
     POLICIES,
+    ZARR_JSON,
     parse_index,
     refuse_altered,
     refuse_altered_folder,
@@ -81,7 +82,7 @@ def make_plan(
     recipe: Recipe | None,
     out: str | Path | Site,
     only: Sequence[str] = (),
-    device: str = "cpu",
+    device: str | None = None,
     episodes: tuple[int, int] | None = None,
     part: tuple[int, int] = (1, 1),
     pixels: bool = True,
@@ -92,6 +93,7 @@ def make_plan(
       recipe: None goes on with the release that is there, from its manifest alone.
       out: the release's folder or site; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
+      device: where pictures are painted; by default where the release that is there was begun, or on the CPU.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
       part: (K, N): of all jobs, done or not, every N-th from the K-th on.
       pixels: paint pictures; without, `release.paint` can do it later.
@@ -102,7 +104,7 @@ def make_plan(
     site = out if isinstance(out, Site) else FolderSite(local_path(out))
     there = site.manifest()
     if recipe is not None:
-        manifest, inputs = describe(recipe, device, pixels)
+        manifest, inputs = describe(recipe, device or "cpu", pixels)
     elif there is not None:
         _check_goes_on(there, site, device, pixels)
         manifest, inputs = there, None
@@ -119,7 +121,7 @@ def make_plan(
     return Plan(site, manifest, inputs, left, _count(jobs) - _count(left))
 
 
-def _check_goes_on(there: Manifest, site: Site, device: str, pixels: bool) -> None:
+def _check_goes_on(there: Manifest, site: Site, device: str | None, pixels: bool) -> None:
     """Raises StoreError where a release that goes on from its manifest cannot be as the options want it."""
     painted = any(record.pixels for record in there.subsets)
     if not pixels and painted:
@@ -127,7 +129,7 @@ def _check_goes_on(there: Manifest, site: Site, device: str, pixels: bool) -> No
             f"{site.place} was begun with pictures and goes on with them; leave out --no-pixels, or give TASKs or "
             "--recipe with another --out"
         )
-    if device != "cpu" and not painted:
+    if device not in (None, "cpu") and not painted:
         raise StoreError(
             f"{site.place} was begun without pictures, so none are painted on {device}; leave out --device"
         )
@@ -294,9 +296,13 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
             f"at {root}; make room, choose another --out or fewer --episodes"
         )
     wanted = {record.name for job in plan.jobs for record in job.subsets}
-    records = [record for record in manifest.subsets if shared or record.name in wanted]
+    records = [
+        record
+        for record in manifest.subsets
+        if shared or record.name in wanted or (root / subset_path(record.name) / ZARR_JSON).is_file()  # and may grow
+    ]
     if plan.inputs is not None:
-        copy_inputs(root, records, plan.inputs)
+        copy_inputs(root, [record for record in records if record.name in plan.inputs], plan.inputs)
     create_groups(root, manifest, records)
     return manifest
 
