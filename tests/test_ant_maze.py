@@ -32,6 +32,7 @@ from dmcvb_gen.tasks.ant_maze.distance import (
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, get_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
 from dmcvb_gen.tasks.ant_maze.waypoints import headings
+from tests.conftest import TINY_MAZE
 
 GOAL_RADIUS, GOAL_HEIGHT = 0.5, 1.0
 """The released goal (SPEC, section 3), written here once more."""
@@ -552,3 +553,20 @@ def test_ants_that_start_in_the_floor_are_flung_up():
     heights = [batch.step(np.zeros((2, 8))).state[:, task.state_slices["body_height"]][:, 0] for _ in range(10)]
     highest = np.max(heights, axis=0)
     assert highest[0] > 0.9 and highest[1] < 0.8
+
+
+@pytest.mark.parametrize("name", ["ant-maze-empty7x7", TINY_MAZE])
+def test_simulations_hold_no_textures_and_all_else_that_painters_see(name):
+    task = get_task(name)
+    bare, whole = task.model, task.picture_model
+    assert bare.nbuffer < 1_000_000 and whole.ntexdata > 100_000_000
+    compared = 0
+    for field in dir(whole):
+        value = getattr(whole, field)
+        if isinstance(value, np.ndarray) and not field.startswith(("_", "tex_", "name", "path", "mat_texid")):
+            np.testing.assert_array_equal(getattr(bare, field), value, err_msg=field)
+            compared += 1
+    assert compared > 300
+    names = [[model.geom(i).name for i in range(model.ngeom)] for model in (bare, whole)]
+    materials = [[model.mat(i).name for i in range(model.nmat)] for model in (bare, whole)]
+    assert names[0] == names[1] and materials[0] == materials[1]

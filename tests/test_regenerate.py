@@ -62,11 +62,14 @@ def test_a_part_of_a_release_comes_out_with_its_digests(small_release):
     assert outcome.environment == {} and stamps_of(small_release) == before
 
 
-def test_nothing_but_the_manifest_is_needed(small_release, tmp_path):
+@pytest.mark.filterwarnings("error:Object at")
+@pytest.mark.parametrize("name, shards", [("small_release", 6), ("maze_release", 2)])
+def test_nothing_but_the_manifest_is_needed(request, name, shards, tmp_path):
+    small_release = request.getfixturevalue(name)
     (tmp_path / "bare").mkdir()
     shutil.copy(small_release / "manifest.json", tmp_path / "bare")
     outcome = Regeneration(tmp_path / "bare").repair()
-    assert outcome.sound and len(outcome.shards) == 6
+    assert outcome.sound and len(outcome.shards) == shards
     assert files_of(tmp_path / "bare").keys() - {tmp_path / "bare/manifest.json"}
     for path, data in files_of(small_release).items():
         if path.name not in (".created", ".lock") and "preview" not in path.parts:

@@ -30,6 +30,8 @@ COMPILED = {
 here, as that takes minutes under emulation, and run there, from numba's cache."""
 ALIKE = {"Haswell-v4": {}, "SandyBridge": PLAIN}
 """What else a process here needs to be like the model."""
+OURS = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
+"""Without what makes BLAS take another processor's functions: a model would stop at what it does not have."""
 PAINTER = "native" if "native" in RENDERERS else "-"
 
 pytestmark = [
@@ -44,7 +46,7 @@ def start(model: str | None, environment: dict[str, str]) -> subprocess.Popen:
     return subprocess.Popen(
         command,
         cwd=Path(__file__).parents[1],
-        env=os.environ | {"OMP_NUM_THREADS": "1"} | environment,
+        env=OURS | {"OMP_NUM_THREADS": "1"} | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -40,6 +40,7 @@ from dmcvb_gen.store.remote import local_path, storage_errors
 from dmcvb_gen.store.schema import EpisodeShape, subset_specs
 from dmcvb_gen.store.shards import chosen_shards
 from dmcvb_gen.store.writer import (
+    CREATED,
     commit_path,
     find_array,
     finish_release,
@@ -413,7 +414,9 @@ class _Known:
             if source := self._source(path):
                 copy_file(source, target)
         if not self._source(f"{subset_path(record.name)}/{ZARR_JSON}"):
+            (group / CREATED).unlink(missing_ok=True)  # which Zarr would warn of
             zarr.consolidate_metadata(str(group))  # with what its arrays were given
+            mark_created(folder, record)
 
     def restore(self, folder: Path, record: SubsetRecord) -> None:
         """Put back what is missing or damaged, from `folder`, where it was made or taken."""

@@ -66,7 +66,7 @@ class OpenglRenderer(Renderer):
 
         self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
         self._backgrounds = backgrounds
-        self._model = copy.deepcopy(task.model)  # materials and textures change frame by frame
+        self._model = copy.deepcopy(task.picture_model)  # materials and textures change frame by frame
         self._model.vis.global_.offwidth = self._model.vis.global_.offheight = size
         self._model.vis.quality.offsamples = 4 if samples is None else samples
         self._samples = int(self._model.vis.quality.offsamples)

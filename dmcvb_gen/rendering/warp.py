@@ -105,6 +105,7 @@ class WarpRenderer(Renderer):
         self._data: dict[int, Any] = {}
         self._skies: dict[tuple[int, int], Any] = {}
         self._model: Any = None
+        self._mujoco_model: Any = None
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -127,7 +128,8 @@ class WarpRenderer(Renderer):
         return min(2 * self.size, 512)
 
     def _build(self) -> None:
-        mjw, wp, mjm = _mjw(), _warp(), self.task.model
+        self._mujoco_model = self.task.picture_model
+        mjw, wp, mjm = _mjw(), _warp(), self._mujoco_model
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(mjm)
             self._textures = [self._texture(i) for i in range(mjm.ntex)]
@@ -141,8 +143,8 @@ class WarpRenderer(Renderer):
         """A texture of the model; repeating ones are averaged down, so that far away they do not sparkle."""
         from mujoco_warp._src.render_util import texture_pixels
 
-        pixels = np.asarray(texture_pixels(self.task.model, index))[..., :3]
-        is_sky = self.task.model.tex_type[index] == 2
+        pixels = np.asarray(texture_pixels(self._mujoco_model, index))[..., :3]
+        is_sky = self._mujoco_model.tex_type[index] == 2
         width = 2 * self._sky_width() if is_sky else self._texels()
         if pixels.shape[1] > width:
             faces = pixels.shape[0] // pixels.shape[1]
@@ -164,12 +166,12 @@ class WarpRenderer(Renderer):
         mjw = _mjw()
         if worlds not in self._data:
             with _warp().ScopedDevice(self._device):
-                self._data[worlds] = mjw.make_data(self.task.model, nworld=worlds)
+                self._data[worlds] = mjw.make_data(self._mujoco_model, nworld=worlds)
         key = camera, labels, worlds
         if key not in self._contexts:
             with _warp().ScopedDevice(self._device):
                 context = mjw.create_render_context(
-                    self.task.model,
+                    self._mujoco_model,
                     nworld=worlds,
                     cam_res=(self.size, self.size * self.samples),  # a block of rows a sample
                     cam_active=[camera],
@@ -183,7 +185,7 @@ class WarpRenderer(Renderer):
                     shadow_light_fraction=0.0,
                 )
                 context.use_textures = True
-                context.ray.assign(self._rays(float(self.task.model.cam_fovy[camera])))
+                context.ray.assign(self._rays(float(self._mujoco_model.cam_fovy[camera])))
             self._contexts[key] = context
         return self._contexts[key]
 
@@ -244,7 +246,7 @@ class WarpRenderer(Renderer):
 
     def _launch(self, physics, exogenous, view, hide_goal, worlds, labels=False):
         """Up to `worlds` frames of one view: pictures, and depth and segmentation if asked for."""
-        mjw, wp, mjm, count = _mjw(), _warp(), self.task.model, len(physics)
+        mjw, wp, mjm, count = _mjw(), _warp(), self._mujoco_model, len(physics)
         camera = camera_ids(self.task)[view]
         context = self._context(camera, labels, worlds)
         data = self._data[worlds]
@@ -302,7 +304,7 @@ class WarpRenderer(Renderer):
         (and agree with a regression of OpenGL's pixels on the two pictures).
         """
         alpha = self.floor_alpha
-        reflectance = float(self.task.model.mat_reflectance[self._floor_materials].max(initial=0.0))
+        reflectance = float(self._mujoco_model.mat_reflectance[self._floor_materials].max(initial=0.0))
         if reflectance:
             weights = alpha * (1 - reflectance) + alpha * (1 - alpha), (1 - alpha) ** 2
         else:
@@ -320,7 +322,7 @@ class WarpRenderer(Renderer):
         return np.minimum(total // self.samples, 255).astype(np.uint8)
 
     def _geom_rgba(self, hide_goal: bool) -> np.ndarray:
-        rgba = np.array(self.task.model.geom_rgba, np.float32)
+        rgba = np.array(self._mujoco_model.geom_rgba, np.float32)
         if hide_goal:
             rgba[list(self.task.goal_geoms)] = 0
         return rgba[None]
@@ -332,7 +334,7 @@ class WarpRenderer(Renderer):
 
     def _set_sky(self, context, exogenous: Exogenous, worlds: int) -> None:
         """Each world's sky: the model's own, or a video frame on every face."""
-        wp, mjm = _warp(), self.task.model
+        wp, mjm = _warp(), self._mujoco_model
         skies = np.flatnonzero(mjm.tex_type == 2)
         own = int(skies[0]) if len(skies) else -1
         textures, index = list(self._textures), np.full(worlds, own)
@@ -362,4 +364,4 @@ class WarpRenderer(Renderer):
         self._contexts.clear()
         self._skies.clear()
         self._data.clear()
-        self._model = None
+        self._model = self._mujoco_model = None

@@ -86,6 +86,11 @@ class Task(abc.ABC):
     unstored_fields: tuple[str, ...] = ()
     """Fields of the state that a physics state alone does not give."""
 
+    @property
+    def picture_model(self) -> mujoco.MjModel:
+        """What painters need: `model` with its textures, where that goes without them."""
+        return self.model
+
     def styles(self, split: str) -> tuple[int, ...]:
         """The visual styles of data ("train") or of evaluation ("val"); none where a task has no styles."""
         return ()

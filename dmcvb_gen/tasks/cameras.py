@@ -17,7 +17,7 @@ from dmcvb_gen.tasks.base import Task, physics_columns
 CHUNK = 512
 """States a call into MuJoCo at most; only memory depends on it."""
 KEPT = 2
-"""Tasks whose simulations are kept, those asked for last: a maze's hold a copy of its 200 MB of textures."""
+"""Tasks whose simulations are kept, those asked for last."""
 
 
 class _KeptBatch:

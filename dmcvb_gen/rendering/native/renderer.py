@@ -51,7 +51,7 @@ class NativeRenderer(Renderer):
         self._scene = scene_of(task)
         self._angles = np.radians(task.model.cam_fovy[camera_ids(task)]).tolist()
         finest = min(_finest_level(size, angle) for angle in self._angles)
-        self._textures = Textures(task.model, backgrounds, finest)
+        self._textures = Textures(task.picture_model, backgrounds, finest)
         self._textures.make_ready(self._scene.sky)
         self._looks: dict[int, int] = {}
         self._records = np.zeros((0, len(self._scene.geoms), columns.RGB + 3))

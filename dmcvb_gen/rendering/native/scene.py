@@ -95,7 +95,7 @@ def scene_of(task: Task) -> Scene:
     Raises:
       RenderingError: the model has what this painter does not paint.
     """
-    model = task.model
+    model = task.picture_model
     alpha = np.where(
         (model.geom_matid >= 0) & (model.geom_rgba == _OWN_COLOR).all(axis=1),
         model.mat_rgba[model.geom_matid, 3] if model.nmat else 1.0,
@@ -137,7 +137,7 @@ def look_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> Look:
     Args:
       floor_alpha: opacity of the planes whose material is their own (below 1: the floor is seen through).
     """
-    model, geoms = task.model, scene.geoms
+    model, geoms = task.picture_model, scene.geoms
     chosen = task.style_geom_matid(style) if style >= 0 else None
     material = np.array(model.geom_matid if chosen is None else chosen)[geoms].astype(np.int64)
     own = (model.geom_rgba[geoms] != _OWN_COLOR).any(axis=1) | (material < 0)

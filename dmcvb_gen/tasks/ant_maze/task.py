@@ -24,6 +24,7 @@ from dmcvb_gen.tasks.ant_maze.arena import (
     TOP_HEIGHT,
     build_arena,
     look_numbers,
+    textured_model,
 )
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
@@ -301,6 +302,10 @@ class AntMaze(Task):
     @property
     def model(self):
         return build_arena(self.layout).model
+
+    @property
+    def picture_model(self):
+        return textured_model(self.layout)
 
     @property
     def action_size(self):
