@@ -83,6 +83,9 @@ def test_a_bucket_ends_with_the_very_files_of_a_folder(whole, tmp_path):
     site = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
     plan = prepare(make_plan(quick_recipe(), site))
     assert [job.inputs for job in plan.jobs] == [None] * 8  # workers need nothing but the bucket
+    for command in (["verify"], ["fetch", "--out", str(tmp_path / "fetched")]):
+        result = CliRunner().invoke(main, [command[0], f"file://{tmp_path}/bucket", *command[1:]])
+        assert result.exit_code == 2 and "is not finished; finish it first: dmcvb-gen rollout --out" in result.output
     for _ in run_jobs(plan.jobs):
         pass
     assert finish(plan).complete and contents(tmp_path / "bucket") == contents(whole)

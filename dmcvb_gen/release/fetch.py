@@ -161,6 +161,8 @@ class Source:
             raise StoreError(f"{place} holds no release (no {MANIFEST}); check the URL, or it is still being published")
         manifest = parse_manifest(text, f"{place}/{MANIFEST}")
         listing = read_object(filesystem, place, f"{base}/{INDEX}")
+        if listing is None and not manifest.complete:
+            raise StoreError(f"{place} is not finished; finish it first: dmcvb-gen rollout --out {place} --finish")
         if listing is None:
             raise StoreError(
                 f"{place} has no {INDEX}; it was not put there by `dmcvb-gen publish`, copy the folder whole"
