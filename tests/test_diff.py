@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
 import json
 import re
 import shutil
+import threading
 
 from click.testing import CliRunner
 
@@ -79,6 +82,20 @@ def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tm
     assert "do not give the digest" not in result.output  # which sizes are no part of
     record.write_text(re.sub(r'"sha256": "....', '"sha256": "0000', text, count=1))
     assert "do not give the digest" in run(main, ["verify", url]).output
+    record.write_text(text)
+    with shard.open("ab") as file:
+        file.write(b"more")
+    for every in ([], ["--all"]):
+        result = run(main, ["verify", url, *every])
+        assert result.exit_code == 1 and result.output.count("is missing or has another size") == 1
+    shard.write_bytes(data)
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(http.server.SimpleHTTPRequestHandler, directory=there)
+    )
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    result = run(main, ["verify", f"http://127.0.0.1:{server.server_port}/mazes"])  # whose lists say no sizes
+    server.shutdown()
+    assert result.exit_code == 0, result.output
     assert run(main, ["list", "--remote", f"file://{there}/half"]).exit_code == 2
 
 

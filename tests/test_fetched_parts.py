@@ -95,6 +95,26 @@ def test_what_is_here_is_made_again_and_nothing_else(part):
     assert more.exit_code == 0 and verify(part).sound and other in open_release(part).subsets
 
 
+def test_a_part_that_was_repainted_or_has_grown_is_repaired_too(part, tmp_path):
+    [subset] = open_release(part).subsets.values()
+    maze = subset.task.startswith("ant")
+    look = ["--size", "48"] if maze else ["--distractor", "static"]
+    assert run("repaint", part, *look, "--out", tmp_path / "other").exit_code == 0
+    fixed = ["--goal", "fixed", "--fixed-goals", "1", "--episodes-per-goal", "1"]
+    grown = fixed if maze else ["--distractor", "static", "--episodes", "1"]
+    more = ["--level", "random", *grown, "--max-steps", "5", "--size", "16", "--seed", "3"]
+    added = run("rollout", subset.task, *more, "--out", part)
+    assert added.exit_code == 0, added.output
+    for folder in (tmp_path / "other", part):
+        new = list(open_release(folder).subsets.values())[-1]
+        assert new.name != subset.name or folder != part
+        (folder / new.commits[0].files[0].path).write_bytes(b"damaged")
+        assert run("verify", folder).exit_code == 1
+        repaired = run("regenerate", folder)
+        assert repaired.exit_code == 0 and "repaired" in repaired.output, repaired.output
+        assert verify(folder).sound
+
+
 def test_a_shard_that_is_lost_from_a_whole_release_is_no_part(published, tmp_path):
     fetch(published, tmp_path / "whole")
     shutil.rmtree(tmp_path / "whole" / "commits")

@@ -7,7 +7,9 @@ import shutil
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import copy_file
 from dmcvb_gen.release.card import write_card
@@ -243,6 +245,29 @@ def test_the_last_to_finish_keeps_what_others_added_meanwhile(tmp_path, bucket):
     written = (tmp_path / "r/manifest.json").read_bytes()
     assert finish_site(site_of(there, scratch=tmp_path / "scratch")).complete
     assert (tmp_path / "r/manifest.json").read_bytes() == written
+
+
+@pytest.mark.parametrize("family", ["walker", "maze"])
+@pytest.mark.parametrize("bucket", [False, True], ids=["folder", "bucket"])
+def test_a_release_that_is_finished_in_between_is_never_called_damaged(tmp_path, monkeypatch, family, bucket):
+    """One of two shards is made and the digests written, then the other; the second time writing them is cut off."""
+    there, scratch = f"file://{tmp_path}/r" if bucket else str(tmp_path / "r"), tmp_path / "scratch"
+    pattern = MAZES | {"settings": "visible"} if family == "maze" else WALKER
+    recipe = small_recipe(subsets=[pattern | {"episodes": 2}], size=16)
+    prepare(make_plan(recipe, site_of(there, scratch=scratch)), shared=True)
+    for part in (1, 2):
+        for _ in run_jobs(make_plan(recipe, site_of(there, scratch=scratch), part=(part, 2)).jobs):
+            pass
+        if part == 1:
+            assert not finish_site(site_of(there, scratch=scratch)).complete
+    looked = CliRunner().invoke(main, ["verify", there])
+    assert looked.exit_code == 3 and "not finished" in looked.output, looked.output
+    if not bucket:
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr("dmcvb_gen.files.write_bytes", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+            finish_site(site_of(there))  # the index is new, the manifest is not
+    assert finish_site(site_of(there, scratch=scratch)).complete
+    assert CliRunner().invoke(main, ["verify", there]).exit_code == 0 and verify(tmp_path / "r").sound
 
 
 def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there(grown, tmp_path, monkeypatch):

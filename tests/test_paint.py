@@ -304,6 +304,7 @@ def test_a_part_of_the_published_pictures_and_the_rest_painted_are_the_release(m
 
 def test_a_release_that_travels_light_has_a_card_of_its_own(made, tmp_path):
     shutil.copytree(made / "painted", tmp_path / "r")
+    (tmp_path / "r/CHANGELOG.md").write_text("# Changes\n\n## 1.0.0\n\n- Much better.\n")
     assert run("card", tmp_path / "r").exit_code == 0
     for moved in (True, False):
         sent = run("publish", tmp_path / "r", f"file:{tmp_path / 'there'}", "--no-pixels", "--json")
@@ -313,6 +314,7 @@ def test_a_release_that_travels_light_has_a_card_of_its_own(made, tmp_path):
     assert checked.exit_code == 0, checked.output
     assert "`dmcvb-gen paint` makes the pictures" in (tmp_path / "here/README.md").read_text()
     assert "`dmcvb-gen paint` makes" not in (tmp_path / "r/README.md").read_text()
+    assert "Much better" in (tmp_path / "here/CHANGELOG.md").read_text()
 
 
 def test_a_release_that_travels_light_can_be_checked_and_repaired(made, tmp_path):

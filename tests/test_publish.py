@@ -30,7 +30,7 @@ from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.recipe import expand, load_recipe
 from dmcvb_gen.store import open_release, transfer
-from dmcvb_gen.store.index import INDEX, card_files
+from dmcvb_gen.store.index import INDEX, card_files, take_in_card
 from dmcvb_gen.store.manifest import commit_path
 from dmcvb_gen.store.remote import public, reason
 from dmcvb_gen.store.schema import EpisodeShape, array_specs
@@ -320,10 +320,11 @@ def test_a_card_goes_up_with_its_release_and_one_of_another_version_does_not(cop
     assert check_card(tmp_path / "back") == [] and verify(tmp_path / "back").sound
     text = (copy / "README.md").read_text()
     (copy / "README.md").write_text("a card of before")
+    take_in_card(copy)
     with pytest.raises(StoreError, match="is of another version; run `dmcvb-gen card"):
         publish(copy, f"file:{tmp_path / 'elsewhere'}")
     (copy / "README.md").write_text(f"{text}more")
-    with pytest.raises(StoreError, match="does not have its digest; run `dmcvb-gen card`"):
+    with pytest.raises(StoreError, match="README.md does not have its digest; run `dmcvb-gen card "):
         publish(copy, f"file:{tmp_path / 'elsewhere'}")
 
 
@@ -510,6 +511,31 @@ def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(ti
         hub.publish_to_hub(tiny, manifest, index, "hf://models/x", api=api)
     with pytest.raises(StoreError, match="newest"):
         hub.publish_to_hub(tiny, manifest, index, "hf://datasets/me/x@v1", api=api)
+
+
+def test_a_card_that_is_new_goes_to_the_hub_too(copy):
+    pytest.importorskip("huggingface_hub")
+    from dmcvb_gen.release import hub
+    from dmcvb_gen.release.publish import index_of
+
+    api, manifest = FakeHub(), open_release(copy).manifest
+    hub.publish_to_hub(copy, manifest, index_of(copy, manifest), "hf://datasets/me/tiny", api=api)
+    write_card(copy)
+    cards = len(card_files(copy))
+    assert hub.publish_to_hub(copy, manifest, index_of(copy, manifest), "hf://datasets/me/tiny", api=api) == cards
+    assert api.files["README.md"] == (copy / "README.md").read_bytes() and api.commits[-1] == [INDEX]
+    assert json.loads(api.files[INDEX]) == json.loads((copy / INDEX).read_text())
+    assert hub.publish_to_hub(copy, manifest, index_of(copy, manifest), "hf://datasets/me/tiny", api=api) == 0
+    (copy / "README.md").write_text("by hand")
+    with pytest.raises(StoreError, match="README.md does not have its digest; run `dmcvb-gen card"):
+        publish(copy, "hf://datasets/me/tiny")
+
+
+def test_a_damaged_index_is_put_there_again(copy, tmp_path):
+    publish(copy, f"file:{tmp_path / 'there'}")
+    (tmp_path / "there" / INDEX).write_text("{")
+    publish(copy, f"file:{tmp_path / 'there'}")
+    assert json.loads((tmp_path / "there" / INDEX).read_text()) == json.loads((copy / INDEX).read_text())
 
 
 def hub_of(folder, monkeypatch):

@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 
 import dmcvb_gen
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.publish import publish
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.plan import finish, make_plan, prepare
 from dmcvb_gen.store import open_release
@@ -134,6 +136,8 @@ def test_a_release_of_version_1_reads_as_before(small_release, maze_release, tmp
     data = dmcvb_gen.open(folder)[name].xarray()
     assert {"action", "state", "physics", "exogenous_style"} <= set(data.data_vars)
     xarray.testing.assert_equal(data.drop_attrs(), dmcvb_gen.open(source)[name].xarray().drop_attrs())
+    write_card(folder)  # with no digest to say
+    assert check_card(folder) == [] and publish(folder, f"file:{tmp_path / 'there'}").moved
 
 
 def version_1(source, folder, name):

@@ -261,8 +261,9 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
 @contextlib.contextmanager
 def _left_behind(path):
     """A copy (of links) of a release without its pictures, beside it."""
-    from dmcvb_gen.release.card import CROISSANT, README, write_card
+    from dmcvb_gen.release.card import README, write_card
     from dmcvb_gen.release.paint import without_pictures
+    from dmcvb_gen.store.index import CARD_FILES
     from dmcvb_gen.store.remote import storage_errors
 
     folder = Path(path)
@@ -271,7 +272,10 @@ def _left_behind(path):
     with made as light:
         without_pictures(folder, light)
         if (folder / README).is_file():  # its own card says what it has
-            shutil.copyfile(folder / CROISSANT, Path(light) / CROISSANT)  # which knows the day and the place
+            with storage_errors(folder):
+                for name in CARD_FILES:  # the day and the place, the changes so far
+                    if name != README and (folder / name).is_file():
+                        shutil.copyfile(folder / name, Path(light) / name)
             write_card(light)
         yield light
 

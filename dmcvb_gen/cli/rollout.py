@@ -120,7 +120,7 @@ def rollout(
     chosen = _recipe(context, options, going_on=bool(out))
     if options["slurm_script"]:
         if chosen:
-            describe(chosen, device, not no_pixels)  # or says why each task would be refused
+            describe(chosen, pixels=not no_pixels)  # or says why each task would be refused; this one needs no GPU
         return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
     scratch = (options["scratch"], options["scratch_size"])
     site = site_of(out or _out_default(chosen.name), options["options"], *scratch, workers)

@@ -103,7 +103,9 @@ def publish_to_hub(root: Path, manifest: Manifest, index: Index, url: str, tick:
         found, mine = there.get(folder + MANIFEST, set()), _digests(root / MANIFEST)
         if found and not found & mine:
             _check_grown(api, where, url, folder, manifest, index)
-        todo = [] if found & mine else list(_to_send(root, index.files, there, folder))
+        same = bool(found & mine)  # then a card may be new
+        wanted = [file for file in index.files if is_card(file.path)] if same else index.files
+        todo = list(_to_send(root, wanted, there, folder))
         expect(tick, len(todo))
         for first in range(0, len(todo), BATCH):
             part = todo[first : first + BATCH]
@@ -111,11 +113,9 @@ def publish_to_hub(root: Path, manifest: Manifest, index: Index, url: str, tick:
             message = f"{version}: files {first + 1} to {first + len(part)}"
             head = api.create_commit(**where, operations=operations, commit_message=message).oid
             tick(len(part))
-        if not found & mine:
-            last = [
-                CommitOperationAdd(folder + INDEX, files.json_bytes(index)),
-                CommitOperationAdd(folder + MANIFEST, str(root / MANIFEST)),
-            ]
+        if todo or not same:
+            last = [CommitOperationAdd(folder + INDEX, files.json_bytes(index))]
+            last += [] if same else [CommitOperationAdd(folder + MANIFEST, str(root / MANIFEST))]
             # Refused by the Hub if anyone else committed since: two publishers cannot both finish.
             made = api.create_commit(**where, operations=last, commit_message=version, parent_commit=head)
             head = made.oid
@@ -156,8 +156,7 @@ def _check_grown(api, where, url: str, folder: str, manifest: Manifest, index: I
 
 def _to_send(root: Path, listed: Sequence[FileRecord], there: dict[str, set[str]], folder: str) -> Iterator[FileRecord]:
     """Files that are not there yet: new ones first, then those that take the place of an older version's."""
-    late = [file for file in listed if is_replaced(file.path)]
-    for file in [*(file for file in listed if file not in set(late)), *late]:
+    for file in sorted(listed, key=lambda file: is_replaced(file.path)):
         _check_local(root, file)
         if not there.get(folder + file.path, set()) & _digests(root / file.path):
             yield file

@@ -16,12 +16,14 @@ from dmcvb_gen import files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.fetch import Moved
+from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.store.growth import is_grown_from
 from dmcvb_gen.store.index import (
     INDEX,
     Index,
     card_files,
     data_files,
+    is_card,
     is_replaced,
     keeps,
     parse_index,
@@ -99,13 +101,13 @@ def publish(
         raise StoreError(f"{root} is not complete; finish it with the same rollout, or `dmcvb-gen regenerate {root}`")
     index = index_of(root, manifest)
     total = sum(file.bytes for file in index.files)
+    _check_card(root, manifest, index)
     if url.startswith("hf://"):
         from dmcvb_gen.release.hub import publish_to_hub
 
         return Moved(len(index.files), total, publish_to_hub(root, manifest, index, url, tick))
     filesystem, base = file_system(url, options)
     place = public(url)
-    _check_card(root, manifest)
     before, same = _published(filesystem, place, base, index, manifest)
     if same and before is not None and set(index.files) <= set(before):
         return Moved(len(index.files), total, 0)
@@ -133,19 +135,23 @@ def publish(
     return Moved(len(index.files), total, sum(results))
 
 
-def _check_card(root: Path, manifest: Manifest) -> None:
-    """Refuse a card of another version: a release that has grown since."""
+def _check_card(root: Path, manifest: Manifest, index: Index) -> None:
+    """Refuse a card that was changed by hand, or is of another version: a release that has grown since."""
     page = root / "README.md"
-    with storage_errors(page):
-        old = page.is_file() and str(manifest.digest) not in page.read_text(errors="replace")
+    with storage_errors(root):
+        for file in index.files:
+            if is_card(file.path) and wrong_bytes(root, file):
+                raise StoreError(f"{root / file.path} does not have its digest; run `dmcvb-gen card {root}` first")
+        known = page.is_file() and manifest.digest  # of version 1 there is none
+        old = known and str(manifest.digest) not in page.read_text(errors="replace")
     if old:
         raise StoreError(f"the card of {root} is of another version; run `dmcvb-gen card {root}` first")
 
 
 def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     """Files in the order in which they go up: new ones first, then those that take the place of an older version's."""
-    late = [file for file in todo if is_replaced(file.path)]
-    return [part for part in ([file for file in todo if file not in set(late)], late) if part]
+    parts = [[file for file in todo if is_replaced(file.path) is late] for late in (False, True)]
+    return [part for part in parts if part]
 
 
 def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tuple[tuple[FileRecord, ...] | None, bool]:
@@ -161,8 +167,10 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
     if found is None:
         return None, False
     if files.sha256_bytes(found) == index.manifest_sha256:
-        listed = read_object(filesystem, place, f"{base}/{INDEX}")
-        return index.files if listed is None else parse_index(listed, f"{place}/{INDEX}").files, True
+        try:
+            return parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files, True
+        except StoreError:  # damaged, and put there again
+            return (), True
     what = "something else"
     try:
         other = parse_manifest(found, f"{place}/{MANIFEST}")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import (
     copy_file,
     folder_in_the_making,
@@ -234,13 +234,16 @@ class Regeneration:
 
     def _wanted(self, manifest: Manifest) -> dict[tuple[str, int], SubsetRecord]:
         """The shards that should be here."""
+        chosen = chosen_shards(manifest, self.only, self.episodes)
         fetched = [entry for entry in manifest.lineage if entry["kind"] == "fetch"]
         if self.only or self.episodes or manifest.complete or not fetched:
-            return chosen_shards(manifest, self.only, self.episodes)
-        wanted: dict[tuple[str, int], SubsetRecord] = {}
+            return chosen
+        root, _ = load_manifest(self.root)
+        wanted = {key: record for key, record in chosen.items() if (root / commit_path(*key)).is_file()}
         for entry in fetched:
             span = entry.get("episodes")
-            wanted |= chosen_shards(manifest, entry.get("only", ()), tuple(span) if span else None)
+            with contextlib.suppress(UnknownNameError, StoreError):  # a repaint has not all, and names some otherwise
+                wanted |= chosen_shards(manifest, entry.get("only", ()), tuple(span) if span else None)
         return wanted
 
     def _repair(self, known: _Known, shards, folder, tick) -> list[ShardOutcome]:

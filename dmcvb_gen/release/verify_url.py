@@ -6,7 +6,7 @@ digests, a sample of them or all; of the rest, that they are there at their size
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,9 @@ from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.verify import Verification, subset_of
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.index import INDEX, root_digest
-from dmcvb_gen.store.manifest import MANIFEST, FileRecord, shard_count
+from dmcvb_gen.store.manifest import FileRecord, commit_path, shard_count
 from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.transfer import in_parallel, list_files, remote_sha256, retry
+from dmcvb_gen.store.transfer import in_parallel, list_files, protocol, remote_sha256, retry
 from dmcvb_gen.store.writer import subset_digest
 
 SAMPLE_FILES = 40
@@ -72,40 +72,50 @@ def verify_url(
         release = open_release(url, options)
     except StoreError as error:
         return Verification(counts, (*findings, Finding("files", "commits", str(error))))
-    findings += _missing(source, {file.path for file in chosen})
+    findings += _missing(source, {finding.message for finding in findings})
+    listed, finished = {file.path: file for file in source.index.files}, source.manifest.complete
     for subset in release.subsets.values():
-        findings += _disagreements(source, subset)
+        findings += _disagreements(subset, listed)
+        finished &= all(commit_path(subset.name, shard) in listed for shard in subset.commits)
         counts["subsets"] += 1
         counts["episodes"] += len(subset.episodes)
         counts["steps"] += subset.steps
-    return Verification(counts, tuple(findings), release.shortfalls, release.manifest.digest)
+    return Verification(counts, tuple(findings), release.shortfalls, release.manifest.digest, finished)
 
 
-def _missing(source: Source, read: Collection[str]) -> list[Finding]:
-    """Files that the index lists and that are not there, or have another size, as far as the place can be listed."""
+def _missing(source: Source, said: Collection[str]) -> list[Finding]:
+    """Files that the index lists and that are not there, or have another size, as far as the place can be listed.
+
+    Args:
+      said: messages of what was found already.
+    """
+    if protocol(source.filesystem) in ("http", "https"):
+        return []  # whose lists are pages without sizes, or none; a sample was read
     try:
         there = list_files(source.filesystem, source.place, source.base.rstrip("/"))
     except StoreError:
         return []  # may be read and not listed; a sample was read
-    if MANIFEST not in there:
-        return []  # has no lists (HTTP)
-    sizes = {path: facts["size"] for path, facts in there.items()}
-    return [
-        Finding("files", subset_of(source.manifest, file.path), f"{file.path} is missing or has another size")
-        for file in source.index.files
-        if file.path not in read and sizes.get(file.path) != file.bytes
-    ]
+    found = []
+    for file in source.index.files:
+        size = there[file.path].get("size") if file.path in there else -1
+        text = f"{file.path} is missing or has another size"
+        if size not in (None, file.bytes) and not any(file.path in other for other in said):
+            found.append(Finding("files", subset_of(source.manifest, file.path), text))
+    return found
 
 
-def _disagreements(source: Source, subset: Subset) -> list[Finding]:
-    """What the commit records of a subset say otherwise than the index or the manifest."""
-    listed = {file.path: file for file in source.index.files}
-    found = [
-        Finding("files", subset.name, f"shard {shard}: its commit record and {INDEX} do not agree about {file.path}")
-        for shard, commit in subset.commits.items()
-        for file in commit.files
-        if listed.get(file.path) != file
-    ]
+def _disagreements(subset: Subset, listed: Mapping[str, FileRecord]) -> list[Finding]:
+    """What the commit records of a subset say otherwise than the index or the manifest.
+
+    Args:
+      listed: of the index, by path; shards that it does not know yet were made since.
+    """
+    found = []
+    for shard, commit in subset.commits.items():
+        other = [file.path for file in commit.files if listed.get(file.path) != file]
+        if other and commit_path(subset.name, shard) in listed:
+            text = f"shard {shard}: its commit record and {INDEX} do not agree about {other[0]}"
+            found.append(Finding("files", subset.name, text))
     whole = len(subset.commits) == shard_count(subset.record)
     if whole and subset.record.digest not in (None, subset_digest(subset.commits)):
         found.append(Finding("files", subset.name, "its commit records do not give the digest of the manifest"))

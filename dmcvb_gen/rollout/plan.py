@@ -299,7 +299,9 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
     records = [
         record
         for record in manifest.subsets
-        if shared or record.name in wanted or (root / subset_path(record.name) / ZARR_JSON).is_file()  # and may grow
+        if shared
+        or record.name in wanted
+        or ((root / subset_path(record.name) / ZARR_JSON).is_file() and not record.imported)  # which may grow
     ]
     if plan.inputs is not None:
         copy_inputs(root, [record for record in records if record.name in plan.inputs], plan.inputs)

@@ -31,7 +31,7 @@ from dmcvb_gen.store.manifest import (
     commit_path,
     subset_path,
 )
-from dmcvb_gen.store.remote import storage_errors
+from dmcvb_gen.store.remote import is_url, storage_errors
 
 ZARR_JSON = "zarr.json"
 INDEX = "files.json"
@@ -239,7 +239,8 @@ def refuse_altered(listed: Iterable[FileRecord], digest: Callable[[str], str | N
         found = digest(file.path)
         if found != file.sha256:
             what = "is damaged" if found else "is missing"
-            raise StoreError(f"{file.path} of {place} {what}; mend it first: dmcvb-gen regenerate {place}")
+            cure = "put it there from a copy" if is_url(place) else f"dmcvb-gen regenerate {place}"
+            raise StoreError(f"{file.path} of {place} {what}; mend it first: {cure}")
 
 
 def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
@@ -251,6 +252,8 @@ def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
     if manifest.digest is None or not (root / INDEX).is_file():
         return
     index = trusted_index(root, manifest)
+    if index is None and not manifest.complete:
+        return  # writing it may have been interrupted, and it is written again
     if index is None:
         raise StoreError(f"{root / INDEX} is damaged; mend it first: dmcvb-gen regenerate {root}")
 

@@ -381,7 +381,7 @@ def finish_together(root: Path) -> Manifest:
     Raises:
       StoreError: see there; or what the release has digests of already is not what it was.
     """
-    with storage_errors(root, "write to"), only_writer(root, wait=LOCK_SECONDS):
+    with storage_errors(root, "write to"), only_writer(root, wait=10 * LOCK_SECONDS):  # others finish for a while, too
         manifest = local_manifest(root)
         refuse_altered_folder(root, manifest)
         return finish_release(root, manifest)
