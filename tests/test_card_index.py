@@ -28,4 +28,6 @@ def test_the_report_beside_the_card_is_of_this_release():
     assert len(returns) == 71 and all(line in card for line in returns)
     manifest = Manifest.model_validate_json((folder / MANIFEST).read_bytes())
     assert lines[0] == f"# Validation of {manifest.name} {manifest.version}"
-    assert lines[2].startswith(f"Sound: {len(manifest.subsets)} subsets, {sum(s.episodes for s in manifest.subsets)} ")
+    assert lines[2].startswith(
+        f"Sound: {len(manifest.subsets)} subsets, {sum(s.episodes for s in manifest.subsets):,} "
+    )

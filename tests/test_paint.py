@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 import threading
 
@@ -236,6 +237,45 @@ def test_a_source_in_memory_shows_the_subsets_epoch(made):
     assert (source[3]["pixels"] != before).any()
     subset.set_epoch(0)
     assert np.array_equal(source[3]["pixels"], before)
+
+
+@pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
+def test_each_data_set_shows_the_epoch_that_it_was_given(made, kind):
+    opened = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")
+    subset = next(reversed(opened.subsets.values()))
+    options = {"episodes": [int(subset.episodes[0])]}
+    if kind == "stream":
+        options |= {"batch_size": 4, "shuffle": False}
+
+    def pictures(data):
+        items = data if kind == "stream" else [data[index] for index in range(len(data))]
+        return np.concatenate([np.ravel(item["pixels"].numpy()) for item in items])
+
+    sets, wanted = [subset.torch(kind, **options) for _ in range(2)], []
+    for epoch in (1, 2):
+        subset.set_epoch(epoch)
+        wanted.append(pictures(sets[0]))  # given none, it shows the subset's
+    for data, epoch in zip(sets, (1, 2), strict=True):
+        data.set_epoch(epoch)
+    assert [np.array_equal(pictures(data), want) for data, want in zip(sets, wanted, strict=True)] == [True, True]
+    assert np.array_equal(pictures(sets[0]), wanted[0]) and not np.array_equal(*wanted)
+    if kind == "stream":
+        subset.set_epoch(0)
+        assert np.array_equal(pictures(subset.torch(kind, epoch=2, **options)), wanted[1])
+
+
+@pytest.mark.parametrize("way", [{}, {"paint": True, "distractors": "resample"}])
+def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
+    subset = next(reversed(dmcvb_gen.open(str(made / "painted"), **way).subsets.values()))
+    from dmcvb_gen.readers import source as module
+
+    made_blocks, real = [], module.Block
+    monkeypatch.setattr(module, "Block", lambda *options: made_blocks.append(1) or real(*options))
+    source = pickle.loads(pickle.dumps(subset.source()))
+    threads = [threading.Thread(target=lambda: source[0]) for _ in range(6)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert len(made_blocks) == 1
 
 
 def test_painted_episodes_are_kept_while_there_is_room(made):

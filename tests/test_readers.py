@@ -208,7 +208,7 @@ def test_ranks_get_equally_many_batches_of_episodes_that_differ_in_length(subset
             rows = {"state": length + 1, "action": length, "reward": length, "discount": length}
             return {name: value[: rows[name]] if name in rows else value for name, value in values.items()}
 
-    counts, steps = [], []
+    counts, steps, by_worker = [], [], []
     for rank in range(2):
         parts = [
             list(stream(Uneven(), batch_size=batch_size, pictures=(), rank=rank, world=2, worker=worker,
@@ -216,9 +216,14 @@ def test_ranks_get_equally_many_batches_of_episodes_that_differ_in_length(subset
             for worker in range(workers)
         ]  # fmt: skip
         counts.append(sum(map(len, parts)))
+        by_worker.append([len(part) for part in parts])
         steps += [(int(e), int(s)) for part in parts for b in part
                   for e, s in zip(np.atleast_1d(b["episode"]), np.atleast_1d(b["step"]), strict=True)]  # fmt: skip
     assert counts[0] == counts[1] > 0 and len(set(steps)) == len(steps)
+    if batch_size is None:  # a loader makes batches of each worker's steps
+        assert by_worker[0] == by_worker[1]
+    with pytest.raises(DmcvbError, match="rank 2 is not in 0..1"):
+        next(stream(Uneven(), rank=2, world=2))
 
 
 def test_random_steps_work_in_loader_workers_and_survive_pickling(subset):

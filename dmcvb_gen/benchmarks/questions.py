@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.benchmarks.tables import FEW_EPISODES
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import DISTRACTOR_KINDS
 
@@ -243,7 +242,7 @@ QUESTIONS: dict[str, tuple[str, Callable[[Scores], Iterator[Answer]]]] = {
     "gap": ("Is BC(state) above BC from pictures?", _gap),
     "id": ("Does ID+BC beat the other agents under distractors and in mazes?", _encoder),
     "mixed": (
-        f"Does an encoder of mixed data help a policy of {FEW_EPISODES} episodes (B2)?",
+        "Does an encoder of mixed data help a policy of few episodes (B2)?",
         _pretrained("b2", "mixed"),
     ),
     "goals": (

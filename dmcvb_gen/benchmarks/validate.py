@@ -15,7 +15,7 @@ from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
 from dmcvb_gen.benchmarks.setup import Setup, open_data
-from dmcvb_gen.benchmarks.tables import Cell, Missing, plan_benchmark
+from dmcvb_gen.benchmarks.tables import FEW_EPISODES, Cell, Missing, plan_benchmark
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import select
 from dmcvb_gen.pool import Workers
@@ -133,7 +133,7 @@ def validate(
             results.append((cell, result))
     order = {cell: index for index, cell in enumerate(cells)}
     results.sort(key=lambda pair: order[pair[0]])
-    warnings = (*structure.warnings, *_learning_warnings(setup, results))
+    warnings = (*structure.warnings, *_learning_warnings(setup, results), *_few_warnings(chosen, cells))
     report, facts = write_report(
         setup=setup,
         release=chosen,
@@ -186,6 +186,17 @@ def check_writable(folder: str | Path) -> None:
             pass
     except OSError as error:
         raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
+
+
+def _few_warnings(release: Release, cells: Sequence[Cell]) -> list[Finding]:
+    """B2 asks what few expert episodes give; a release that has no more of them does not tell."""
+    found = {}
+    for part in (part for cell in cells if cell.benchmark == "b2" for part in cell.policy):
+        there = len(release[part.subset].episodes)
+        if part.episodes == there:
+            text = f"b2 learns from {FEW_EPISODES} expert episodes, and {there} are all there are; roll out more"
+            found[part.subset] = Finding("learning", part.subset, text)
+    return list(found.values())
 
 
 def _learning_warnings(setup: Setup, results) -> list[Finding]:

@@ -152,19 +152,22 @@ def stream(
     chosen = choose(subset, episodes)
     names = shown(subset, pictures).arrays
     order = np.random.default_rng([seed, epoch, 0]).permutation(chosen) if shuffle else chosen
-    most = None
+    own, most = share(order, rank, world, worker, workers), None
     if world > 1:
-        most = _batches(subset, order, batch_size or 1, world, workers, drop_last)[rank][worker]
-    order = share(order, rank, world, worker, workers)
+        most = _batches(subset, order, batch_size, world, workers, drop_last)[rank][worker]
     mixer = np.random.default_rng([seed, epoch, 1 + rank * workers + worker])
-    items = _mixed(subset, order, names, mixer if shuffle else None, batch_size, stack, next_step, buffer, drop_last)
+    items = _mixed(subset, own, names, mixer if shuffle else None, batch_size, stack, next_step, buffer, drop_last)
     yield from itertools.islice(items, most)
 
 
 def _batches(
-    subset: Subset, order: np.ndarray, batch_size: int, world: int, workers: int, drop_last: bool
+    subset: Subset, order: np.ndarray, batch_size: int | None, world: int, workers: int, drop_last: bool
 ) -> list[list[int]]:
-    """How many batches each rank's workers give: as many a rank as the shortest rank has."""
+    """How many batches each rank's workers give: as many a rank as the shortest rank has.
+
+    Of single steps (no batch size), each worker gives as many as that worker of any rank has: a loader that makes
+    batches of them makes them by worker.
+    """
     lengths = dict(zip(subset.episodes.tolist(), subset.lengths.tolist(), strict=True))
     counts = []
     for rank in range(world):
@@ -172,7 +175,10 @@ def _batches(
             sum(lengths[int(episode)] for episode in share(order, rank, world, worker, workers))
             for worker in range(workers)
         ]
-        counts.append([count // batch_size if drop_last else -(-count // batch_size) for count in steps])
+        size = batch_size or 1
+        counts.append([count // size if drop_last else -(-count // size) for count in steps])
+    if batch_size is None:
+        return [[min(own) for own in zip(*counts, strict=True)]] * world
     fewest = min(map(sum, counts))
     return [np.diff(np.minimum(np.cumsum([0, *own]), fewest)).tolist() for own in counts]
 

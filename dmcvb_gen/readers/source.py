@@ -7,6 +7,7 @@ A `StepSource` has `__len__` and `__getitem__`, which is what Grain (`grain.MapD
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -59,9 +60,11 @@ class StepSource:
         self._ends = np.cumsum(lengths)
         if in_memory is None:
             size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3
-            in_memory = size <= SHARE_OF_MEMORY * free_memory()
+            holders = 1 + (os.cpu_count() or 1) if is_fresh(subset) else 1  # each of a loader's workers paints its own
+            in_memory = size <= SHARE_OF_MEMORY * free_memory() / holders
         self.in_memory = in_memory
         self._held: tuple[int, Block] | None = None
+        self._reading = threading.Lock()  # of several threads, one reads
 
     def __len__(self) -> int:
         return int(self._ends[-1]) if len(self._ends) else 0
@@ -95,16 +98,19 @@ class StepSource:
     @property
     def block(self) -> Block:
         """All steps, in memory; read again where the subset's distractors have become those of another epoch."""
-        epoch = getattr(self.subset, "shown_epoch", 0)
-        if self._held is None or self._held[0] != epoch:
-            self._held = None  # free the old pictures before new ones are painted
-            self._held = epoch, Block(self.subset, self.episodes, self.pictures, self.stack, self.next_step)
-        return self._held[1]
+        with self._reading:
+            epoch = getattr(self.subset, "shown_epoch", 0)
+            if self._held is None or self._held[0] != epoch:
+                self._held = None  # free the old pictures before new ones are painted
+                self._held = epoch, Block(self.subset, self.episodes, self.pictures, self.stack, self.next_step)
+            return self._held[1]
 
-    def __getstate__(
-        self,
-    ) -> dict[str, Any]:  # what is held is read again where the source lands: quicker than sending it
-        return self.__dict__ | {"_held": None}
+    def __getstate__(self) -> dict[str, Any]:
+        # What is held is read again where the source lands: quicker than sending it.
+        return {name: value for name, value in self.__dict__.items() if name != "_reading"} | {"_held": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state | {"_reading": threading.Lock()}
 
     def _read(self, place: int) -> dict[str, np.ndarray]:
         number = int(np.searchsorted(self._ends, place, side="right"))
@@ -121,6 +127,12 @@ class StepSource:
                 values[f"{prefix}pixels"] = stack_channels(frames[np.maximum(rows, 0)])
         values |= {name: np.asarray(array(name)[episode, step]) for name in ("action", "reward", "discount")}
         return values | {"episode": np.asarray(episode), "step": np.asarray(step)}
+
+
+def is_fresh(subset: Subset) -> bool:
+    """Whether each epoch shows other distractors, painted when they are read."""
+    painting = getattr(subset, "painting", None)
+    return painting is not None and painting.distractors == "resample"
 
 
 def free_memory() -> int:

@@ -29,22 +29,26 @@ def _tensors(values: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
 class _Epochs:
     """An epoch that a loader's persistent workers see too: in shared memory, as they keep the data they began with."""
 
-    def __init__(self, subset: Subset, first: int = 0):
-        self._subset, self._set = subset, first
-        self._epoch = torch.tensor(first).share_memory_()
+    def __init__(self, subset: Subset, given: int | None = None):
+        self._subset = subset
+        self._epoch = torch.tensor(-1 if given is None else given).share_memory_()  # -1: nobody has given one
 
     @property
     def number(self) -> int:
-        return int(self._epoch)
+        return max(0, int(self._epoch))
 
     def set(self, epoch: int) -> None:
         self._epoch.fill_(epoch)
 
     def take(self) -> None:
-        """Let the subset know (one with fresh distractors), in whichever process reads it."""
-        if self.number != self._set:
-            self._set = self.number
-            getattr(self._subset, "set_epoch", lambda epoch: None)(self._set)
+        """Let the subset know (one with fresh distractors), in whichever process reads it.
+
+        At every read, as other data sets of the subset may be at another epoch. One that was given none shows that of
+        the subset.
+        """
+        given = int(self._epoch)
+        if given >= 0 and getattr(self._subset, "epoch", given) != given:
+            self._subset.set_epoch(given)  # type: ignore[attr-defined]
 
 
 class StepDataset(Dataset):
@@ -126,7 +130,7 @@ class StreamDataset(IterableDataset):
 
     def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options: Any):
         self.subset, self.options = subset, options
-        self._epochs = _Epochs(subset, options.pop("epoch", 0))
+        self._epochs = _Epochs(subset, options.pop("epoch", None))
         running = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else torch.distributed.get_rank() if running else 0
         self.world = world if world is not None else torch.distributed.get_world_size() if running else 1
