@@ -28,6 +28,9 @@ def commands(task, folder):
     yield "rollout", task, "--episodes", "2", "--max-steps", "5", "--out", folder / "bare", "--no-pixels"
     yield "paint", folder / "bare"
     yield "verify", release
+    yield "validate", release, "--checks-only", "--out", folder / "report"
+    narrow = open_release(release).manifest.subsets[0].name
+    yield "validate", release, "--checks-only", "--only", narrow, "--workers", "2", "--out", folder / "report"
     yield "regenerate", release, "--check"
     yield "repaint", release, "--size", "32", "--out", folder / "repainted"
     yield "publish", release, f"file:{folder / 'published'}"

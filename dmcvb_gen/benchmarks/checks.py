@@ -11,12 +11,13 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
-from dmcvb_gen.pool import Tick, Workers, ignore, in_order, open_pool
+from dmcvb_gen.pool import Tick, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.readers.painted import PaintedSubset
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.release.paint import drift
@@ -166,6 +167,19 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
     return drift(release.manifest, painted, sources)
 
 
+class _Longer:
+    """A tick that is told of more than it expects to be told of by whom it is given to."""
+
+    def __init__(self, tick: Tick, more: int):
+        self._tick, self._more = tick, more
+
+    def __call__(self, done: Any) -> None:
+        self._tick(done)
+
+    def expect(self, count: float) -> None:
+        expect(self._tick, count + self._more)
+
+
 def check_structure(
     release: Release,
     backgrounds: str | None = None,
@@ -176,7 +190,8 @@ def check_structure(
 
     Args:
       backgrounds: where the manifest's videos are now, if they moved.
-      tick: told the subset that is looked at: for the bytes of each few shards, for values, for labels.
+      tick: told the subset that is looked at: for the bytes of each few shards, for values, for labels; it is told
+        beforehand how often.
       workers: processes, or a Ray cluster that sees the folder; a subset each.
 
     Raises:
@@ -185,6 +200,8 @@ def check_structure(
     started = time.perf_counter()
     wanted = {record.name for record in release.manifest.subsets}
     others = {record.name for record in open_release(release.path).manifest.subsets} - wanted
+    again = len(release.subsets)  # for labels; and of the others only the bytes are looked at
+    tick = _Longer(tick, again - (len(wanted | others) - again))
     with open_pool(workers, tick=tick) as pool:
         verified = verify(release.path, backgrounds, tick, pool, names=release.subsets)
         findings, warnings = [f for f in verified.findings if f.subset not in others], []

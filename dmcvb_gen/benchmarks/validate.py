@@ -18,7 +18,7 @@ from dmcvb_gen.benchmarks.setup import Setup, open_data
 from dmcvb_gen.benchmarks.tables import FEW_EPISODES, Cell, Missing, plan_benchmark
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.names import select
-from dmcvb_gen.pool import Workers
+from dmcvb_gen.pool import Tick, Workers, ignore
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.store import Release
 from dmcvb_gen.store.remote import local_path
@@ -67,13 +67,13 @@ class Progress:
     """Who is told how a validation goes on.
 
     Attributes:
-      checking: called with the subset that is checked.
+      checking: a tick, told the subset that is checked.
       total: called with the number of Adam steps to come.
       training: called with what is trained and the steps made.
       done: called with each cell and its result.
     """
 
-    checking: Callable[[str], None] = field(default=lambda subset: None)
+    checking: Tick = ignore
     total: Callable[[int], None] = field(default=lambda steps: None)
     training: Callable[[str, int], None] = field(default=lambda what, steps: None)
     done: Callable[[Cell, dict[str, Any]], None] = field(default=lambda cell, result: None)

@@ -77,10 +77,10 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
         dino_weights=weights and str(weights),
         **options | {"threads": options["threads"] or threads},
     )
-    with ProgressBar(as_json, unit=" steps", desc="structure") as bar:
+    with ProgressBar(as_json, unit=" checks", desc="structure") as bar:
         progress = Progress(
-            checking=lambda name: bar.set_description(f"checking {name}"),
-            total=bar.reset,
+            checking=bar,
+            total=lambda steps: (setattr(bar, "unit", " steps"), bar.reset(steps)),
             training=lambda what, steps: (bar.set_description(what, refresh=False), bar.update(steps)),
             done=lambda cell, facts: None if as_json else _show_score(cell, facts, setup.profile),
         )
