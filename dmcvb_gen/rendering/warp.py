@@ -105,7 +105,7 @@ class WarpRenderer(Renderer):
         self._data: dict[int, Any] = {}
         self._skies: dict[tuple[int, int], Any] = {}
         self._model: Any = None
-        self._mujoco_model: Any = None
+        self._held: Any = None
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -127,8 +127,14 @@ class WarpRenderer(Renderer):
         """Texels a side of a sky face: a face spans 90 degrees, about two pictures at 45 degrees of view."""
         return min(2 * self.size, 512)
 
+    @property
+    def _mujoco_model(self) -> Any:
+        """The task's, with its textures; kept, as the task may let go of it."""
+        if self._held is None:
+            self._held = self.task.picture_model
+        return self._held
+
     def _build(self) -> None:
-        self._mujoco_model = self.task.picture_model
         mjw, wp, mjm = _mjw(), _warp(), self._mujoco_model
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(mjm)
@@ -364,4 +370,4 @@ class WarpRenderer(Renderer):
         self._contexts.clear()
         self._skies.clear()
         self._data.clear()
-        self._model = self._mujoco_model = None
+        self._model = self._held = None
