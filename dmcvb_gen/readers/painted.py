@@ -120,9 +120,14 @@ class PaintedSubset(SubsetReader):
         self.epoch = epoch
 
     @property
+    def fresh(self) -> bool:
+        """Whether each epoch shows other distractors."""
+        return self.painting.distractors == RESAMPLED
+
+    @property
     def shown_epoch(self) -> int:
         """The epoch whose distractors the pictures show; 0 where they are those of the data."""
-        return self.epoch if self.painting.distractors == RESAMPLED else 0
+        return self.epoch if self.fresh else 0
 
     @property
     def picture_names(self) -> tuple[str, ...]:
@@ -180,7 +185,7 @@ class PaintedSubset(SubsetReader):
         length = self.read("length", index)
         used = int(length.max()) + 1
         physics = self.read("physics", index)[:, :used]
-        if self.painting.distractors == RESAMPLED:
+        if self.fresh:
             names = (*self._names, f"epoch {self.epoch}")
             labels = exogenous_of(self.record, self._seed, names, np.array(index), physics, length, videos)
         else:

@@ -60,7 +60,8 @@ class StepSource:
         self._ends = np.cumsum(lengths)
         if in_memory is None:
             size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3
-            holders = 1 + (os.cpu_count() or 1) if is_fresh(subset) else 1  # each of a loader's workers paints its own
+            fresh = getattr(subset, "fresh", False)  # then each of a loader's workers paints and holds its own
+            holders = 1 + (os.cpu_count() or 1) if fresh else 1
             in_memory = size <= SHARE_OF_MEMORY * free_memory() / holders
         self.in_memory = in_memory
         self._held: tuple[int, Block] | None = None
@@ -127,12 +128,6 @@ class StepSource:
                 values[f"{prefix}pixels"] = stack_channels(frames[np.maximum(rows, 0)])
         values |= {name: np.asarray(array(name)[episode, step]) for name in ("action", "reward", "discount")}
         return values | {"episode": np.asarray(episode), "step": np.asarray(step)}
-
-
-def is_fresh(subset: Subset) -> bool:
-    """Whether each epoch shows other distractors, painted when they are read."""
-    painting = getattr(subset, "painting", None)
-    return painting is not None and painting.distractors == "resample"
 
 
 def free_memory() -> int:

@@ -66,13 +66,15 @@ def verify_url(
         return Finding("files", subset_of(source.manifest, file.path), f"{file.path} does not have its digest")
 
     expect(tick, len(chosen))
-    findings += [found for found in in_parallel(look, chosen, workers, lambda _: tick(1)) if found]
+    looked = in_parallel(look, chosen, workers, lambda _: tick(1))
+    findings += [found for found in looked if found]
+    damaged = {file.path for file, found in zip(chosen, looked, strict=True) if found}
     counts = {"subsets": 0, "episodes": 0, "steps": 0, "files": len(chosen)}
     try:
         release = open_release(url, options)
     except StoreError as error:
         return Verification(counts, (*findings, Finding("files", "commits", str(error))))
-    findings += _missing(source, {finding.message for finding in findings})
+    findings += _missing(source, damaged)
     listed, finished = {file.path: file for file in source.index.files}, source.manifest.complete
     for subset in release.subsets.values():
         findings += _disagreements(subset, listed)
@@ -83,11 +85,11 @@ def verify_url(
     return Verification(counts, tuple(findings), release.shortfalls, release.manifest.digest, finished)
 
 
-def _missing(source: Source, said: Collection[str]) -> list[Finding]:
+def _missing(source: Source, damaged: Collection[str]) -> list[Finding]:
     """Files that the index lists and that are not there, or have another size, as far as the place can be listed.
 
     Args:
-      said: messages of what was found already.
+      damaged: paths of what was found to be so already.
     """
     if protocol(source.filesystem) in ("http", "https"):
         return []  # whose lists are pages without sizes, or none; a sample was read
@@ -99,7 +101,7 @@ def _missing(source: Source, said: Collection[str]) -> list[Finding]:
     for file in source.index.files:
         size = there[file.path].get("size") if file.path in there else -1
         text = f"{file.path} is missing or has another size"
-        if size not in (None, file.bytes) and not any(file.path in other for other in said):
+        if size not in (None, file.bytes) and file.path not in damaged:
             found.append(Finding("files", subset_of(source.manifest, file.path), text))
     return found
 
