@@ -212,3 +212,8 @@ def select(names: Sequence[str], patterns: Sequence[str]) -> list[str]:
         if not any(matches(name, [pattern]) for name in names):
             raise UnknownNameError("subset pattern", pattern, names)
     return [name for name in names if not patterns or matches(name, patterns)]
+
+
+def counted(count: int, noun: str) -> str:
+    """A number with its noun, given in the plural: 1, "shards" -> "1 shard"; 1200 -> "1,200 shards"."""
+    return f"{count:,} {noun.removesuffix('s') if count == 1 else noun}"

@@ -88,7 +88,7 @@ def test_what_is_here_is_made_again_and_nothing_else(part):
     (part / shard.files[0].path).unlink()
     assert run("regenerate", part, "--check").exit_code == 1
     repaired = run("regenerate", part)
-    assert repaired.exit_code == 0 and "1 shards made again" in repaired.output
+    assert repaired.exit_code == 0 and "1 shard made again" in repaired.output
     assert {path for path in part.rglob("*") if path.is_file()} - {part / ".lock"} == before - {part / ".lock"}
     assert verify(part).sound
     more = run("regenerate", part, "--only", other)

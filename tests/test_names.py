@@ -61,3 +61,8 @@ def test_patterns_select_and_unknown_ones_are_refused():
     assert names.select(known, ["walker-walk"]) == known[:2] and names.select(known, []) == known
     with pytest.raises(UnknownNameError, match="walker-walk/expert/none"):
         names.select(known, ["walker-walk/*/dynamic"])
+
+
+@pytest.mark.parametrize("count,text", [(0, "0 shards"), (1, "1 shard"), (2, "2 shards"), (1200, "1,200 shards")])
+def test_counted(count, text):
+    assert names.counted(count, "shards") == text

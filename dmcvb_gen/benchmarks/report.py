@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.questions import QUESTIONS, ask
 from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.tables import Cell, Missing
 from dmcvb_gen.files import write_json, write_text
-from dmcvb_gen.names import ANT_MAZE, DISTRACTOR_KINDS, FIXED, VISIBLE, family_of, task_folder
+from dmcvb_gen.names import ANT_MAZE, DISTRACTOR_KINDS, FIXED, VISIBLE, counted, family_of, task_folder
 from dmcvb_gen.release.finding import Finding
 from dmcvb_gen.rollout.info import return_statistics
 from dmcvb_gen.store import Release
@@ -256,11 +256,12 @@ def _score_text(entry: Mapping[str, Any] | None, profile: str) -> str:
 
 def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
     found, failed = len(facts["structure"]["findings"]), len(facts["failed"])
-    checked = ", ".join(f"{count:,} {what}" for what, count in facts["structure"]["checked"].items())
+    checked = ", ".join(counted(count, what) for what, count in facts["structure"]["checked"].items())
     there, asked = facts["episodes"]["there"], facts["episodes"]["asked"]
     if not facts["sound"]:
         kind = "unsound"
-        text = f"Not sound: {found} findings" + (f", {failed} cells failed" if failed else "") + f" in {checked}."
+        text = f"Not sound: {counted(found, 'findings')}"
+        text += (f", {counted(failed, 'cells')} failed" if failed else "") + f" in {checked}."
     elif not facts["complete"]:
         kind, text = "incomplete", f"Incomplete: {there:,} of {asked:,} episodes. Sound is what is there: {checked}."
     else:
@@ -269,7 +270,7 @@ def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
         text += f" Incomplete: {there:,} of {asked:,} episodes."
     done = len(facts["results"])
     text += f" {done} of {facts['cells_planned']} benchmark cells run [{facts['profile']['name']}]."
-    text += f" {len(facts['warnings'])} warnings." if facts["warnings"] else ""
+    text += f" {counted(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
     return {"kind": kind, "text": text}
 
 

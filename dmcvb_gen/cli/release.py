@@ -21,7 +21,7 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.cli.unheard import given_options, refuse
-from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS
+from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS, counted
 
 
 @click.command()
@@ -75,8 +75,8 @@ def _tell_verified(path, result):
         click.echo(f"... and {len(result.findings) - 50} more")
     for name, (here, planned) in result.incomplete.items():
         click.echo(f"{name}: {here:,} of {planned:,} episodes")
-    checked = ", ".join(f"{count:,} {name}" for name, count in result.checked.items())
-    verdict = "sound" if result.sound else f"{len(result.findings)} findings"
+    checked = ", ".join(counted(count, name) for name, count in result.checked.items())
+    verdict = "sound" if result.sound else counted(len(result.findings), "findings")
     if result.incomplete:
         here = result.checked["episodes"]
         planned = here + sum(planned - count for count, planned in result.incomplete.values())
@@ -171,10 +171,10 @@ def regenerate(
                 click.echo(f"environment: {name} was {there}, is {here}")
             if not outcome.environment:
                 click.echo("environment: the same versions and processor as when the release was made")
-        count = len(outcome.shards)
-        left = f"; {outcome.left} more are not here" if outcome.left else ""
+        made = counted(len(outcome.shards), "shards")
+        left = f"; {outcome.left} more not here" if outcome.left else ""
         nothing = "none of these shards is here" if outcome.left else "nothing is damaged or missing"
-        click.echo(f"{out or path}: {count} shards made again{left}" if count else f"{path}: {nothing}")
+        click.echo(f"{out or path}: {made} made again{left}" if outcome.shards else f"{path}: {nothing}")
     context.exit(1 if not outcome.sound else 3 if outcome.left else 0)
 
 

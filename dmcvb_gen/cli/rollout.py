@@ -31,6 +31,7 @@ from dmcvb_gen.names import (
     SPLITS,
     DistractorSetting,
     MazeName,
+    counted,
     family_of,
     task_folder,
 )
@@ -142,7 +143,7 @@ def rollout(
 def _tell_begun(plan, as_json):
     if as_json:
         return print_json({"out": plan.site.place, "jobs": len(plan.jobs), "already_done": plan.done})
-    click.echo(f"{plan.site.place}: begun, {len(plan.jobs)} jobs to do; make them with --part 1/N to N/N")
+    click.echo(f"{plan.site.place}: begun, {counted(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N")
 
 
 def _finish(site, finish_site, as_json):
@@ -151,7 +152,8 @@ def _finish(site, finish_site, as_json):
     if as_json:
         print_json({"out": site.place, "complete": manifest.complete, "incomplete": missing})
     elif missing:
-        click.echo(f"{site.place}: not complete; shards are missing in {len(missing)} subsets, e.g. {missing[0]}")
+        lacking = counted(len(missing), "subsets")
+        click.echo(f"{site.place}: not complete; shards are missing in {lacking}, e.g. {missing[0]}")
     else:
         click.echo(f"{site.place}: complete")
     click.get_current_context().exit(0 if manifest.complete else 1)
@@ -188,7 +190,7 @@ def _run(plan, workers, as_json, whole=True):
     state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
     if not whole:
         state = "finished with --finish when all parts are there"
-    kept = f", {plan.done} shards were there already" if plan.done else ""
+    kept = f", {counted(plan.done, 'shards')} there already" if plan.done else ""
     rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
     click.echo(f"{place}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
     named = shlex.quote(str(place))
@@ -390,7 +392,8 @@ def _show_plan(plan, cost, workers, as_json):
     console.print(table)
     spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
     console.print(
-        f"{cost.jobs} jobs to do, {cost.done} shards done; {cost.steps:,} steps, {format_bytes(cost.bytes)}, "
+        f"{counted(cost.jobs, 'jobs')} to do, {counted(cost.done, 'shards')} done; "
+        f"{cost.steps:,} steps, {format_bytes(cost.bytes)}, "
         f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
         f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64."
     )

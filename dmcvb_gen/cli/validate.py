@@ -10,6 +10,7 @@ import click
 from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
 from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
 from dmcvb_gen.cli.unheard import given_options, refuse
+from dmcvb_gen.names import counted
 
 TRAINING = (
     *("benchmarks", "agents", "profile", "scale", "seed"),
@@ -130,9 +131,9 @@ def _show(result, profile) -> None:
             click.echo(f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}")
         if entry.left_out:
             click.echo(f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}")
-    checked = ", ".join(f"{count:,} {name}" for name, count in result.structure.checked.items())
+    checked = ", ".join(counted(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
-    verdict = ["sound" if result.sound else f"{found} findings"]
+    verdict = ["sound" if result.sound else counted(found, "findings")]
     if not result.complete:
         there, asked = result.episodes
         verdict = [

@@ -21,7 +21,7 @@ from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import remove_partial, replacing, write_text
-from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
+from dmcvb_gen.names import ANT_MAZE, FIXED, counted, distractor_of
 from dmcvb_gen.readers.painted import Painting, painted_release
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
@@ -219,8 +219,8 @@ def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
         held += "makes the pictures"
     text = (
         f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with {held}: "
-        f"{len(facts['subsets'])} subsets, "
-        f"{sum(subset['episodes'] for subset in facts['subsets']):,} episodes, {facts['steps']:,} steps."
+        f"{counted(len(facts['subsets']), 'subsets')}, "
+        f"{counted(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
     )
     return text.strip()
 

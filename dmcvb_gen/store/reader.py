@@ -12,6 +12,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.names import counted
 from dmcvb_gen.store.manifest import (
     MANIFEST,
     CommitRecord,
@@ -274,7 +275,7 @@ class Release:
         self.root, self.manifest, self.subsets = root, manifest, subsets
 
     def __repr__(self) -> str:
-        return f"<Release {self.manifest.name} {self.manifest.version}: {len(self.subsets)} subsets>"
+        return f"<Release {self.manifest.name} {self.manifest.version}: {counted(len(self.subsets), 'subsets')}>"
 
     def __getitem__(self, name: str) -> Subset:
         if name in self.shortfalls and name not in self.subsets:
