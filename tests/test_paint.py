@@ -264,6 +264,16 @@ def test_each_data_set_shows_the_epoch_that_it_was_given(made, kind):
         assert np.array_equal(pictures(subset.torch(kind, epoch=2, **options)), wanted[1])
 
 
+def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
+    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
+    streams = [subset.torch("stream", batch_size=4, shuffle=False, buffer=1, epoch=epoch) for epoch in (1, 2)]
+    alone = [[batch["pixels"].numpy() for batch in stream] for stream in streams]
+    turns = [[pair[index]["pixels"].numpy() for pair in zip(*streams, strict=True)] for index in (0, 1)]
+    assert len(alone[0]) > 2 and not np.array_equal(alone[0][-1], alone[1][-1])
+    for one, other in zip(alone, turns, strict=True):
+        assert all(map(np.array_equal, one, other))
+
+
 @pytest.mark.parametrize("way", [{}, {"paint": True, "distractors": "resample"}])
 def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
     subset = next(reversed(dmcvb_gen.open(str(made / "painted"), **way).subsets.values()))

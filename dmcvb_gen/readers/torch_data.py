@@ -40,13 +40,18 @@ class _Epochs:
     def set(self, epoch: int) -> None:
         self._epoch.fill_(epoch)
 
-    def take(self) -> None:
+    @property
+    def given(self) -> int:
+        """The epoch; -1 where nobody has given one."""
+        return int(self._epoch)
+
+    def take(self, given: int | None = None) -> None:
         """Let the subset know (one with fresh distractors), in whichever process reads it.
 
         At every read, as other data sets of the subset may be at another epoch. One that was given none shows that of
-        the subset.
+        the subset. A pass that has begun keeps the epoch that was given before it.
         """
-        given = int(self._epoch)
+        given = self.given if given is None else given
         if given >= 0 and getattr(self._subset, "epoch", given) != given:
             self._subset.set_epoch(given)  # type: ignore[attr-defined]
 
@@ -145,17 +150,21 @@ class StreamDataset(IterableDataset):
         self._epochs.set(epoch)
 
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
-        self._epochs.take()
+        given = self._epochs.given  # of the whole pass, though others may read the subset between its batches
         worker = get_worker_info()
         place = (worker.id, worker.num_workers) if worker else (0, 1)
         items = stream(
             self.subset,
-            epoch=self.epoch,
+            epoch=max(0, given),
             rank=self.rank,
             world=self.world,
             worker=place[0],
             workers=place[1],
             **self.options,
         )
-        for values in items:
+        while True:
+            self._epochs.take(given)
+            values = next(items, None)
+            if values is None:
+                return
             yield _tensors(values)
