@@ -25,7 +25,7 @@ stage() { # NAME COMMAND...: runs it, one line before and after
   printf '%-10s done in %s s\n' "$name" "$((SECONDS - begun))"
 }
 
-tenth() { # every tenth subset, begun at a random one, made again
+tenth() { # a random tenth of the subsets, made again
   local name patterns=()
   while read -r name; do patterns+=(--only "$name"); done < <(dmcvb-gen info "$out" --json | TENTH="${TENTH:-0}" python -c '
 import json, os, random, sys

@@ -461,6 +461,12 @@ def test_what_was_painted_stays_when_more_is_fetched(made, published, tmp_path):
     assert more.exit_code == 0 and before == of_shard(tmp_path / "r", 0), more.output
     subset = next(iter(open_release(tmp_path / "r").subsets.values()))
     assert subset.unpainted.tolist() == [False, False, True]
+    table = dmcvb_gen.open(str(tmp_path / "r"))[subset.name]
+    assert table.xarray([0, 1]).sizes["episode"] == 2
+    with pytest.raises(StoreError, match="no pictures"):
+        table.xarray()
+    with pytest.raises(StoreError, match="paints nothing"):
+        dmcvb_gen.open(str(tmp_path / "r"), paint=True)[subset.name].xarray()
     done = paint_release(tmp_path / "r")
     assert (done.shards, done.known) == (2, 2)
     assert done.manifest.digest == open_release(made / "painted").manifest.digest

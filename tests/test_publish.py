@@ -387,6 +387,17 @@ def climb_in_the_manifest(index, folder):
     (folder / "manifest.json").write_text(text)
 
 
+def climb_in_the_version(index, folder):
+    data = json.loads((folder / "manifest.json").read_text()) | {"version": "../../evil"}
+    (folder / "manifest.json").write_text(json.dumps(data))
+
+
+def climb_in_a_view(index, folder):
+    data = json.loads((folder / "manifest.json").read_text())
+    data["subsets"][0]["views"] = ["top", "../../evil"]
+    (folder / "manifest.json").write_text(json.dumps(data))
+
+
 def be_from_the_future(index, folder):
     data = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
     (folder / "manifest.json").write_text(json.dumps(data))
@@ -398,6 +409,8 @@ def be_from_the_future(index, folder):
         (leave_the_folder, "not a plain relative path"),
         (name_the_manifest, "names files outside"),
         (climb_in_the_manifest, "not a plain relative path"),
+        (climb_in_the_version, "version"),
+        (climb_in_a_view, "views"),
         (be_from_the_future, "install a newer dmcvb-gen"),
     ],
 )
@@ -623,3 +636,52 @@ def test_no_room_for_the_manifest_is_one_line_and_leaves_none(tiny, tmp_path, mo
     assert not list((tmp_path / "there").glob("*manifest.json*"))
     publish(tiny, url)
     assert open_release(url).manifest.complete and not list((tmp_path / "there").rglob("*.partial"))
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_whoever_stops_while_files_move_stops_the_rest(error):
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        threading.Event().wait(0.01)
+
+    def tick(_):
+        raise error
+
+    with pytest.raises(error):
+        transfer.in_parallel(work, range(2000), 2, tick)
+    assert len(begun) < 1000
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_a_record_that_cannot_be_read_is_no_missing_shard(tiny, tmp_path, monkeypatch, complete):
+    from fsspec.implementations.local import LocalFileSystem
+
+    url = f"file://{tmp_path}/there"
+    publish(tiny, url)
+    if not complete:
+        rewrite(tmp_path / "there", lambda index, folder: incomplete(folder))
+    real, wanted = LocalFileSystem.cat_file, commit_path(NAME, 0)
+
+    fault = {}
+
+    def cat_file(self, path, **options):
+        if path.endswith(wanted):
+            raise fault["raised"]
+        return real(self, path, **options)
+
+    monkeypatch.setattr(LocalFileSystem, "cat_file", cat_file)
+    for fault["raised"], found in ((TimeoutError("slow"), False), (PermissionError("403"), not complete)):
+        if found:
+            assert 0 not in open_release(url)[NAME].commits
+        else:
+            with pytest.raises(StoreError):
+                open_release(url)
+    fault["raised"] = FileNotFoundError("none")
+    assert 0 not in open_release(url)[NAME].commits
+
+
+def incomplete(folder):
+    data = json.loads((folder / "manifest.json").read_text()) | {"complete": False}
+    (folder / "manifest.json").write_text(json.dumps(data))

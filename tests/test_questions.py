@@ -145,3 +145,14 @@ def test_what_is_no_report_is_one_line(tmp_path, text):
     (tmp_path / "report.json").write_text(text)
     with pytest.raises(DmcvbError, match="validate writes it"):
         read_reports([tmp_path])
+
+
+def test_agents_trained_on_other_data_are_not_compared(tmp_path):
+    for folder, agent, digest in (("a", "bc", "d1"), ("b", "id+bc", "d2"), ("c", "id+bc", "d1")):
+        facts = {"release": {"name": "mini", "version": "1.0.0"}, "profile": {"name": "brief"}, "settings": {"seed": 0}}
+        one = result(agent, "static", near(50), digests={"walker-walk/expert/static": digest}, fingerprint=folder)
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "report.json").write_text(json.dumps(facts | {"results": [one]}))
+    assert len(read_reports([tmp_path / "a", tmp_path / "c"])) == 2
+    with pytest.raises(DmcvbError, match="different data"):
+        read_reports([tmp_path / "a", tmp_path / "b"])

@@ -90,7 +90,8 @@ def draw(
 
 def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:
     """Losses on held-out episodes, always on the same, at `most` so many batches; {} where nothing is held out."""
-    if not len(data.hold_out_rows):
+    rows, apart = data.hold_out_rows, learner.k_max if learner.needs_next else 1
+    if not (rows + apart <= data.end[rows]).any():  # as few or as short episodes as that
         return {}
     sums: dict[str, float] = {}
     count = min(most, max(HOLD_OUT_BATCHES, -(-HOLD_OUT_TRANSITIONS // size)))

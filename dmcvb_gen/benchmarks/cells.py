@@ -311,6 +311,7 @@ def inspect(setup: Setup, encoder: nn.Module, data: TrainingData, cell: Cell, ti
     """What a frozen encoder still knows: test errors of decoders of its observations and states (section 5.1)."""
     curves: dict[str, Curve] = {}
     errors: dict[str, float | None] = {}
+    torch.manual_seed(setup.seed)  # of the readouts' weights, also where training has just been resumed
     readouts = {
         "observation": ObservationReadout(encoder, data.channels, data.frames.size, setup.profile.network),
         "state": StateReadout(encoder, data.state.shape[1]),

@@ -81,12 +81,12 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     """The results of reports (folders that `validate` wrote), each once.
 
     Raises:
-      DmcvbError: there is no report, or two were made with different profiles, or one cell of theirs of different data
-        or twice of one seed.
+      DmcvbError: there is no report, or two were made with different profiles, or one cell or subset of theirs of
+        different data, or one cell twice of one seed.
     """
     results: dict[str, dict[str, Any]] = {}
     profiles: dict[str, str | Path] = {}
-    data: dict[tuple[Place, str], set[str]] = {}
+    data: dict[tuple[Place | str, str], set[str]] = {}
     seeds: dict[tuple[Place, int], dict[str, str | Path]] = {}
     for folder in folders:
         path = Path(folder) / "report.json"
@@ -101,6 +101,9 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
                 if "digests" in result:  # those of earlier versions have none
                     digests = ", ".join(digest[:12] for digest in result["digests"].values())
                     data.setdefault((place, "digests"), set()).add(f"{release}, digest {digests}")
+                # Agents, settings and shares are compared too, so a subset is to be the same everywhere.
+                for subset, digest in result.get("digests", {}).items():
+                    data.setdefault((subset, "digest"), set()).add(f"{subset}, digest {digest[:12]}")
                 seed = result.get("seed", facts["settings"]["seed"])
                 seeds.setdefault((place, seed), {})[result["fingerprint"]] = folder
         except (OSError, ValueError, KeyError, TypeError) as error:

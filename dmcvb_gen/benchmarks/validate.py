@@ -154,7 +154,7 @@ def _plan(
     """Cells of all benchmarks, and what is missing for others."""
     cells: list[Cell] = []
     missing: list[Missing] = []
-    for name in benchmarks:
+    for name in dict.fromkeys(benchmarks):
         found, lacking = plan_benchmark(name, chosen, agents, left_out)
         if not found:
             needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
@@ -210,6 +210,8 @@ def _learning_warnings(setup: Setup, results) -> list[Finding]:
             continue
         if data["success"] is not None:
             reached, wanted, what = 100 * score["success"], 100 * data["success"], "% of its goals, the data"
+        elif score.get("limit") != data.get("limit"):
+            continue  # returns of episodes that were cut elsewhere
         else:
             reached, wanted, what = score["mean"], data["mean"], "a return, the data"
         if reached < STATE_BC_SHARE * wanted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import click
@@ -89,7 +90,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
             path,
             setup,
             benchmarks=() if checks_only else benchmarks or ("b1",),
-            agents=[name for name in agents.split(",") if name.strip()],
+            agents=split_agents(agents),
             patterns=only,
             workers=team,
             train_unsound=train_unsound,
@@ -116,6 +117,11 @@ def _show_score(cell, facts, profile) -> None:
     score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]"
     with ProgressBar.external_write_mode():
         click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
+
+
+def split_agents(text: str) -> list[str]:
+    """ "bc,id+bc:k=10,sample" -> ["bc", "id+bc:k=10,sample"]: commas stand between agents and in their options."""
+    return [name for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip()]
 
 
 def _show(result, profile) -> None:

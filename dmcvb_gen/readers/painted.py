@@ -115,6 +115,17 @@ class PaintedSubset(SubsetReader):
         self.__dict__.update(state)
         self._start()
 
+    def xarray(self, episodes: Iterable[int] | None = None) -> Any:
+        """Refused: xarray shows what is stored.
+
+        Raises:
+          StoreError: always.
+        """
+        raise StoreError(
+            f"xarray shows what is stored of {self.name}, and paints nothing; open the release without paint=True, or "
+            f"paint it first: dmcvb-gen paint {self.root}"
+        )
+
     def set_epoch(self, epoch: int) -> None:
         """Draw the distractors of another epoch from now on (where they are fresh)."""
         self.epoch = epoch

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.readers.blocks import choose, stream
 from dmcvb_gen.readers.source import StepSource
 from dmcvb_gen.store import Release, Subset, open_release
@@ -33,13 +33,16 @@ class SubsetReader(Subset):
           store's names with "/" as "_" ("exogenous_camera_position"); read when used.
 
         Raises:
-          StoreError: an episode is not there; also where values are used that are damaged or cannot be read.
+          StoreError: an episode is not there, or has not been painted where others have; also where values are used
+            that are damaged or cannot be read.
         """
         import xarray
 
         from dmcvb_gen.readers.lazy import guarded
 
         chosen = choose(self, episodes)
+        if any(name in self.paths for name in self.pixel_arrays) and self.unpainted[chosen].any():
+            raise StoreError(self._without_pictures)  # they would read as black
         options = self._storage_options if "://" in self.root else None
         path = f"{self.root}/{self.name}.zarr"
         parts = []

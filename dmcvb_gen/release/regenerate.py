@@ -349,7 +349,8 @@ def check_makeable(manifest: Manifest) -> None:
 def _unfinished(manifest: Manifest) -> Manifest:
     """The manifest as it was before any shard."""
     subsets = tuple(record.model_copy(update={"digest": None}) for record in manifest.subsets)
-    return manifest.model_copy(update={"subsets": subsets, "environments": (environment(),), "complete": False})
+    begun = {"subsets": subsets, "environments": (environment(),), "complete": False, "digest": None}
+    return manifest.model_copy(update=begun)
 
 
 class Held:

@@ -31,10 +31,14 @@ def releases_at(url: str, options: dict[str, Any] | None = None) -> list[dict[st
                 entry["name"] for entry in filesystem.ls(base, detail=True) if entry["type"] == "directory"
             )
             found = {f"{place}/{folder.rstrip('/').rsplit('/', 1)[-1]}": folder.rstrip("/") for folder in folders}
-        texts = filesystem.cat([f"{folder}/{MANIFEST}" for folder in found.values()], on_error="omit") if found else {}
-    if isinstance(texts, bytes):  # fsspec gives bare bytes for a single path
-        texts = {f"{next(iter(found.values()))}/{MANIFEST}": texts}
-    texts = {path.lstrip("/"): text for path, text in texts.items()}
+        paths = [f"{folder}/{MANIFEST}" for folder in found.values()]
+        texts = filesystem.cat(paths, on_error="return") if paths else {}
+        if not isinstance(texts, dict):  # fsspec gives what a single path has
+            texts = {paths[0]: texts}
+        for error in texts.values():
+            if isinstance(error, BaseException) and not isinstance(error, FileNotFoundError | NotADirectoryError):
+                raise error
+    texts = {path.lstrip("/"): text for path, text in texts.items() if isinstance(text, bytes)}
     releases = []
     for where, folder in found.items():
         text = texts.get(f"{folder}/{MANIFEST}".lstrip("/"))

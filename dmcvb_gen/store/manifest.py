@@ -28,7 +28,9 @@ MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
 IMPORTED = "imported"
 """Name of the renderer of subsets that came from DMC-VB's published data."""
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
+PLAIN_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$"
+"""A part of a path that leads nowhere else; exports make folders and files of versions and views."""
+_NAME = re.compile(PLAIN_NAME.strip("^$"))
 
 
 def check_relative_path(path: str) -> str:
@@ -124,7 +126,9 @@ class SubsetRecord(_Model):
     renderer: dict[str, Any] = {}
     backgrounds: dict[str, Any] | None = None
     family: str = LOCOMOTION
-    views: tuple[str, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
+    views: tuple[Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME)], ...] = pydantic.Field(
+        default=("pixels",), min_length=1, max_length=100
+    )
     hidden_goal: bool = False
     max_steps: int = pydantic.Field(default=500, gt=0, le=MAX_STEPS)
     fixed_goals: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
@@ -192,7 +196,7 @@ class Manifest(_Model):
 
     schema_version: int = SCHEMA_VERSION
     name: str
-    version: str
+    version: Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME)]
     license: str
     authors: tuple[str, ...] = ()
     generator: str = f"dmcvb-gen {__version__}"

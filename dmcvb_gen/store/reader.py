@@ -334,7 +334,10 @@ def open_release(path: str | Path, storage_options: dict | None = None, skip: Co
             except FileNotFoundError:
                 raise StoreError(f"{public(path)} holds no release (no {MANIFEST}); check the URL") from None
             manifest = parse_manifest(text, f"{public(path)}/{MANIFEST}")
-            commits = {subset.name: _remote_commits(filesystem, base, subset, path) for subset in wanted(manifest)}
+            commits = {
+                subset.name: _remote_commits(filesystem, base, subset, path, manifest.complete)
+                for subset in wanted(manifest)
+            }
     subsets = {record.name: Subset(path, record, commits[record.name], options) for record in wanted(manifest)}
     return Release(path, manifest, {name: subset for name, subset in subsets.items() if len(subset.commits)})
 
@@ -357,15 +360,26 @@ def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
     return root, local_manifest(root)
 
 
-def _remote_commits(filesystem: Any, base: str, subset: SubsetRecord, place: str) -> dict[int, CommitRecord]:
-    """The committed shards of a subset at a URL, shard -> record."""
+def _remote_commits(
+    filesystem: Any, base: str, subset: SubsetRecord, place: str, complete: bool
+) -> dict[int, CommitRecord]:
+    """The committed shards of a subset at a URL, shard -> record.
+
+    What cannot be read is raised: left out, it would be a release with fewer episodes. But where keys may not be
+    listed, buckets refuse those that do not exist, as a release that is being made lacks some.
+    """
     paths = {f"{base}/{commit_path(subset.name, shard)}": shard for shard in range(shard_count(subset))}
-    found = filesystem.cat(list(paths), on_error="omit")
-    if isinstance(found, bytes):  # fsspec gives bare bytes for a single path
+    found = filesystem.cat(list(paths), on_error="return")
+    if not isinstance(found, dict):  # fsspec gives what a single path has
         found = {next(iter(paths)): found}
+    absent = (FileNotFoundError, NotADirectoryError, *(() if complete else (PermissionError,)))
     shards = {path.lstrip("/"): shard for path, shard in paths.items()}  # some file systems give other slashes back
     commits = {}
     for path, text in found.items():
+        if isinstance(text, absent):
+            continue
+        if isinstance(text, BaseException):
+            raise text
         shard = shards[path.lstrip("/")]
         where = f"{public(place)}/{commit_path(subset.name, shard)}"
         commits[shard] = checked_commit(text, where, subset, shard)

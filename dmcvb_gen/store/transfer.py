@@ -264,16 +264,16 @@ def download(filesystem: fsspec.AbstractFileSystem, place: str, remote: str, loc
 
 
 def in_parallel(work, items, workers: int, tick) -> list:
-    """Results of `work(item)` for all items, `workers` at a time; the first error stops what has not begun."""
+    """Results of `work(item)` for all items, `workers` at a time; the first error, of `tick` too, stops the rest."""
     with ThreadPoolExecutor(max(1, workers)) as pool:
         futures = [pool.submit(work, item) for item in items]
         waiting = set(futures)
-        while waiting:
-            done, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
-            for future in done:
-                error = future.exception()
-                if error:
-                    pool.shutdown(wait=True, cancel_futures=True)
-                    raise error
-                tick(future.result())
+        try:
+            while waiting:
+                done, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
+                for future in done:
+                    tick(future.result())
+        except BaseException:  # also of the tick, and a person's Ctrl-C
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
     return [future.result() for future in futures]

@@ -34,7 +34,10 @@ def test_minari_lists_what_was_exported(datasets):
     assert all(facts["dataset_size"] > 0 for facts in found.values())
     result = CliRunner().invoke(app, ["list", "local"])
     assert result.exit_code == 0 and "dmcvb_gen" in result.output, result.output
-    assert minari.namespace.list_local_namespaces() >= ["dmcvb_gen"]
+    spaces = {"dmcvb_gen", *(name.rpartition("/")[0] for name in datasets.values())}
+    assert set(minari.namespace.list_local_namespaces()) == spaces
+    about = {space: minari.namespace.get_namespace_metadata(space)["description"] for space in spaces}
+    assert "dmcvb-gen" in about["dmcvb_gen"] and len(set(about.values())) == len(spaces)
 
 
 def test_episodes_have_the_pictures_that_the_subset_is_about(datasets, stored):

@@ -64,8 +64,9 @@ def write(source: Source, folder: Path) -> None:
     storage.update_episodes(_buffer(number, episode) for number, episode in enumerate(source))
     storage.update_metadata({"dataset_size": storage.get_size()})
     about = {"description": f"{source.manifest.name} {source.manifest.version} ({source.manifest.generator})"}
-    files.write_json(folder.parent.parent / "namespace_metadata.json", about)
-    files.write_json(folder.parent / "namespace_metadata.json", {"description": subset.task})
+    # The namespaces are above the folder that is moved into its place when it is whole.
+    files.write_json(folder.parents[2] / "namespace_metadata.json", about)
+    files.write_json(folder.parents[1] / "namespace_metadata.json", {"description": subset.task})
 
 
 def _environment(source: Source, split: str) -> EnvSpec:
