@@ -1,6 +1,6 @@
 """Makes the moving pictures of docs/gallery.md and README.md, with the package's own commands.
 
-python scripts/make_gallery.py        (minutes on two cores; writes docs/gallery/*.webp and dataset_cards/ant-maze.png)
+python scripts/make_gallery.py        (minutes on two cores; writes docs/gallery/*.webp and ant-maze.png)
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def main() -> None:
             moving(work / "all", f"{task}/*/*", task, "--scale", 1)
         sheet = ["--only", "ant-maze-easy7x7a/*/visible", "--episodes", 1, "--out", work / "sheet"]
         command("preview", work / "all", *sheet)
-        shutil.copy(work / "sheet/contact_sheet.png", ROOT / "dataset_cards/ant-maze.png")
+        shutil.copy(work / "sheet/contact_sheet.png", ROOT / "docs/gallery/ant-maze.png")
         styles(work)
 
 

@@ -149,8 +149,15 @@ def test_mazes_have_the_papers_two_levels_in_b1_and_others_where_they_are_there(
 def test_ablations_vary_frames_k_and_the_share_of_the_data():
     cells, _ = plan_benchmark("ablations", release_of("walker-walk/expert/none"))
     names = {cell.agent.name for cell in cells}
-    assert {"bc:frames=1", "bc", "id+bc:k=5", "id+bc:k=10,sample"} <= names
+    assert {"bc:frames=1", "bc", "bc+bc", "id+bc:k=5", "id+bc:k=10,sample"} <= names
     assert {part.share for cell in cells for part in cell.policy} == {0.01, 0.05, 0.1, 0.25, 0.5, 1.0}
+
+
+@pytest.mark.parametrize("name", ["walker-walk/expert/none", f"{MAZE}/expert/visible"])
+@pytest.mark.parametrize("episodes, shares", [(10, {0.1, 0.25, 0.5, 1}), (20, {0.05, 0.1, 0.25, 0.5, 1})])
+def test_shares_that_come_to_the_same_episodes_are_trained_once(name, episodes, shares):
+    cells, _ = plan_benchmark("ablations", release_of(name, episodes=episodes), ["bc"])
+    assert [cell.policy[0].share for cell in cells] == sorted(shares, key=lambda share: (share < 1, share))
 
 
 def test_unknown_benchmarks_and_profiles_list_the_known_ones():

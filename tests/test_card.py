@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from click.testing import CliRunner
@@ -171,3 +173,21 @@ def test_a_card_can_lie_elsewhere(carded, tmp_path):
 def test_no_release_no_card(tmp_path):
     with pytest.raises(StoreError, match="holds no release"):
         write_card(tmp_path)
+
+
+def test_a_card_of_the_overhead_view_alone_shows_it(small_mazes, tmp_path):
+    shutil.copytree(small_mazes, tmp_path / "whole")
+    published = CliRunner().invoke(
+        main, ["publish", str(tmp_path / "whole"), f"file:{tmp_path / 'there'}", "--no-pixels"]
+    )
+    assert published.exit_code == 0, published.output
+    command = ["fetch", f"file:{tmp_path / 'there'}", "--paint", "--views", "overhead", "--size", "24"]
+    fetched = CliRunner().invoke(main, [*command, "--out", str(tmp_path / "r")])
+    assert fetched.exit_code == 0, fetched.output
+    write_card(tmp_path / "r")
+    assert check_card(tmp_path / "r") == []
+    frames = pq.read_table(tmp_path / "r/card/episodes.parquet")["first_frame"].to_pylist()
+    for subset in open_release(tmp_path / "r").subsets.values():
+        first = np.asarray(Image.open(io.BytesIO(frames.pop(0)["bytes"])))
+        np.testing.assert_array_equal(first, subset.array(subset.pixel_arrays[0])[0, 0])
+        frames = frames[len(subset.episodes) - 1 :]

@@ -93,3 +93,13 @@ def test_the_site_builds_without_a_warning(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_links_and_pictures_are_there_where_the_site_is_not_built():
+    """Who reads the pages in the repository finds all but the commands' own pages, which are made of the code."""
+    cards = [ROOT / "dataset_cards/README.md"]
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md", *cards]:
+        targets = re.findall(r"!?\[[^\]]*\]\(([^)\s#]+)", BLOCK.sub("", page.read_text()))
+        made = [target for target in targets if target.startswith(("http", "cli/"))]
+        for target in set(targets) - set(made):
+            assert (page.parent / target).exists(), f"{page.name} shows {target}"

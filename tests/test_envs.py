@@ -136,6 +136,20 @@ def test_a_maze_shows_its_views_and_hides_its_goal():
         DistractedEnv("ant-maze-empty7x7", "dynamic")
 
 
+def test_a_mazes_goal_is_shown_or_not_as_asked_whatever_the_setting():
+    maze, options = "ant-maze-empty7x7", {"views": ["top"], "size": 32}
+    seen = {
+        (setting, goal): DistractedEnv(maze, setting, goal=goal, **options).reset(seed=1)[0]["pixels"]
+        for setting in ("visible", "hidden")
+        for goal in (None, "visible", "hidden")
+    }
+    for setting, goal in seen:
+        np.testing.assert_array_equal(seen[setting, goal], seen[goal or setting, None])
+    assert (seen["visible", None] != seen["hidden", None]).any()
+    hidden, seen = (DistractedEnv(maze, "fixed", goal=goal, **options).reset(seed=1)[0] for goal in (None, "visible"))
+    assert (hidden["pixels"] != seen["pixels"]).any()
+
+
 def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     maze, views = "ant-maze-empty7x7", ["top"]
     env = gymnasium.make(f"dmcvb_gen/{maze}-fixed-v0", views=views, goal_seed=3, size=48)
@@ -201,6 +215,15 @@ def test_mistakes_are_answered():
         DistractedEnv("walker-walk").step(np.zeros(6))
     with pytest.raises(DmcvbError, match="at least 1"):
         DistractedVectorEnv(0, "walker-walk")
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        with pytest.raises(DmcvbError, match="split 'test'.*train, val"):
+            DistractedEnv(task, split="test")
+    with pytest.raises(DmcvbError, match="leave difficulty away"):
+        DistractedEnv("ant-maze-empty7x7", "visible", difficulty="hard")
+    with pytest.raises(DmcvbError, match="leave goal away"):
+        DistractedEnv("walker-walk", goal="hidden")
+    with pytest.raises(DmcvbError, match="goal 'seen'.*hidden, visible"):
+        DistractedEnv("ant-maze-empty7x7", "visible", goal="seen")
 
 
 class TestDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):

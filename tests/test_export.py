@@ -17,6 +17,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 import dmcvb_gen
+from dmcvb_gen.benchmarks.goals import GoalPairs, goal_pairs
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.release.card import check_card, write_card
@@ -423,6 +424,72 @@ def test_dmc_vbs_mazes_are_imported_by_the_names_of_their_fields(dmcvb_mazes, sm
         assert batch["pixels"].shape == (8, 9, 16, 16) and batch["state"].shape == (8, 167)
     result = verify(tmp_path / "r")
     assert result.sound, result.findings
+
+
+def split_files(folder, count):
+    """The one TFRecord file of a folder as `count` files, an episode or none each; gives their paths."""
+    [whole] = folder.rglob("*.tfrecord-*")
+    data = [record(encode_example(read_example(whole, *place))) for place in offsets(whole)]
+    stem = whole.name.rsplit("-", 3)[0]
+    whole.unlink()
+    files = [whole.with_name(f"{stem}-{number:05d}-of-{count:05d}") for number in range(count)]
+    for number, file in enumerate(files):
+        file.write_bytes(data[number] if number < len(data) else b"")
+    return files
+
+
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_folders_that_lack_files_are_imported_only_when_asked(exported, dmcvb_mazes, tmp_path, family, monkeypatch):
+    shards = {"locomotion": 1, "ant-maze": 1}  # else a release of one episode does not grow
+    monkeypatch.setattr("dmcvb_gen.release.import_tfds.DEFAULT_EPISODES_PER_SHARD", shards)
+    mazes = family == "mazes"
+    place = "antmaze_random_visible_goal/empty7x7/expert" if mazes else "locomotion/walker_walk/random/static_medium"
+    shutil.copytree(dmcvb_mazes / place if mazes else exported("rlds"), tmp_path / place)
+    files = split_files(tmp_path / place, 3)
+    for missing, out in ((files[0], "without_first"), (files[1], "without_second")):
+        hidden = missing.rename(tmp_path / "away")
+        number = files.index(missing)
+        command = ["import", str(tmp_path / place.split("/")[0]), "--out", str(tmp_path / out)]
+        refused = CliRunner().invoke(main, command)
+        assert refused.exit_code == 2 and f"2 of 3 files (number {number} is missing)" in refused.output
+        assert not (tmp_path / out).exists()
+        assert CliRunner().invoke(main, [*command, "--partial"]).exit_code == 0
+        again = CliRunner().invoke(main, [*command, "--partial"])
+        assert again.exit_code == 0 and "1 episode" in again.output
+        hidden.rename(missing)
+        before = (tmp_path / out / "manifest.json").read_bytes()
+        other = CliRunner().invoke(main, command)
+        assert other.exit_code == 2 and "choose another --out" in other.output and "2 other files" in other.output
+        assert (tmp_path / out / "manifest.json").read_bytes() == before
+    away = [file.rename(tmp_path / file.name) for file in files[1:]]
+    command = ["import", str(tmp_path / place.split("/")[0]), "--out", str(tmp_path / "grown")]
+    assert CliRunner().invoke(main, [*command, "--partial"]).exit_code == 0
+    for file, path in zip(away, files[1:], strict=True):
+        file.rename(path)
+    grown = CliRunner().invoke(main, command)
+    assert grown.exit_code == 0 and "2 episodes" in grown.output, grown.output
+    import_tfds(tmp_path / place.split("/")[0], tmp_path / "whole")
+    [grown], [whole] = (dmcvb_gen.open(tmp_path / name).subsets.values() for name in ("grown", "whole"))
+    for index in range(2):
+        for name, value in whole.episode(index).items():
+            np.testing.assert_array_equal(grown.episode(index)[name], value)
+    assert verify(tmp_path / "grown").sound
+
+
+def test_fixed_goals_of_unequal_numbers_of_episodes_are_all_found(dmcvb_mazes, small_mazes, tmp_path):
+    place = "antmaze_fixed_hidden_goal"
+    shutil.copytree(dmcvb_mazes / place, tmp_path / place)
+    first, _ = sorted((tmp_path / place).rglob("*.tfrecord-*"))
+    first.write_bytes(first.read_bytes() * 3)
+    import_tfds(tmp_path / place, tmp_path / "r")
+    [subset] = dmcvb_gen.open(tmp_path / "r").subsets.values()
+    assert subset.read("goal_pair").tolist() == [0, 0, 0, 1]
+    assert goal_pairs(subset) == GoalPairs((0, 1))
+    made = open_release(small_mazes)["ant-maze-tiny/random/fixed"]
+    for pair in (0, 1):
+        target = get_task(made.task).state_slices["target_position"]
+        row = int(np.flatnonzero(subset.read("goal_pair") == pair)[0])
+        np.testing.assert_array_equal(subset.episode(row)["state"][0, target], made.episode(pair)["state"][0, target])
 
 
 def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path):

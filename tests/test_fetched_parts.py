@@ -16,6 +16,7 @@ from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rollout.executors import run_jobs
 from dmcvb_gen.rollout.plan import make_plan, prepare
 from dmcvb_gen.store import open_release
+from dmcvb_gen.store.writer import commit_path
 from tests.conftest import maze_recipe, rewrite, small_recipe
 
 WALKER = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "dynamic"], "episodes": 3}
@@ -119,3 +120,38 @@ def test_a_shard_that_is_lost_from_a_whole_release_is_no_part(published, tmp_pat
     fetch(published, tmp_path / "whole")
     shutil.rmtree(tmp_path / "whole" / "commits")
     assert run("regenerate", tmp_path / "whole", "--check").exit_code == 1
+
+
+def test_a_part_whose_record_is_lost_is_made_again_only_with_the_bytes_that_its_index_lists(part):
+    [subset] = open_release(part).subsets.values()
+    [shard] = subset.commits
+    record = part / commit_path(subset.name, shard)
+    was = record.read_bytes()
+    record.unlink()
+    checked = json.loads(run("regenerate", part, "--check", "--only", subset.name, "--json").stdout)
+    assert checked["not_here"] > 0 and checked["shards"] == []
+    repaired = json.loads(run("regenerate", part, "--json").stdout)
+    assert [(made["equal"], made["repaired"]) for made in repaired["shards"]] == [(True, True)]
+    assert record.read_bytes() == was
+
+
+def test_another_machines_part_whose_record_is_lost_stays_as_it_is(published, tmp_path):
+    """This machine makes other bytes than it holds; only the list of the release's files can say so."""
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    fetch(published, whole)
+    name = next(iter(open_release(whole).subsets))
+
+    def elsewhere(group):
+        group["action"][0] = group["action"][0] * 0.5
+
+    rewrite(whole, name, elsewhere)
+    fetch(f"file:{whole}", part, [name], (0, 1))
+    (part / commit_path(name, 0)).unlink()
+    before = {path: path.read_bytes() for path in part.rglob("*") if path.is_file()}
+    result = run("regenerate", part)
+    assert result.exit_code == 1 and "other bytes" in result.output, result.output
+    assert {path: path.read_bytes() for path in part.rglob("*") if path.is_file() and path.name != ".lock"}.items() <= (
+        before.items()
+    )
+    beside = run("regenerate", part, "--only", name, "--episodes", "0:1", "--out", tmp_path / "beside")
+    assert beside.exit_code == 1 and "other bytes" in beside.output, beside.output

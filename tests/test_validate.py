@@ -18,17 +18,18 @@ import markdown
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, render_tables
 from dmcvb_gen.benchmarks.tables import plan_benchmark
-from dmcvb_gen.benchmarks.validate import only
+from dmcvb_gen.benchmarks.validate import _seen_warnings, only
 from dmcvb_gen.cli import main
 from dmcvb_gen.store import open_release
 from dmcvb_gen.store.manifest import parse_manifest
 from dmcvb_gen.store.writer import commit_path, finish_release
-from tests.conftest import rewrite, roll_out, small_recipe
+from tests.conftest import maze_recipe, rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/expert/dynamic"
 
@@ -306,6 +307,25 @@ def test_a_flipped_byte_fails_by_its_digest(copy):
     assert found(copy) == {("files", None, None)}
 
 
+@pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
+def test_returns_that_cannot_be_read_cost_no_report(whole, request, tmp_path):
+    folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")
+    names = list(open_release(folder).subsets)
+    [file] = [file for file in open_release(folder)[names[0]].commits[0].files if "/return/" in file.path]
+    data = bytearray((folder / file.path).read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / file.path).write_bytes(data)
+    rewrite(folder, names[1], lambda group: group["return"].__setitem__(0, np.nan))
+    result = run("validate", folder, "--checks-only", "--out", tmp_path / "out")
+    assert result.exit_code == 1 and f"FAIL files: {names[0]}" in result.output, result.output
+    assert f"FAIL returns: {names[1]}, episode 0" in result.output, result.output
+    facts = json.loads((tmp_path / "out/report.json").read_text())
+    assert list(facts["returns"]) == names[1:]
+    left = open_release(folder)[names[1]].returns[1:]
+    assert facts["returns"][names[1]]["mean"] == pytest.approx(left.mean())
+    assert "Not sound" in (tmp_path / "out/report.html").read_text()
+
+
 def test_a_truncated_shard_fails_by_its_size(copy):
     file = next(file for file in open_release(copy)[NAME].commits[0].files if "/state/" in file.path)
     (copy / file.path).write_bytes((copy / file.path).read_bytes()[:100])
@@ -350,6 +370,28 @@ def test_labels_that_do_not_fit_the_setting_fail(copy, array, step, value):
 def test_labels_of_every_setting_fit(small_release):
     for subset in open_release(small_release).subsets.values():
         assert not list(check_labels(subset))
+
+
+def test_data_that_show_what_evaluation_shows_are_warned_of(tmp_path, small_release, maze_release):
+    """By the split that was asked for, or because a folder of one video has no other; states show neither."""
+    (tmp_path / "one").mkdir()
+    Image.fromarray(np.arange(64 * 64 * 3, dtype=np.uint8).reshape(64, 64, 3)).save(tmp_path / "one/video.png")
+    walker = {"tasks": "walker-walk", "levels": "random", "episodes": 1, "max_steps": 3}
+    seen = {
+        "val": small_recipe(split="val", subsets=[walker | {"settings": ["static", "none"]}]),
+        "one": small_recipe(backgrounds=str(tmp_path / "one"), subsets=[walker | {"settings": ["dynamic"]}]),
+        "maze": maze_recipe(max_steps=3).model_copy(update={"split": "val"}),
+    }
+    for name, recipe in seen.items():
+        roll_out(recipe, tmp_path / "made" / name)
+        release = open_release(tmp_path / "made" / name)
+        cells, _ = plan_benchmark("b1", release, ["bc", "state-bc"])
+        found = {finding.subset for finding in _seen_warnings(release, cells, None)}
+        assert found == {subset for subset in release.subsets if not subset.endswith("/none")}
+        assert not _seen_warnings(release, [cell for cell in cells if cell.agent.sees_state], None)
+    for folder in (small_release, maze_release):
+        release = open_release(folder)
+        assert not _seen_warnings(release, plan_benchmark("b1", release, ["bc"])[0], None)
 
 
 def with_policy(subset, **evaluation):

@@ -351,6 +351,11 @@ def batches(
             yield step, batch
 
 
+def part_count(share: float, episodes: int) -> int:
+    """How many of so many episodes a share is, at least one."""
+    return max(1, round(share * episodes))
+
+
 def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """(episodes, held out) of a source: its share, and which of those no agent learns from (5 %, none of one)."""
     names = source.subset.episodes
@@ -359,7 +364,7 @@ def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
         if not len(names):
             raise DmcvbError(f"{source.subset.name} has no episodes of goal pair {source.goal_pair}")
     order = np.random.default_rng(seed).permutation(len(names))
-    count = min(source.episodes or max(1, round(source.share * len(names))), len(names))
+    count = min(source.episodes or part_count(source.share, len(names)), len(names))
     out = min(math.ceil(HOLD_OUT * count), count - 1)
     chosen = order[:count]
     held = np.zeros(count, bool)

@@ -7,6 +7,7 @@ pictures that show something.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
 from dmcvb_gen.pool import Tick, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.readers.painted import PaintedSubset
@@ -158,6 +160,18 @@ def check_pictures(subset: Subset) -> Iterator[Finding]:
                     yield Finding("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax()))
             if len(frames) > 1 and (flat == flat[:1]).all() and high[0] > 0:
                 yield Finding("pictures", subset.name, f"{name} shows the same frame throughout", episode)
+
+
+def known_returns(release: Release) -> dict[str, np.ndarray]:
+    """Subset -> (episode,) returns that are numbers; without subsets that have none, or whose cannot be read.
+
+    What is wrong with those is among the findings; a report is made all the same.
+    """
+    found = {}
+    for name, subset in release.subsets.items():
+        with contextlib.suppress(StoreError):
+            found[name] = subset.returns[np.isfinite(subset.returns)]
+    return {name: returns for name, returns in found.items() if len(returns)}
 
 
 def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str, ...]:

@@ -8,10 +8,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.benchmarks.checks import known_returns
 from dmcvb_gen.benchmarks.tables import Cell
 from dmcvb_gen.names import FIXED, task_folder
 from dmcvb_gen.store import Release
@@ -48,18 +50,18 @@ def batched(values: Iterable, most: int) -> Iterator[list]:
 
 def return_figures(release: Release) -> Iterator[Figure]:
     """Histograms of returns, the paper's quartiles and range as a box under each."""
-    for names in batched(release.subsets, HISTOGRAM_LINES * COLUMNS):
-        yield _return_figure(release, names)
+    for part in batched(known_returns(release).items(), HISTOGRAM_LINES * COLUMNS):
+        yield _return_figure(release, dict(part))
 
 
-def _return_figure(release: Release, names: Sequence[str]) -> Figure:
-    columns = min(COLUMNS, len(names))
-    lines = -(-len(names) // columns)
+def _return_figure(release: Release, known: Mapping[str, np.ndarray]) -> Figure:
+    columns = min(COLUMNS, len(known))
+    lines = -(-len(known) // columns)
     figure = Figure(figsize=(4 * columns, 2.4 * lines), layout="constrained")
-    for index, name in enumerate(names):
+    for index, (name, returns) in enumerate(known.items()):
         axis = figure.add_subplot(lines, columns, index + 1)
         subset = release.subsets[name]
-        axis.hist(subset.returns, bins=30, color="#4477aa")
+        axis.hist(returns, bins=30, color="#4477aa")
         shown = name if len(name) <= NAME_BREAK else name.replace("/", "\n", 1)
         axis.set_title(shown, fontsize=9)
         axis.set(xlabel="return", ylabel="episodes")

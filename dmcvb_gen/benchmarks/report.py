@@ -18,7 +18,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from dmcvb_gen.behaviours.policies.paper import paper_returns
-from dmcvb_gen.benchmarks.checks import Structure
+from dmcvb_gen.benchmarks.checks import Structure, known_returns
 from dmcvb_gen.benchmarks.figures import curve_figures, data_url, figure_url, label_of, place_of, return_figures
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.questions import QUESTIONS, ask
@@ -109,9 +109,10 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
         },
         "warnings": [dataclasses.asdict(finding) for finding in warnings],
         "returns": {
-            name: return_statistics(subset.returns)
+            name: return_statistics(returns)
             | {"paper": None if subset.setting == FIXED else paper_returns(subset.task, subset.level)}
-            for name, subset in release.subsets.items()
+            for name, returns in known_returns(release).items()
+            for subset in [release[name]]
         },
         "cells_planned": len(cells),
         "failed": failed,

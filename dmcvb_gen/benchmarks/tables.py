@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from dmcvb_gen.agents.catalog import Agent, parse_agent
+from dmcvb_gen.agents.data import part_count
 from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.names import (
@@ -45,7 +46,8 @@ FEW_EPISODES = 20
 """B2: 1 % of the paper's expert subset of 2,000 episodes."""
 B2_AGENTS = ("id+bc", "bc+bc", "lfd+bc", "ae+bc")
 B3_AGENTS = ("bc+bc", "id+bc")
-ABLATION_AGENTS = ("bc:frames=1", "bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10,sample")
+ABLATION_AGENTS = ("bc:frames=1", "bc", "bc+bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10,sample")
+"""Inverse dynamics over more steps stand beside pre-training by BC, which the paper sees them tend to."""
 SHARES = (0.01, 0.05, 0.1, 0.25, 0.5)
 
 
@@ -294,6 +296,12 @@ def _b3(shelf: _Shelf, agents: list[Agent]):
                     yield Cell("b3", task, FIXED, agent, ten, hidden)
 
 
+def _distinct_shares(episodes: int) -> list[float]:
+    """Shares of a number of episodes, the largest of those that come to the same count."""
+    counts = {part_count(share, episodes): share for share in SHARES}
+    return [share for count, share in counts.items() if count < episodes]
+
+
 def _ablations(shelf: _Shelf, agents: list[Agent]):
     agents = agents or [parse_agent(name) for name in ABLATION_AGENTS]
     for task in shelf.tasks:
@@ -304,5 +312,6 @@ def _ablations(shelf: _Shelf, agents: list[Agent]):
             for agent in agents:
                 yield Cell("ablations", task, setting, agent, parts)
             pictures = [agent for agent in agents if agent.name == "bc"]
-            for share, agent in itertools.product(SHARES, pictures):
+            shares = _distinct_shares(len(shelf.release[parts[0].subset].episodes))
+            for share, agent in itertools.product(shares, pictures):
                 yield Cell("ablations", task, setting, agent, (Part(parts[0].subset, share=share),))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tempfile
 import time
@@ -12,14 +13,17 @@ from typing import Any
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
+from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
 from dmcvb_gen.benchmarks.setup import Setup, open_data
 from dmcvb_gen.benchmarks.tables import FEW_EPISODES, Cell, Missing, plan_benchmark
-from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import select
+from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.errors import BackgroundError, DmcvbError
+from dmcvb_gen.names import ANT_MAZE, select
 from dmcvb_gen.pool import Tick, Workers, ignore
 from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.rollout.jobs import video_source
 from dmcvb_gen.store import Release
 from dmcvb_gen.store.remote import local_path
 
@@ -133,7 +137,12 @@ def validate(
             results.append((cell, result))
     order = {cell: index for index, cell in enumerate(cells)}
     results.sort(key=lambda pair: order[pair[0]])
-    warnings = (*structure.warnings, *_learning_warnings(setup, results), *_few_warnings(chosen, cells))
+    warnings = (
+        *structure.warnings,
+        *_learning_warnings(setup, results),
+        *_few_warnings(chosen, cells),
+        *_seen_warnings(chosen, cells, setup.backgrounds),
+    )
     report, facts = write_report(
         setup=setup,
         release=chosen,
@@ -197,6 +206,22 @@ def _few_warnings(release: Release, cells: Sequence[Cell]) -> list[Finding]:
             text = f"b2 learns from {FEW_EPISODES} expert episodes, and {there} are all there are; roll out more"
             found[part.subset] = Finding("learning", part.subset, text)
     return list(found.values())
+
+
+def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> list[Finding]:
+    """Evaluation shows what no data show (paper, section 5); data that were painted with it do not tell."""
+    learned = dict.fromkeys(part.subset for cell in cells if not cell.agent.sees_state for part in cell.policy)
+    found = []
+    for record in (release.subsets[name].record for name in learned):
+        what, seen = "maze style", record.family == ANT_MAZE and record.split == SPLIT
+        if record.backgrounds:
+            with contextlib.suppress(BackgroundError):  # what is not there fails in the cells
+                shown = load_backgrounds(video_source(release.path, record, backgrounds), SPLIT).digest
+                what, seen = "videos", record.backgrounds.get("digest") == shown
+        if seen:
+            text = f"painted with the {what} that evaluation shows: its scores are of distractors that were seen"
+            found.append(Finding("learning", record.name, text))
+    return found
 
 
 def _learning_warnings(setup: Setup, results) -> list[Finding]:

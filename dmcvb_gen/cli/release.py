@@ -355,10 +355,13 @@ def export(path, to, only, episodes, merge, video, workers, executor, ray_addres
 @click.option("--level", help="Likewise.")
 @click.option("--setting", help="Likewise: none, static_medium, dynamic_medium, ...")
 @click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
+@click.option("--partial", is_flag=True, help="Take the files that are there, though their names say there are more.")
 @click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
 @json_option
-def import_command(folder, task, level, setting, name, out, as_json):
+def import_command(folder, task, level, setting, name, partial, out, as_json):
     """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.
+
+    Run again, it goes on where it stopped.
 
     \b
     dmcvb-gen import dmc_vb/locomotion --out releases/original
@@ -366,7 +369,8 @@ def import_command(folder, task, level, setting, name, out, as_json):
     from dmcvb_gen.release.import_tfds import import_tfds
 
     with ProgressBar(as_json, unit=" episodes") as bar:
-        manifest = import_tfds(folder, out, task=task, level=level, setting=setting, name=name, tick=bar)
+        given = dict(task=task, level=level, setting=setting, name=name, partial=partial, tick=bar)
+        manifest = import_tfds(folder, out, **given)
     if as_json:
         return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
     for subset in manifest.subsets:

@@ -18,9 +18,19 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from dmcvb_gen.distractors import DistractorSetting, ExogenousWalk, floor_alpha_for, load_backgrounds
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.labels import Exogenous
-from dmcvb_gen.names import ANT_MAZE, FIXED, VISIBLE, distractor_of, hides_goal, normalize_setting
+from dmcvb_gen.names import (
+    ANT_MAZE,
+    FIXED,
+    GOAL_PICTURES,
+    HIDDEN,
+    SPLITS,
+    VISIBLE,
+    distractor_of,
+    hides_goal,
+    normalize_setting,
+)
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rollout.painting import check_renderer
 from dmcvb_gen.rollout.recipe import check_size
@@ -43,13 +53,14 @@ class Scene:
       task: e.g. "walker-walk".
       distractor: "none", "static", "dynamic", or with a difficulty ("dynamic_hard"); for mazes whether the goal is
         "visible", "hidden", or hidden and "fixed" with the start.
-      difficulty: easy, medium or hard.
+      difficulty: easy, medium or hard; of locomotion.
       size: pixels a side. renderer: its name; samples: a pixel.
       split: "val" shows videos and styles that no released data show, "train" those of the data.
       backgrounds: "builtin" or a folder of videos.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
       fixed_goals: of "fixed": how many pairs of start and goal there are; an episode takes the next one.
+      goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
       goal_pair: of "fixed": this pair in all episodes.
       goal_seed: of "fixed": the seed that the pairs are drawn from, as a recipe's seed.
       threads: of the simulation; the result does not depend on them.
@@ -65,6 +76,7 @@ class Scene:
     backgrounds: str = "builtin"
     views: Sequence[str] | None = None
     max_steps: int | None = None
+    goal: str | None = None
     fixed_goals: int = FIXED_GOALS
     goal_pair: int | None = None
     goal_seed: int = 0
@@ -84,6 +96,17 @@ class Scene:
             return DistractorSetting(DistractorSetting.parse(setting).kind, self.difficulty).name
         return setting
 
+    def check(self) -> None:
+        """Raises DmcvbError for a field that has no such value, or none for this task."""
+        maze = get_task(self.task).family == ANT_MAZE
+        for field, value, known in (("split", self.split, SPLITS), ("goal", self.goal, (None, *GOAL_PICTURES))):
+            if value not in known:
+                raise UnknownNameError(field, str(value), [name for name in known if name])
+        if maze and self.difficulty:
+            raise DmcvbError(f"{self.task} has no difficulty: mazes differ in style alone; leave difficulty away")
+        if self.goal and not maze:
+            raise DmcvbError(f"{self.task} has no goal in its pictures; leave goal away")
+
 
 class _Stage:
     """`count` episodes with their distractors and pictures; restarted one by one."""
@@ -91,10 +114,12 @@ class _Stage:
     def __init__(self, count: int, scene: Scene):
         if count < 1:
             raise DmcvbError(f"num_envs is {count}; give at least 1")
+        scene.check()
         setting = scene.normalized_setting()
         self.task, self.count, self.size, self.split = get_task(scene.task), count, scene.size, scene.split
         self.setting = distractor_of(scene.task, setting)
-        self.pictures = Pictures(self.task.views, hides_goal(setting)).select(scene.views)
+        hide = scene.goal == HIDDEN if scene.goal else hides_goal(setting)
+        self.pictures = Pictures(self.task.views, hide).select(scene.views)
         self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if setting == FIXED else None
         self._first_pair = scene.goal_pair or 0

@@ -23,7 +23,7 @@ from dmcvb_gen.rollout.jobs import background_source
 from dmcvb_gen.rollout.painting import renderer_for
 from dmcvb_gen.store import Release, Subset
 from dmcvb_gen.store.index import CARD_FOLDER
-from dmcvb_gen.store.pictures import training_pictures
+from dmcvb_gen.store.pictures import Pictures, shown, training_pictures
 
 TABLE = f"{CARD_FOLDER}/episodes.parquet"
 CONFIG = "episodes"
@@ -144,7 +144,7 @@ def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
 
 def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     """The column of the pictures."""
-    name = training_pictures(subset).arrays[0]
+    name = _pictures(subset).arrays[0]
     without = subset.unpainted[episodes]
     frames: dict[int, np.ndarray] = {}
     for episode in episodes[~without] if name in subset.arrays else ():
@@ -155,9 +155,15 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     return {"first_frame": [_picture(frames.get(int(episode))) for episode in episodes]}
 
 
+def _pictures(subset: Subset) -> Pictures:
+    """Those that agents learn from, the first of which is shown; the overhead view where there is no other."""
+    pictures = training_pictures(subset)
+    return pictures if pictures.views else shown(subset)
+
+
 def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
     """First frames, painted from the stored physics states and labels."""
-    pictures = training_pictures(subset)
+    pictures = _pictures(subset)
     renderer, _ = renderer_for(subset.record, background_source(Path(subset.root), subset.record))
     try:
         physics = subset.read("physics", episodes)[:, 0]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +18,14 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.files import parse_json, sha256_file
+from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
 from dmcvb_gen.pool import Tick, expect, ignore
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD
-from dmcvb_gen.store.manifest import IMPORTED, Manifest, SubsetRecord, environment
+from dmcvb_gen.store.manifest import IMPORTED, MANIFEST, Manifest, SubsetRecord, environment, local_manifest
 from dmcvb_gen.store.pictures import picture_arrays, picture_of
 from dmcvb_gen.store.remote import local_path
 from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
@@ -59,6 +60,11 @@ class _Source:
     record: SubsetRecord
     folders: tuple[Path, ...]
 
+    @property
+    def files(self) -> list[str]:
+        """Names of its files in the order of their episodes; of fixed goals, with the folder's place before."""
+        return [f"{goal}/{file.name}" for goal, folder in enumerate(self.folders) for file in _files(folder)]
+
 
 def import_tfds(
     folder: str | Path,
@@ -68,19 +74,24 @@ def import_tfds(
     level: str | None = None,
     setting: str | None = None,
     name: str = "dmc-vb-original",
+    partial: bool = False,
     tick: Tick = ignore,
 ) -> Manifest:
     """Import subsets, of locomotion and of mazes; run again, it goes on where it stopped.
+
+    Episodes are numbered by the order of their files. Where files that were missing come between those that were
+    imported, the numbers would be others, and `out` is refused; where they come after, the subset grows.
 
     Args:
       folder: a TFDS folder (with features.json), or a tree of DMC-VB's folders that hold such (see `parse_folder`).
       out: folder of the new release.
       task, level, setting: what a single folder holds, where its path does not say it.
       name: of the new release.
+      partial: take the files that are there, though their names say that there are more (`-00003-of-00100`).
       tick: told 1 for each episode.
 
     Raises:
-      StoreError: no TFDS folder is there, it is damaged or has other features, or `out` cannot be used.
+      StoreError: no TFDS folder is there, it is damaged, lacks files or has other features, or `out` cannot be used.
     """
     folder, out = Path(folder), local_path(out)
     found = sorted(path.parent for path in folder.rglob("features.json"))
@@ -90,12 +101,20 @@ def import_tfds(
         raise StoreError(
             f"{folder} holds {len(found)} data sets; give the folder of one with --task, --level, --setting"
         )
+    if not partial:
+        for path in found:
+            _refuse_missing(path)
     sources = _sources(found, task, level, setting)
+    _refuse_other_files(sources, out)
     manifest = Manifest(
         name=name,
         version="1.0.0",
         license="CC-BY-4.0",
-        recipe={"name": name, "imported": sorted(source.record.name for source in sources)},
+        recipe={
+            "name": name,
+            "imported": sorted(source.record.name for source in sources),
+            "files": {source.record.name: _fingerprint(source.files) for source in sources},
+        },
         subsets=tuple(source.record for source in sources),
         environments=(environment(),),
         lineage=(
@@ -188,7 +207,7 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         hidden_goal=hidden,
         max_steps=get_task(task).max_steps,
         fixed_goals=len(folders) if fixed else None,
-        episodes_per_goal=max(counts) if fixed else None,
+        episodes_per_goal=counts[0] if fixed and len(set(counts)) == 1 else None,  # else the episodes' labels say it
     )
 
 
@@ -214,6 +233,42 @@ def _flatten(feature: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
 
 def _files(path: Path) -> list[Path]:
     return sorted(file for file in path.glob("*.tfrecord*") if file.is_file())
+
+
+def _refuse_missing(path: Path) -> None:
+    """Raises StoreError where the files' names say that there are more."""
+    there: dict[tuple[str, int], set[int]] = {}
+    for file in _files(path):
+        if named := re.fullmatch(r"(.*\.tfrecord.*)-(\d{5,})-of-(\d{5,})", file.name):
+            there.setdefault((named[1], int(named[3])), set()).add(int(named[2]))
+    for (_, count), numbers in there.items():
+        if len(numbers) < count:
+            first = next(number for number in range(count) if number not in numbers)
+            raise StoreError(
+                f"{path} holds {len(numbers)} of {count} files (number {first} is missing); fetch the others, or "
+                "import what is there with --partial"
+            )
+
+
+def _fingerprint(files: list[str]) -> dict[str, Any]:
+    """Which files a subset was made from."""
+    return {"count": len(files), "sha256": sha256_bytes("\n".join(files).encode())}
+
+
+def _refuse_other_files(sources: list[_Source], out: Path) -> None:
+    """Raises StoreError where subsets of `out` were made from files that are not the first ones of those here."""
+    if not (out / MANIFEST).exists():
+        return
+    old = local_manifest(out)
+    for source in sources:
+        name = source.record.name
+        recipes = (old.recipe, *(addition.recipe for addition in old.additions))
+        known = [recipe["files"][name] for recipe in recipes if name in recipe.get("files", {})]
+        if any(_fingerprint(source.files[: facts["count"]]) != facts for facts in known):
+            raise StoreError(
+                f"{out} holds {name} from {known[-1]['count']} other files than the first of these "
+                f"{len(source.files)}, and its episodes would be numbered anew; choose another --out"
+            )
 
 
 def _episodes_to_come(record: SubsetRecord, out: Path) -> int:

@@ -194,7 +194,7 @@ class Regeneration:
                 record = shards[commit.subset, commit.shard]
                 promised = known.commit(record, commit.shard)
                 held.add(commit)
-                equal = None if promised is None else _agree(promised, commit)
+                equal = known.agrees(commit) if promised is None else _agree(promised, commit)
                 was = known.damage(record, commit.shard)
                 outcomes.append(_outcome(root, folder, record, commit, was, equal))
                 for file in commit.files:
@@ -261,11 +261,12 @@ class Regeneration:
         for commit in self._make(manifest, shards, folder, tick):
             record = shards[commit.subset, commit.shard]
             was, promised = known.damage(record, commit.shard), known.commit(record, commit.shard)
-            if promised is None and record.digest is not None:  # the subset's digest decides, once all are there
+            equal = known.agrees(commit) if promised is None else _agree(promised, commit)
+            if equal is None and record.digest is not None:  # the subset's digest decides, once all are there
                 held.add(commit)
                 waiting.append((record, commit, was))
             else:
-                settle(record, commit, was, None if promised is None else _agree(promised, commit))
+                settle(record, commit, was, equal)
         verdicts = {record.name: held.equal(record) for record, _, _ in waiting}
         for record, commit, was in waiting:
             settle(record, commit, was, verdicts[record.name])
@@ -300,8 +301,8 @@ class Regeneration:
         for commit in commits:
             record = shards[commit.subset, commit.shard]
             promised = known.commit(record, commit.shard)
-            equal = _agree(promised, commit) if promised else None
-            if promised is None and record.digest and digests[record.name]:
+            equal = known.agrees(commit) if promised is None else _agree(promised, commit)
+            if equal is None and record.digest and digests[record.name]:
                 equal = digests[record.name] == record.digest
             outcomes.append(_outcome(root, out, record, commit, None, equal))
         return Outcome(tuple(outcomes), environment_difference(manifest))
@@ -354,7 +355,7 @@ def _unfinished(manifest: Manifest) -> Manifest:
 
 
 class Held:
-    """Shards made again whose commit record is lost: with the others, they must give their subset's digest."""
+    """Shards made again whose record and index are lost: with the others, they must give their subset's digest."""
 
     def __init__(self, known: _Known):
         self._known = known
@@ -396,6 +397,14 @@ class _Known:
     def commit(self, record: SubsetRecord, shard: int) -> CommitRecord | None:
         """A shard's record, None where it is missing, damaged or not what it was."""
         return read_commit(self.root, record, shard, self._digests)
+
+    def agrees(self, commit: CommitRecord) -> bool | None:
+        """Whether a shard made again, whose record is lost, has the bytes that the index lists; None if it lists none.
+
+        Pictures that a light release leaves out are not listed, and do not count.
+        """
+        made = [file for file in (*commit.files, *commit.pictures) if file.path in self._digests]
+        return all(file.sha256 == self._digests[file.path] for file in made) if made else None
 
     def damage(self, record: SubsetRecord, shard: int) -> str | None:
         """What is wrong with a shard, in words; None where every byte is as committed."""

@@ -1,7 +1,5 @@
 """Pages that the documentation makes of the code: one for each command of `dmcvb-gen`, and their index."""
 
-from pathlib import Path
-
 import mkdocs_gen_files
 
 from dmcvb_gen.cli import COMMANDS
@@ -15,7 +13,3 @@ with mkdocs_gen_files.open("cli/index.md", "w") as index:
             page.write(f"# dmcvb-gen {name}\n\n")
             page.write(f"::: mkdocs-click\n    :module: dmcvb_gen.cli.{module}\n    :command: {attribute}\n")
             page.write(f"    :prog_name: dmcvb-gen {name}\n    :depth: 1\n    :style: table\n")
-
-for picture in ("quickstart.png", "ant-maze.png"):
-    with mkdocs_gen_files.open(f"pictures/{picture}", "wb") as copy:
-        copy.write((Path("dataset_cards") / picture).read_bytes())

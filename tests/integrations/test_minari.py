@@ -5,11 +5,13 @@ from __future__ import annotations
 import minari
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from minari.cli import app
 from PIL import Image
-from typer.testing import CliRunner
+from typer.testing import CliRunner as TyperRunner
 
 import dmcvb_gen
+from dmcvb_gen.cli import main
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.export.references import reference_returns
 from dmcvb_gen.tasks import get_task
@@ -32,7 +34,7 @@ def test_minari_lists_what_was_exported(datasets):
     found = minari.list_local_datasets()
     assert set(found) == set(datasets.values())
     assert all(facts["dataset_size"] > 0 for facts in found.values())
-    result = CliRunner().invoke(app, ["list", "local"])
+    result = TyperRunner().invoke(app, ["list", "local"])
     assert result.exit_code == 0 and "dmcvb_gen" in result.output, result.output
     spaces = {"dmcvb_gen", *(name.rpartition("/")[0] for name in datasets.values())}
     assert set(minari.namespace.list_local_namespaces()) == spaces
@@ -90,6 +92,25 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
         env.close()
     sky = episode.observations["pixels"][0, 0].mean(axis=0)
     assert np.abs(colors[1] - sky).max() < 5 < np.abs(colors[0] - sky).max()
+
+
+@pytest.mark.parametrize("goal", ["visible", "hidden"])
+def test_the_environment_shows_the_goal_as_the_data_were_painted(goal, tmp_path, monkeypatch):
+    asked = [f"--goal={setting}" for setting in ("visible", "hidden")]
+    asked += ["--level=random", "--episodes=1", "--max-steps=3", "--size=16", "--no-pixels", "--fixed-goals=1"]
+    for command in (
+        ["rollout", "ant-maze-empty7x7", *asked, f"--out={tmp_path / 'r'}"],
+        ["paint", str(tmp_path / "r"), f"--goal={goal}"],
+    ):
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 0, result.output
+    export(str(tmp_path / "r"), "minari", tmp_path / "out")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
+    for setting in ("visible", "hidden", "fixed"):
+        env = minari.load_dataset(f"dmcvb_gen/ant-maze-empty7x7/random-{setting}-v0").recover_environment()
+        assert env.unwrapped._stage.pictures.hide_goal == (goal == "hidden")
+        assert bool(env.unwrapped._stage.pairs) == (setting == "fixed")
+        env.close()
 
 
 def test_references_are_of_episodes_as_long_as_the_datas(small_mazes, tmp_path):

@@ -16,7 +16,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from dmcvb_gen import files
-from dmcvb_gen.names import ANT_MAZE, FIXED, DistractorSetting
+from dmcvb_gen.names import ANT_MAZE, FIXED, HIDDEN, VISIBLE, DistractorSetting, hides_goal
 from dmcvb_gen.readers.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.readers.release import ReleaseReader
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
@@ -90,6 +90,8 @@ def _environment(source: Source, split: str) -> EnvSpec:
         options["difficulty"] = DistractorSetting.parse(record.setting).difficulty
     if maze:
         options["views"] = list(source.views)
+        if record.hidden_goal != hides_goal(setting):  # `paint --goal` decides it, too
+            options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
     options["max_steps"] = record.max_steps
     if record.setting == FIXED:
         options |= {
