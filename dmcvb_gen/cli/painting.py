@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from dmcvb_gen.names import GOAL_PICTURES
+from dmcvb_gen.names import GOAL_PICTURES, counted
 
 _OPTIONS = (
     click.option("--size", type=click.IntRange(1), help="Pixels a side.  [default: the manifest's]"),
@@ -46,7 +46,7 @@ def painted_facts(done):
 
 def show_painted(place, done):
     """What painting gave, for people."""
-    click.echo(f"{place}: {done.shards} shards painted; {_compared(done)}.")
+    click.echo(f"{place}: {counted(done.shards, 'shards')} painted; {_compared(done)}.")
     for name in done.differing[:10]:
         click.echo(f"  differs: {name}")
     if done.differing:

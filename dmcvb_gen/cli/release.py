@@ -374,7 +374,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
     if as_json:
         return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
     for subset in manifest.subsets:
-        click.echo(f"{subset.name}: {subset.episodes} episodes")
+        click.echo(f"{subset.name}: {counted(subset.episodes, 'episodes')}")
 
 
 @click.command("diff")
