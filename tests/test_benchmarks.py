@@ -18,7 +18,7 @@ from dmcvb_gen.agents.data import (
     normalize_pixels,
     training_views,
 )
-from dmcvb_gen.benchmarks.cells import _DataCache, train_settings
+from dmcvb_gen.benchmarks.cells import _DataCache, run_cell, train_settings
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
@@ -287,6 +287,10 @@ def test_agents_see_three_of_a_mazes_views_with_the_goal_hidden_where_the_settin
         assert training_views(subset) == tuple(f"{root}/{view}" for view in ("top", "egocentric", "follow"))
 
 
+def without_time(point):
+    return {name: value for name, value in point.items() if name != "seconds"}
+
+
 # -- running cells --------------------------------------------------------------------------------
 
 
@@ -400,6 +404,36 @@ def test_cells_on_a_cluster_take_no_more_than_their_share_of_a_node(small_releas
     for given in (setup, dataclasses.replace(setup, memory=1000), dataclasses.replace(setup, device="cuda")):
         list(run_cells(given, cells, Ray("nowhere:1")))
     assert held == [2_000_000, 1000, None]  # a cell has a GPU, and its memory, alone
+
+
+@pytest.mark.parametrize("whole", ["small_release", "maze_release"])
+@pytest.mark.parametrize("decoder", ["observation decoder", "state decoder"])
+def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, request, tmp_path, monkeypatch):
+    folder = request.getfixturevalue(whole)
+    cell = plan_benchmark("b1", open_release(folder), ["bc"])[0][0]
+    one, other = (Setup(str(folder), str(tmp_path / name), PROFILES["smoke"]) for name in ("one", "other"))
+    expected = run_cell(one, cell)
+    monkeypatch.setattr("dmcvb_gen.agents.trainer.SAVE_SECONDS", 0.0)
+    made, again = [], []
+
+    def stop(what, steps):
+        made.append(what)
+        if made.count(decoder) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(other, cell, stop)
+    found = run_cell(other, cell, lambda what, steps: again.append((what, steps)))
+    at_once = [steps for what, steps in again if what == decoder][0]
+    assert at_once == 1 and sum(steps for _, steps in again) == planned_steps(other.profile, [cell])
+
+    def plain(result):
+        curves = {name: [without_time(point) for point in curve] for name, curve in result["curves"].items()}
+        return result | {"curves": curves}
+
+    assert plain(found["inspection"]) == plain(expected["inspection"])
+    assert list(found["score"]["returns"]) == list(expected["score"]["returns"])
+    assert not list((tmp_path / "other").rglob("*.run"))
 
 
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):

@@ -121,10 +121,10 @@ def train(
     Raises:
       DmcvbError: the folder holds the state of another learner, or a loss is no longer finite.
     """
-    first, curve, spent = 0, [], 0.0
+    first, curve, spent, means = 0, [], 0.0, _Means()
     path = folder / RESUME_FILE if folder else None
     if path is not None and path.exists():
-        first, curve, spent = _load_state(learner, path)
+        first, curve, spent, means = _load_state(learner, path)
         tick(first)
     learner.half = settings.half
     if settings.compile:
@@ -132,7 +132,6 @@ def train(
             setattr(learner, name, torch.compile(getattr(learner, name)))
     log_every = max(1, settings.steps // settings.points)
     started = saved = time.perf_counter()
-    means = _Means()
 
     def make(step: int, reuse: Batch | None) -> Batch:
         return draw(learner, data, settings.batch_size, seed, step, shift=settings.shift, reuse=reuse)
@@ -153,7 +152,7 @@ def train(
                 point |= evaluate(learner)
             curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})
         if path is not None and time.perf_counter() - saved > SAVE_SECONDS:  # the end too: its evaluation may be long
-            _save_state(learner, path, done, curve, spent + time.perf_counter() - started)
+            _save_state(learner, path, done, curve, spent + time.perf_counter() - started, means)
             saved = time.perf_counter()
     schedule.restore()
     return curve
@@ -180,9 +179,12 @@ class _Schedule:
 class _Means:
     """Means of named losses since they were last taken."""
 
-    def __init__(self):
-        self._sums: dict[str, torch.Tensor] = {}
-        self._counts: dict[str, int] = {}
+    def __init__(self, sums: dict[str, torch.Tensor] | None = None, counts: dict[str, int] | None = None):
+        self._sums, self._counts = sums or {}, counts or {}
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
+        """What it was made from, with what was added since."""
+        return dict(self._sums), dict(self._counts)
 
     def add(self, losses: dict[str, torch.Tensor]) -> None:
         for name, value in losses.items():
@@ -208,12 +210,14 @@ def forget(folder: Path) -> None:
     (folder / RESUME_FILE).unlink(missing_ok=True)
 
 
-def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: float) -> None:
+def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: float, means: _Means) -> None:
+    sums, counts = means.state()
     tensors = {f"weights/{name}": value for name, value in learner.state_dict().items()}
     for name, optimizer in learner.optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer/{name}/{index}/{key}": value for key, value in state.items()}
-    facts = {"step": step, "curve": curve, "seconds": seconds}
+    tensors |= {f"means/{name}": torch.as_tensor(value) for name, value in sums.items()}
+    facts = {"step": step, "curve": curve, "seconds": seconds, "counts": counts}
     # TD3-BC's frozen target shares its body: what is stored once must be stored as two
     tensors = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
     remove_partial(path.parent, below=False)  # of a process that was killed
@@ -221,7 +225,7 @@ def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: 
         save_file(tensors, str(temporary), metadata={"facts": json.dumps(facts)})
 
 
-def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float]:
+def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float, _Means]:
     try:
         with safe_open(str(path), "pt") as file:
             facts = json.loads(file.metadata()["facts"])
@@ -235,10 +239,13 @@ def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float]:
                     states.setdefault(int(index), {})[entry] = value
             optimizer.load_state_dict(optimizer.state_dict() | {"state": states})
             _lay_out(optimizer)
+        device = next(learner.parameters()).device
+        sums = {n.removeprefix("means/"): v.to(device) for n, v in tensors.items() if n.startswith("means/")}
+        means = _Means(sums, {name: int(facts["counts"][name]) for name in sums})
     except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise DmcvbError(f"cannot resume from {path} ({reason}); delete it to start that training again") from None
-    return int(facts["step"]), facts["curve"], float(facts["seconds"])
+    return int(facts["step"]), facts["curve"], float(facts["seconds"]), means
 
 
 def _lay_out(optimizer: torch.optim.Optimizer) -> None:

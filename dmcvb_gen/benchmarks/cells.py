@@ -118,9 +118,11 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: Tick = ignore) -> dic
 
 
 def _clear(folder: Path) -> None:
-    forget(folder)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    """Remove the states of a cell's trainings, the decoders' too."""
+    for place in (*(path for path in folder.glob("*") if path.is_dir()), folder):
+        forget(place)
+        if place.is_dir() and not any(place.iterdir()):
+            place.rmdir()
 
 
 def _load_encoder(setup: Setup, work: Pretraining, encoder: nn.Module) -> None:
@@ -155,7 +157,8 @@ def run_cell(setup: Setup, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:
     subset = release[cell.policy[0].subset]
     curve, trained = _train_policy(setup, cell, subset, data, policy, folder, tick)
     inspected = time.perf_counter()
-    inspection = inspect(setup, policy.encoder, data, cell, tick) if pixels and setup.profile.readout_steps else None
+    looked_into = pixels and setup.profile.readout_steps
+    inspection = inspect(setup, policy.encoder, data, cell, folder, tick) if looked_into else None
     ended, evaluating = time.perf_counter(), sum(point["score"]["seconds"] for point in curve if "score" in point)
     before_stop = max(0.0, curve[-1]["seconds"] - trained)
     seconds = {
@@ -307,8 +310,14 @@ def _peak_memory(device: str) -> int:
 # -- what an encoder knows ------------------------------------------------------------------------
 
 
-def inspect(setup: Setup, encoder: nn.Module, data: TrainingData, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:
-    """What a frozen encoder still knows: test errors of decoders of its observations and states (section 5.1)."""
+def inspect(
+    setup: Setup, encoder: nn.Module, data: TrainingData, cell: Cell, folder: Path, tick: Tick = ignore
+) -> dict[str, Any]:
+    """What a frozen encoder still knows: test errors of decoders of its observations and states (section 5.1).
+
+    Args:
+      folder: where the decoders' states are kept while they train, one in a folder each.
+    """
     curves: dict[str, Curve] = {}
     errors: dict[str, float | None] = {}
     torch.manual_seed(setup.seed)  # of the readouts' weights, also where training has just been resumed
@@ -320,7 +329,12 @@ def inspect(setup: Setup, encoder: nn.Module, data: TrainingData, cell: Cell, ti
     for name, learner in readouts.items():
         learner.to(setup.device)
         curves[name] = train(
-            learner, data, settings, seed=setup.seed, tick=lambda made, n=name: tick(f"{n} decoder", made)
+            learner,
+            data,
+            settings,
+            seed=setup.seed,
+            folder=folder / name,
+            tick=lambda made, n=name: tick(f"{n} decoder", made),
         )
         errors[f"{name}_mse"] = curves[name][-1].get("test_loss")
     held_out = len(data.hold_out_rows) > 0
