@@ -135,6 +135,27 @@ def test_td3_critics_are_not_bounded():
     assert value.shape == (3,) and value.min() > 100
 
 
+def test_td3s_values_are_finer_than_half_precision():
+    """Between 128 and 256 bfloat16 has whole numbers alone, and a step's reward is 2 at most."""
+    learner, batch = td3(), make_batch()
+    for critic in (learner.net.critic1, learner.target.critic1, learner.target.critic2):
+        torch.nn.init.constant_(critic[-1].bias, 150.25)
+    noise = torch.zeros_like(batch.action)
+
+    def values():
+        with learner.precision():
+            return learner.net.values(learner.net.body(batch.observation), batch.action)[0], learner.target_value(
+                batch, noise
+            )
+
+    whole = values()
+    learner.half = True
+    for half, exact in zip(values(), whole, strict=True):
+        assert half.dtype == torch.float32
+        torch.testing.assert_close(half, exact, atol=0.02, rtol=0)
+        assert (half - half.bfloat16()).abs().max() > 0.1
+
+
 # -- gradients ------------------------------------------------------------------------------------
 
 

@@ -252,8 +252,14 @@ class _ActorCritic(nn.Module):
 
     def values(self, body: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Q1 and Q2, each (batch,)."""
-        latent = torch.cat([self.critic_trunk(body), action.to(body.dtype)], dim=1)
-        return self.critic1(latent)[:, 0].float(), self.critic2(latent)[:, 0].float()
+        latent = self.critic_trunk(body)
+        return self.value(self.critic1, latent, action), self.value(self.critic2, latent, action)
+
+    @staticmethod
+    def value(critic: nn.Module, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(batch,): a critic's, in float32 throughout. Half precision knows whole numbers alone where a return lies."""
+        with torch.autocast(latent.device.type, enabled=False):
+            return critic(torch.cat([latent.float(), action.float()], dim=1))[:, 0]
 
 
 class ActorEncoder(nn.Module):
@@ -335,10 +341,10 @@ class TD3BC(Policy):
 
     def critic_loss(self, batch: Batch) -> torch.Tensor:
         with torch.no_grad():
-            latent = torch.cat([self.net.critic_trunk(self.net.body(batch.observation)), batch.action], dim=1)
+            latent = self.net.critic_trunk(self.net.body(batch.observation))
         y = self.target_value(batch)
-        heads = (self.net.critic1, self.net.critic2)
-        return sum(F.mse_loss(head(latent)[:, 0].float(), y) for head in heads)
+        critics = (self.net.critic1, self.net.critic2)
+        return sum(F.mse_loss(self.net.value(critic, latent, batch.action), y) for critic in critics)
 
     def actor_loss(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor's loss, and the cloning error in it."""
