@@ -60,4 +60,4 @@ def _compared(done) -> str:
         return "no digests of these pictures were known"
     if done.differing:
         return f"{len(done.differing)} of {done.known} differ from the known digests"
-    return f"all {done.known} known ones have their digests"
+    return f"equal to the known digests ({done.known} of {done.shards})"
