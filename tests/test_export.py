@@ -476,6 +476,23 @@ def test_folders_that_lack_files_are_imported_only_when_asked(exported, dmcvb_ma
     assert verify(tmp_path / "grown").sound
 
 
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_an_import_has_the_time_limit_of_its_episodes(family, tmp_path):
+    if family == "mazes":
+        task, setting, place = "ant-maze-empty7x7", "--goal=hidden", "antmaze_random_hidden_goal/empty7x7/random"
+    else:
+        task, setting, place = "cheetah-run", "--distractor=static", "locomotion/cheetah_run/random/static_medium"
+    made = ["rollout", task, "--level=random", setting, "--episodes=2", "--max-steps=7", "--size=16"]
+    assert CliRunner().invoke(main, [*made, f"--out={tmp_path / 'made'}"]).exit_code == 0
+    [folder] = export(str(tmp_path / "made"), "rlds", tmp_path / "out")
+    (tmp_path / place).parent.mkdir(parents=True)
+    shutil.move(folder, tmp_path / place)
+    import_tfds(tmp_path / place.split("/")[0], tmp_path / "r")
+    assert [record.max_steps for record in open_release(tmp_path / "r").manifest.subsets] == [7]
+    result = verify(tmp_path / "r")
+    assert result.sound, result.findings
+
+
 def test_fixed_goals_of_unequal_numbers_of_episodes_are_all_found(dmcvb_mazes, small_mazes, tmp_path):
     place = "antmaze_fixed_hidden_goal"
     shutil.copytree(dmcvb_mazes / place, tmp_path / place)

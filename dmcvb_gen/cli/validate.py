@@ -146,7 +146,8 @@ def _show(result, profile) -> None:
             f"incomplete: {there:,} of {asked:,} episodes",
             "what is there is sound" if result.sound else verdict[0],
         ]
-    click.echo(f"{'; '.join(verdict)} ({checked}); {profile.note}")
+    note = f"; {profile.note}" if result.results else ""
+    click.echo(f"{'; '.join(verdict)} ({checked}){note}")
     click.echo(f"Report: {result.report}")
 
 

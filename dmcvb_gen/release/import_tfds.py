@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -41,6 +42,8 @@ from dmcvb_gen.store.writer import (
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
+EPISODES_LOOKED_AT = 20
+"""For one that the time limit ended: of mazes, experts reach nearly all goals."""
 MISSING = ("physics", "exogenous/")
 """Arrays (by the beginnings of their names) that an imported subset has not."""
 
@@ -205,10 +208,19 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         family=family,
         views=views,
         hidden_goal=hidden,
-        max_steps=get_task(task).max_steps,
+        max_steps=_time_limit(folders, get_task(task)),
         fixed_goals=len(folders) if fixed else None,
         episodes_per_goal=counts[0] if fixed and len(set(counts)) == 1 else None,  # else the episodes' labels say it
     )
+
+
+def _time_limit(folders: tuple[Path, ...], task: Task) -> int:
+    """Transitions at which the time limit ended the first episodes that it ended; the task's own if it ended none."""
+    places = ((file, *place) for folder in folders for file in _files(folder) for place in offsets(file))
+    examples = (read_example(file, *place) for file, *place in itertools.islice(places, EPISODES_LOOKED_AT))
+    cut = (values for values in examples if not np.any(values.get("steps/is_terminal", False)))
+    longest = max((len(values.get("steps/reward", ())) - 1 for values in cut), default=0)
+    return longest if 0 < longest <= task.max_steps else task.max_steps
 
 
 def _step_features(path: Path) -> dict[str, Any]:
@@ -278,7 +290,7 @@ def _episodes_to_come(record: SubsetRecord, out: Path) -> int:
 def _import_subset(source: _Source, out: Path, tick: Tick) -> None:
     record = source.record
     task = get_task(record.task)
-    rows = task.max_steps + 1
+    rows = record.max_steps + 1
     specs = imported_specs(record)
     attributes: dict[str, Any] = {
         "task": record.task,
@@ -318,8 +330,8 @@ def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], record: SubsetR
     try:
         count = len(values["steps/reward"])
         length = count - 1  # RLDS: the last step holds the last observation
-        if not 0 < length <= task.max_steps:
-            raise ValueError(f"{count} steps")
+        if not 0 < length <= record.max_steps:
+            raise ValueError(f"{count} steps, and the first ones have {record.max_steps + 1}")
         terminated = bool(np.any(values["steps/is_terminal"])) if "steps/is_terminal" in values else False
         arrays["state"][0, :count] = _state(task, values, count, terminated)
         for view, name in zip(record.views, picture_arrays(record.views, record.hidden_goal), strict=True):
