@@ -46,7 +46,8 @@ def painted_facts(done):
 
 def show_painted(place, done):
     """What painting gave, for people."""
-    click.echo(f"{place}: {counted(done.shards, 'shards')} painted; {_compared(done)}.")
+    painted = f"{counted(done.shards, 'shards')} painted; {_compared(done)}."
+    click.echo(f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}")
     for name in done.differing[:10]:
         click.echo(f"  differs: {name}")
     if done.differing:
