@@ -432,6 +432,8 @@ def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, requ
         return result | {"curves": curves}
 
     assert plain(found["inspection"]) == plain(expected["inspection"])
+    decoding = sum(curve[-1]["seconds"] for curve in found["inspection"]["curves"].values())
+    assert found["seconds"]["all"] >= found["seconds"]["inspection"] >= decoding > 0
     assert list(found["score"]["returns"]) == list(expected["score"]["returns"])
     assert not list((tmp_path / "other").rglob("*.run"))
 

@@ -161,10 +161,12 @@ def run_cell(setup: Setup, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:
     inspection = inspect(setup, policy.encoder, data, cell, folder, tick) if looked_into else None
     ended, evaluating = time.perf_counter(), sum(point["score"]["seconds"] for point in curve if "score" in point)
     before_stop = max(0.0, curve[-1]["seconds"] - trained)
+    decoding = sum(points[-1]["seconds"] for points in inspection["curves"].values()) if inspection else 0.0
+    before_stop += max(0.0, decoding - (ended - inspected))
     seconds = {
         "training": curve[-1]["seconds"] - evaluating,
         "evaluation": evaluating,
-        "inspection": ended - inspected,
+        "inspection": max(decoding, ended - inspected),
         "all": before_stop + ended - started,
     }
     digests = {name: subset_digest(release[name].commits) for name in cell.subsets}

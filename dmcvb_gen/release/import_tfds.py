@@ -275,7 +275,7 @@ def _refuse_other_files(sources: list[_Source], out: Path) -> None:
     for source in sources:
         name = source.record.name
         recipes = (old.recipe, *(addition.recipe for addition in old.additions))
-        known = [recipe["files"][name] for recipe in recipes if name in recipe.get("files", {})]
+        known = [facts for recipe in recipes if (facts := (recipe.get("files") or {}).get(name))]
         if any(_fingerprint(source.files[: facts["count"]]) != facts for facts in known):
             raise StoreError(
                 f"{out} holds {name} from {known[-1]['count']} other files than the first of these "
