@@ -1,6 +1,7 @@
 # Sourced by the other scripts: a virtual environment with the package and the extras that they name, made once.
 #   extras=train . scripts/setup.sh
-# Torch comes first and pinned: a plain install would bring gigabytes of CUDA packages.
+# Torch comes first and pinned. Which build comes is pip's index to say: PyPI's brings gigabytes of CUDA, an index of
+# CPU builds (set PIP_INDEX_URL or PIP_EXTRA_INDEX_URL to it) does not.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 venv="${DMCVB_VENV:-.venv}"
