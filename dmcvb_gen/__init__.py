@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.readers.register import register_with_gymnasium
+from dmcvb_gen.loaders.register import register_with_gymnasium
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
-    from dmcvb_gen.readers.release import ReleaseReader
+    from dmcvb_gen.loaders.release import ReleaseReader
 __all__ = ["__version__", "open"]
 
 
@@ -19,7 +19,7 @@ def open(path: str, storage_options: dict | None = None, *, paint: bool = False,
       path: its folder, or any fsspec URL ("s3://bucket/name"), which is read in place.
       storage_options: passed to fsspec for a URL.
       paint: paint pictures when they are read instead of reading them; needs the simulator installed.
-      painting: how (`dmcvb_gen.readers.painted.Painting`): distractors="stored" (those of the data) or "resample"
+      painting: how (`dmcvb_gen.loaders.painted.Painting`): distractors="stored" (those of the data) or "resample"
         (fresh ones for each `set_epoch`), size, backgrounds, cache_bytes (painted episodes kept a subset).
 
     Raises:
@@ -27,10 +27,10 @@ def open(path: str, storage_options: dict | None = None, *, paint: bool = False,
       DmcvbError: a way of painting that there is not.
     """
     if paint or painting:
-        from dmcvb_gen.readers.painted import open_painted
+        from dmcvb_gen.loaders.painted import open_painted
 
         return open_painted(path, storage_options, **painting)
-    from dmcvb_gen.readers.release import open_for_reading
+    from dmcvb_gen.loaders.release import open_for_reading
 
     return open_for_reading(path, storage_options)
 

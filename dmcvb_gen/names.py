@@ -214,6 +214,6 @@ def select(names: Sequence[str], patterns: Sequence[str]) -> list[str]:
     return [name for name in names if not patterns or matches(name, patterns)]
 
 
-def counted(count: int, noun: str) -> str:
+def pluralize(count: int, noun: str) -> str:
     """A number with its noun, given in the plural: 1, "shards" -> "1 shard"; 1200 -> "1,200 shards"."""
     return f"{count:,} {noun.removesuffix('s') if count == 1 else noun}"

@@ -22,13 +22,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.plan import finish, make_plan, prepare
+from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe
+from dmcvb_gen.generate.site import site_of
 from dmcvb_gen.names import ANT_MAZE, family_of
-from dmcvb_gen.pool import Ray
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.plan import finish, make_plan, prepare
-from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe
-from dmcvb_gen.rollout.site import site_of
-from dmcvb_gen.store.remote import file_system
+from dmcvb_gen.parallel import Ray
+from dmcvb_gen.storage.remote import file_system
 
 TASKS = {"walker": ("walker-walk", "dynamic"), "maze": ("ant-maze-empty7x7", "hidden")}
 

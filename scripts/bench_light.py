@@ -20,16 +20,16 @@ import threading
 import time
 from pathlib import Path
 
+from dmcvb_gen.dataset import Subset, open_release
+from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.plan import finish, make_plan, prepare
+from dmcvb_gen.generate.recipe import make_recipe
+from dmcvb_gen.loaders.painted import open_painted
+from dmcvb_gen.loaders.release import open_for_reading
 from dmcvb_gen.names import ANT_MAZE, family_of
-from dmcvb_gen.readers.painted import open_painted
-from dmcvb_gen.readers.release import open_for_reading
 from dmcvb_gen.release.fetch import fetch, fetch_and_paint
-from dmcvb_gen.release.paint import Painter, without_pictures
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.plan import finish, make_plan, prepare
-from dmcvb_gen.rollout.recipe import make_recipe
-from dmcvb_gen.store import Subset, open_release
-from dmcvb_gen.store.pictures import picture_of
+from dmcvb_gen.release.paint import RenderConfig, without_pictures
 
 PIECE = 64 * 1024
 """Bytes that the slow server sends between two looks at the clock."""
@@ -146,7 +146,7 @@ def travel_table(options) -> None:
                 if kind == "painted":
                     moved = fetch(f"{url}/{kind}", root / "here")
                 else:
-                    painter = Painter(workers=options.workers)
+                    painter = RenderConfig(workers=options.workers)
                     moved, done = fetch_and_paint(f"{url}/{kind}", root / "here", painter=painter)
                     assert done.known == done.shards and not done.differing
                 spent[kind] = time.perf_counter() - started, moved.bytes / 1e6

@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dmcvb_gen.agents.data import PAD, Source, TrainingData, load_data, normalize_pixels
-from dmcvb_gen.store import open_release
+from dmcvb_gen.dataset import open_release
 
 
 class OneByOne(Dataset):

@@ -21,7 +21,7 @@ from dmcvb_gen.agents.data import Source, load_data
 from dmcvb_gen.agents.networks import NARROW, PAPER, Architecture
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator
-from dmcvb_gen.store import open_release
+from dmcvb_gen.dataset import open_release
 
 WARM, TIMED = 20, 100
 """Adam steps before those that are timed, and these."""

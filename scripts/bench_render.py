@@ -14,7 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, make_exogenous  # noqa: E402
+from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors  # noqa: E402
 from dmcvb_gen.rendering import make_renderer  # noqa: E402
 from dmcvb_gen.seeding import episode_stream  # noqa: E402
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task  # noqa: E402
@@ -32,7 +32,7 @@ def frames_of(task_id: str, setting: DistractorSetting, episodes: int, steps: in
     physics = np.stack(rows, axis=1)
     names = ("camera", "color", "background", "style")
     generators = {name: [episode_stream(0, ("bench",), i, name) for i in range(episodes)] for name in names}
-    labels = make_exogenous(task, setting, physics, generators, load_backgrounds()).flat()
+    labels = sample_distractors(task, setting, physics, generators, load_backgrounds()).flat()
     return task, physics.reshape(-1, physics.shape[-1]), labels
 
 

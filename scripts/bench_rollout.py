@@ -90,8 +90,8 @@ def maze_peer(task_id: str, steps: int, cameras: bool) -> float:
 
 def maze_physics(task_id: str, workers: int) -> float:
     """Agent steps a second of simulated episodes without pictures."""
-    from dmcvb_gen.behaviours.policies.actor import random_policy
-    from dmcvb_gen.behaviours.policies.simulate import simulate
+    from dmcvb_gen.policies.actor import random_policy
+    from dmcvb_gen.policies.simulate import simulate
     from dmcvb_gen.tasks import get_task
 
     task = get_task(task_id)

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.pool import ignore
-from dmcvb_gen.rollout.plan import make_plan
-from dmcvb_gen.rollout.recipe import make_recipe
-from dmcvb_gen.rollout.worker import painted_arrays, simulate_job
-from dmcvb_gen.store.schema import create_arrays, picture_spec
+from dmcvb_gen.dataset.schema import create_arrays, picture_spec
+from dmcvb_gen.generate.plan import make_plan
+from dmcvb_gen.generate.recipe import make_recipe
+from dmcvb_gen.generate.worker import painted_arrays, simulate_job
+from dmcvb_gen.parallel import ignore
 
 LAYOUTS = (
     "zstd",

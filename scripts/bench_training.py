@@ -27,13 +27,13 @@ import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
-from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.defaults import default_run
-from dmcvb_gen.behaviours.learning.runs import RunConfig
-from dmcvb_gen.behaviours.learning.training import open_run
-from dmcvb_gen.behaviours.learning.vec_env import TaskVecEnv
-from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training import runs
+from dmcvb_gen.training.defaults import default_run
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.training import open_run
+from dmcvb_gen.training.vec_env import TaskVecEnv
 
 TASK = "walker-walk"
 

@@ -10,8 +10,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 from dmcvb_gen.names import family_of
-from dmcvb_gen.store.manifest import MANIFEST, Manifest
 
 CARDS = Path(__file__).parents[1] / "dataset_cards"
 HEAD = """# Data set cards

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import yaml
 
-from dmcvb_gen.readers.register import MAZES, TASKS
-from dmcvb_gen.store import open_release
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.loaders.register import MAZES, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs/gallery"

@@ -14,9 +14,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from dmcvb_gen.dataset import open_release  # noqa: E402
+from dmcvb_gen.dataset.pictures import shown  # noqa: E402
 from dmcvb_gen.release.export import export  # noqa: E402
-from dmcvb_gen.store import open_release  # noqa: E402
-from dmcvb_gen.store.pictures import shown  # noqa: E402
 from tests.conftest import TINY_MAZE, roll_out, small_recipe  # noqa: E402
 
 FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer",)}

@@ -9,13 +9,13 @@ os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linu
 import pytest  # noqa: E402
 import zarr  # noqa: E402
 
+from dmcvb_gen.dataset import open_release  # noqa: E402
+from dmcvb_gen.dataset.manifest import parse_commit, write_json_atomically  # noqa: E402
+from dmcvb_gen.dataset.writer import finish_release  # noqa: E402
 from dmcvb_gen.files import sha256_file  # noqa: E402
-from dmcvb_gen.rollout.executors import run_jobs  # noqa: E402
-from dmcvb_gen.rollout.plan import finish, make_plan, prepare  # noqa: E402
-from dmcvb_gen.rollout.recipe import make_recipe  # noqa: E402
-from dmcvb_gen.store import open_release  # noqa: E402
-from dmcvb_gen.store.manifest import parse_commit, write_json_atomically  # noqa: E402
-from dmcvb_gen.store.writer import finish_release  # noqa: E402
+from dmcvb_gen.generate.executors import run_jobs  # noqa: E402
+from dmcvb_gen.generate.plan import finish, make_plan, prepare  # noqa: E402
+from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
 
 
 def small_recipe(**changes):

@@ -11,11 +11,11 @@ import sys
 
 import numpy as np
 
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies
-from dmcvb_gen.behaviours.policies.policy_file import load_policy
-from dmcvb_gen.behaviours.policies.simulate import simulate
-from dmcvb_gen.distractors import load_backgrounds, make_exogenous
+from dmcvb_gen.distractors import load_backgrounds, sample_distractors
 from dmcvb_gen.names import LOCOMOTION, distractor_of
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import get_task
 
@@ -53,7 +53,7 @@ def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
         }
         distractors = distractor_of(task_id, setting)
         backgrounds = load_backgrounds("builtin", "train") if distractors.kind != "none" else None
-        labels = make_exogenous(task, distractors, physics, streams, backgrounds, split="train")
+        labels = sample_distractors(task, distractors, physics, streams, backgrounds, split="train")
         found[f"labels {setting}"] = digest(*(value for _, value in labels.items()))
         if renderer:
             from dmcvb_gen.rendering import make_renderer

@@ -17,9 +17,9 @@ from dmcvb_gen.agents.learners import (
     BehaviorCloning,
     InverseDynamics,
     LatentForwardDynamics,
-    ObservationReadout,
+    ObservationProbe,
     StatePrediction,
-    StateReadout,
+    StateProbe,
     move_towards,
 )
 from dmcvb_gen.agents.networks import (
@@ -173,8 +173,8 @@ MOVED = {
     "lfd": (lambda: LatentForwardDynamics(small_encoder(), ACTIONS), ("encoder", "embed_action", "g.", "target_")),
     "ae": (lambda: Autoencoder(small_encoder(), CHANNELS, SIZE), ("encoder", "decoder")),
     "state": (lambda: StatePrediction(small_encoder(), STATES), ("encoder", "h.")),
-    "observation readout": (lambda: ObservationReadout(small_encoder(), CHANNELS, SIZE), ("decoder",)),
-    "state readout": (lambda: StateReadout(small_encoder(), STATES), ("h.",)),
+    "observation readout": (lambda: ObservationProbe(small_encoder(), CHANNELS, SIZE), ("decoder",)),
+    "state readout": (lambda: StateProbe(small_encoder(), STATES), ("h.",)),
     "td3-bc, critics first": (td3, ("net.critic1", "net.critic2")),
 }
 
@@ -304,8 +304,8 @@ OVERFIT = {
     "lfd": (lambda: LatentForwardDynamics(small_encoder(), ACTIONS), 40, 0.3),
     "ae": (lambda: Autoencoder(small_encoder(), CHANNELS, SIZE), 60, 0.7),
     "state": (lambda: StatePrediction(small_encoder(), STATES), 60, 0.3),
-    "observation readout": (lambda: ObservationReadout(small_encoder(), CHANNELS, SIZE), 60, 0.7),
-    "state readout": (lambda: StateReadout(small_encoder(), STATES), 80, 0.05),
+    "observation readout": (lambda: ObservationProbe(small_encoder(), CHANNELS, SIZE), 60, 0.7),
+    "state readout": (lambda: StateProbe(small_encoder(), STATES), 80, 0.05),
 }
 
 

@@ -14,8 +14,8 @@ from dmcvb_gen.agents.data import PAD, HeldFrames, Source, TrainingData, batches
 from dmcvb_gen.agents.learners import BehaviorCloning
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.store import open_release
 
 LENGTHS = np.array([4, 7, 2])
 SIZE = 16

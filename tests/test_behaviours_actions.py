@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies
-from dmcvb_gen.behaviours.policies.policy_file import load_policy
-from dmcvb_gen.behaviours.policies.simulate import simulate
-from dmcvb_gen.rollout.plan import make_plan
-from dmcvb_gen.rollout.recipe import make_recipe
+from dmcvb_gen.generate.plan import make_plan
+from dmcvb_gen.generate.recipe import make_recipe
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import get_task
 

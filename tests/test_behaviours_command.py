@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.learning.defaults import parse_settings
-from dmcvb_gen.behaviours.learning.training import RunConfig, command_of
-from dmcvb_gen.behaviours.policies.bundled import bundled_folder, bundled_levels
-from dmcvb_gen.behaviours.policies.evaluation import maze_scores, running_speed
-from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import train_behaviour
+from dmcvb_gen.policies.bundled import bundled_folder, bundled_levels
+from dmcvb_gen.policies.evaluation import maze_scores, running_speed
+from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task, task_ids
+from dmcvb_gen.training.defaults import parse_settings
+from dmcvb_gen.training.training import RunConfig, command_of
 
 
 @pytest.mark.parametrize("init_from", [None, "runs/my stand run"])

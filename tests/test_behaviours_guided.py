@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.guided import EVALUATION_STEPS, Student, draw_places
-from dmcvb_gen.behaviours.learning.networks import Way, as_arrays
-from dmcvb_gen.behaviours.learning.runs import RunConfig
-from dmcvb_gen.behaviours.learning.training import open_run
-from dmcvb_gen.behaviours.policies.actor import Policy
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies
-from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
-from dmcvb_gen.behaviours.policies.way import headed, places
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.open_maze import open_maze_observation, places
+from dmcvb_gen.policies.policy_file import load_policy, read_header
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
+from dmcvb_gen.training import runs
+from dmcvb_gen.training.guided import EVALUATION_STEPS, Student, draw_places
+from dmcvb_gen.training.networks import WaypointNetwork, as_arrays
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.training import open_run
 
 
 def config(task="ant-maze-easy7x7a", steps=640, **changes):
@@ -43,7 +43,7 @@ def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
     batch = walked(get_task("ant-maze-medium7x7a"))
     batch.set_physics(batch.physics())  # what is seen is of this very state, touch sensors too
     vector = np.random.default_rng(0).uniform(-3, 3, (6, 2))
-    seen = headed(batch.behaviour_observation(), vector)
+    seen = open_maze_observation(batch.behaviour_observation(), vector)
     assert seen.dtype == np.float32
 
     # The same ants in another maze, their torsos moved to its middle, their goals to where they are told to go.
@@ -75,7 +75,7 @@ def test_the_actor_and_the_network_that_learns_agree(tmp_path):
         learned = student.way(torch.from_numpy(places(seen))).numpy()
     np.testing.assert_allclose(policy.heading(seen), learned, atol=1e-5)
     plain = Policy(run.walker.header, run.walker.weights, "")
-    wanted = plain.act(headed(seen, policy.heading(seen)), deterministic=True)
+    wanted = plain.act(open_maze_observation(seen, policy.heading(seen)), deterministic=True)
     np.testing.assert_array_equal(policy.act(seen, deterministic=True), wanted)
 
 
@@ -84,7 +84,7 @@ def test_one_that_knows_the_goal_s_direction_walks_as_in_the_open_maze(tmp_path)
     batch = walked(get_task("ant-maze-empty7x7"))
     seen = batch.behaviour_observation()
     ant, goal = places(seen)[:, :2], places(seen)[:, 2:]
-    changed = np.flatnonzero((np.abs(headed(seen, goal - ant) - seen) > 1e-4).any(axis=0))
+    changed = np.flatnonzero((np.abs(open_maze_observation(seen, goal - ant) - seen) > 1e-4).any(axis=0))
     assert len(changed) == 4  # x and y of ant and of goal
 
 
@@ -112,8 +112,11 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
     place = draw_places(run.task.layout, np.random.default_rng(9), 500)
     told = torch.from_numpy(headings(run.task.layout, place[:, :2], place[:, 2:], AHEAD))
     errors = []
-    for weights in (Way(header.way).state_dict(), {n[4:]: torch.tensor(v) for n, v in policy.weights.items()}):
-        way = Way(header.way)
+    for weights in (
+        WaypointNetwork(header.way).state_dict(),
+        {n[4:]: torch.tensor(v) for n, v in policy.weights.items()},
+    ):
+        way = WaypointNetwork(header.way)
         way.load_state_dict({name: value for name, value in weights.items() if name in way.state_dict()})
         with torch.no_grad():
             errors.append(float(((way(torch.from_numpy(place)) - told) ** 2).sum(1).mean()))

@@ -18,14 +18,14 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.run_log import COLUMNS, read_rows
-from dmcvb_gen.behaviours.learning.runs import RunConfig
-from dmcvb_gen.behaviours.learning.sac import ReplayBuffer
-from dmcvb_gen.behaviours.learning.state_file import STATE, pack_state, read_state
-from dmcvb_gen.behaviours.learning.training import open_run
-from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.policies.policy_file import load_policy, read_header
+from dmcvb_gen.training import runs
+from dmcvb_gen.training.run_log import COLUMNS, read_rows
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.sac import ReplayBuffer
+from dmcvb_gen.training.state_file import STATE, pack_state, read_state
+from dmcvb_gen.training.training import open_run
 
 torch.set_num_threads(1)
 TINY = {
@@ -118,7 +118,7 @@ def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):
 
 SCRIPT = """
 import json, sys, torch
-from dmcvb_gen.behaviours.learning import runs, sb3, training
+from dmcvb_gen.training import runs, sb3, training
 torch.set_num_threads(1)
 runs.EVALUATION_EPISODES = 2
 sb3.SAVE_SECONDS = training.SAVE_SECONDS = 0  # save at each evaluation

@@ -7,11 +7,11 @@ import pytest
 import torch
 from stable_baselines3.common.vec_env import VecNormalize
 
-from dmcvb_gen.behaviours.learning import runs, sb3
-from dmcvb_gen.behaviours.learning.runs import RunConfig
-from dmcvb_gen.behaviours.learning.training import open_run
-from dmcvb_gen.behaviours.policies.policy_file import load_policy
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.training import runs, sb3
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.training import open_run
 
 torch.set_num_threads(1)
 TINY = {

@@ -9,9 +9,9 @@ from dm_control import suite
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 
-from dmcvb_gen.behaviours.learning.vec_env import TaskEnv, TaskVecEnv
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
+from dmcvb_gen.training.vec_env import TaskEnv, TaskVecEnv
 
 TASKS = ("walker-walk", "cheetah-run", "humanoid-walk", "ant-maze-easy7x7a")
 

@@ -18,21 +18,21 @@ from dmcvb_gen.agents.data import (
     normalize_pixels,
     training_views,
 )
-from dmcvb_gen.benchmarks.cells import _DataCache, run_cell, train_settings
 from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.experiments import _DataCache, run_cell, train_settings
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
 from dmcvb_gen.benchmarks.setup import Setup, fingerprint, open_data, pretraining_of
-from dmcvb_gen.benchmarks.tables import BENCHMARKS, Cell, Part, plan_benchmark
-from dmcvb_gen.distractors import ExogenousWalk
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
+from dmcvb_gen.dataset.reader import Release, Subset
+from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.pool import Needs, Ray, SerialPool
-from dmcvb_gen.pool.ray_pool import share_of_node
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord
-from dmcvb_gen.store.reader import Release, Subset
+from dmcvb_gen.parallel import Needs, Ray, SerialPool
+from dmcvb_gen.parallel.ray_pool import share_of_node
 from dmcvb_gen.tasks import get_task
 
 
@@ -245,7 +245,7 @@ def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_rele
     data = load_data([Source(subset)])
     evaluator = Evaluator(subset, episodes=3, max_steps=4)
     streams = {name: evaluator.streams(name) for name in ("camera", "color", "background", "style")}
-    walk = ExogenousWalk(evaluator.task, evaluator.setting, 5, streams, None, split="val")
+    walk = DistractorSampler(evaluator.task, evaluator.setting, 5, streams, None, split="val")
     physics, stack = subset.read("physics"), None
     for step in range(4):
         stack = evaluator._see(stack, physics[:, step], walk, step, np.ones(3, bool))
@@ -445,7 +445,7 @@ def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_releas
     def out_of_memory(*_, **__):
         raise MemoryError("no room for 7 GB")
 
-    monkeypatch.setattr("dmcvb_gen.benchmarks.cells.load_data", out_of_memory)
+    monkeypatch.setattr("dmcvb_gen.benchmarks.experiments.load_data", out_of_memory)
     [(cell, result)] = list(run_cells(setup, cells))
     log = tmp_path / "cells" / f"{cell.id}.log"
     assert result["error"] == f"MemoryError: no room for 7 GB (all of it in {log})"
@@ -482,7 +482,9 @@ def test_ablations_are_set_beside_bc_on_all_of_the_expert_without_distractors():
 
 def test_a_cells_seconds_are_those_of_all_its_sessions(small_release, tmp_path, monkeypatch):
     points = [{"step": 10, "score": {"mean": 1.0, "seconds": 20.0}, "seconds": 100.0}]
-    monkeypatch.setattr("dmcvb_gen.benchmarks.cells.train", lambda *args, **options: points)  # the rest was made before
+    monkeypatch.setattr(
+        "dmcvb_gen.benchmarks.experiments.train", lambda *args, **options: points
+    )  # the rest was made before
     cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
     [(_, result)] = list(run_cells(Setup(str(small_release), str(tmp_path), PROFILES["smoke"]), cells))
     seconds = result["seconds"]

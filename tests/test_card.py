@@ -13,16 +13,16 @@ import yaml
 from click.testing import CliRunner
 from PIL import Image
 
-from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.index import card_files
+from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.dataset.writer import sha256_file
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL
+from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.paint import without_pictures
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.index import card_files
-from dmcvb_gen.store.pictures import training_pictures
-from dmcvb_gen.store.writer import sha256_file
 
 
 @pytest.fixture(scope="module")

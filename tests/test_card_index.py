@@ -5,7 +5,7 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
-from dmcvb_gen.store.manifest import MANIFEST, Manifest
+from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 
 TOP = Path(__file__).parents[1]
 

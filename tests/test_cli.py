@@ -12,10 +12,10 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies
-from dmcvb_gen.behaviours.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.cli import COMMANDS, main
-from dmcvb_gen.store import open_release
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
 
 SMALL = ["rollout", "walker-walk", "--episodes", "1", "--size", "16"]
 
@@ -183,7 +183,7 @@ def test_a_stop_that_foreign_code_turns_into_its_own_error_is_no_traceback(tmp_p
             raise ValueError("argument 1: KeyboardInterrupt") from None  # as ctypes does
 
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # a command that is stopped silences it
-    monkeypatch.setattr("dmcvb_gen.rollout.info.describe_release", foreign)
+    monkeypatch.setattr("dmcvb_gen.generate.info.describe_release", foreign)
     result = run("info", tmp_path)
     assert result.exit_code == 1 and "Aborted" in result.output and isinstance(result.exception, SystemExit)
 

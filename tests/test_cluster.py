@@ -16,17 +16,17 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.jobs import left_to_do, part_of
+from dmcvb_gen.generate.plan import finish, make_plan, prepare
+from dmcvb_gen.generate.progress import progress_of
+from dmcvb_gen.generate.recipe import make_recipe
+from dmcvb_gen.generate.site import FolderSite, UploadQueue, site_of, staging_folder_of
 from dmcvb_gen.names import ANT_MAZE
-from dmcvb_gen.pool import Ray
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.jobs import left_to_do, part_of
-from dmcvb_gen.rollout.plan import finish, make_plan, prepare
-from dmcvb_gen.rollout.progress import progress_of
-from dmcvb_gen.rollout.recipe import make_recipe
-from dmcvb_gen.rollout.site import FolderSite, Sender, site_of, stage_of
-from dmcvb_gen.store import open_release
+from dmcvb_gen.parallel import Ray
 from tests.conftest import TINY_MAZE, roll_out
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
@@ -102,7 +102,7 @@ def test_a_shard_made_twice_ends_in_the_same_bytes_and_other_bytes_are_refused(w
     site, commit = FolderSite(tmp_path / "r"), first.commits[0]
     other = commit.model_copy(update={"files": commit.files[:-1], "environment": {"cpu": "another one"}})
     with pytest.raises(StoreError, match="committed meanwhile with other bytes"):
-        site.deliver(stage_of(site).folder, other)
+        site.deliver(staging_folder_of(site).folder, other)
 
 
 def test_versions_other_than_those_of_the_beginning_are_refused_unless_asked_for(tmp_path):
@@ -131,7 +131,7 @@ def test_progress_is_told_from_the_commit_records_alone(tmp_path):
 
 
 def test_what_waits_to_be_sent_takes_a_bounded_room():
-    sender, waiting, most = Sender(bound=25), [], [0]
+    sender, waiting, most = UploadQueue(bound=25), [], [0]
 
     def send():
         time.sleep(0.02)
@@ -205,7 +205,7 @@ def test_no_room_for_the_digests_of_a_bucket_is_one_line(tmp_path, monkeypatch):
     def full(path, data):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr("dmcvb_gen.rollout.plan.write_bytes", full)
+    monkeypatch.setattr("dmcvb_gen.generate.plan.write_bytes", full)
     with pytest.raises(StoreError, match="no room to write to .*scratch.*No space left"):
         finish(plan)
 
@@ -254,7 +254,7 @@ def test_another_release_or_other_files_in_the_bucket_are_refused(tmp_path):
 
 def test_nobody_at_the_address_is_one_line(tmp_path, monkeypatch):
     pytest.importorskip("s3fs")
-    monkeypatch.setattr("dmcvb_gen.store.transfer.PAUSE", 0.01)
+    monkeypatch.setattr("dmcvb_gen.dataset.transfer.PAUSE", 0.01)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "x")
     options = ["--option", "endpoint_url=http://127.0.0.1:9", "--option", "max_attempts=1"]

@@ -12,10 +12,10 @@ import threading
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.writer import commit_path
 from dmcvb_gen.release.diff import diff
 from dmcvb_gen.release.publish import publish
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.writer import commit_path
 from tests.conftest import maze_recipe, roll_out
 
 NAME, MAZE = "walker-walk/random/none", "ant-maze-tiny/random/visible"

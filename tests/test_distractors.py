@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ks_2samp, kstest
 
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, make_exogenous
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
@@ -39,7 +39,7 @@ def generators(episodes, seed=0):
 def labels(task, setting, physics, episodes=None, seed=0):
     episodes = range(len(physics)) if episodes is None else episodes
     backgrounds = load_backgrounds("builtin", "train")
-    return make_exogenous(task, DistractorSetting.parse(setting), physics, generators(episodes, seed), backgrounds)
+    return sample_distractors(task, DistractorSetting.parse(setting), physics, generators(episodes, seed), backgrounds)
 
 
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)

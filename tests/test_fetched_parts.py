@@ -9,14 +9,14 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.writer import commit_path
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.plan import make_plan, prepare
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.writer import commit_path
 from tests.conftest import maze_recipe, rewrite, small_recipe
 
 WALKER = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "dynamic"], "episodes": 3}

@@ -10,20 +10,20 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.append import merged, next_version
+from dmcvb_gen.dataset.manifest import PolicyRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import copy_file
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.plan import finish, finish_site, make_plan, prepare
+from dmcvb_gen.generate.site import site_of
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.plan import finish, finish_site, make_plan, prepare
-from dmcvb_gen.rollout.site import site_of
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.growth import merged, next_version
-from dmcvb_gen.store.manifest import PolicyRecord
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 
 WALKER = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "episodes_per_shard": 1}
@@ -78,7 +78,7 @@ def test_arrays_grow_whole_wherever_growing_was_interrupted(grown, tmp_path, mon
             copy_file(source, target)
 
         with monkeypatch.context() as patch:
-            patch.setattr("dmcvb_gen.store.writer.copy_file", copy)
+            patch.setattr("dmcvb_gen.dataset.writer.copy_file", copy)
             prepare(make_plan(recipe, folder))
         return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("zarr.json")}
 

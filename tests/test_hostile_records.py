@@ -8,9 +8,9 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import commit_path
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import commit_path
 from tests.faults.hostile import valid_release
 from tests.faults.store_ops import NAMES
 

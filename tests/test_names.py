@@ -65,4 +65,4 @@ def test_patterns_select_and_unknown_ones_are_refused():
 
 @pytest.mark.parametrize("count,text", [(0, "0 shards"), (1, "1 shard"), (2, "2 shards"), (1200, "1,200 shards")])
 def test_counted(count, text):
-    assert names.counted(count, "shards") == text
+    assert names.pluralize(count, "shards") == text

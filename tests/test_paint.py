@@ -13,6 +13,9 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.index import write_release
+from dmcvb_gen.dataset.manifest import commit_path
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.release import paint
@@ -20,9 +23,6 @@ from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.paint import paint_release, without_pictures
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.index import write_release
-from dmcvb_gen.store.manifest import commit_path
 
 TINY = [
     "--episodes",
@@ -79,7 +79,7 @@ def test_painting_a_light_release_gives_the_files_of_a_painted_one(made, tmp_pat
     assert {n: v for n, v in mine.items() if n != ".lock"} == {n: v for n, v in theirs.items() if n != ".lock"}
 
 
-@pytest.mark.parametrize("moment", ["only_writer", "paint_shard"])
+@pytest.mark.parametrize("moment", ["write_lock", "paint_shard"])
 def test_two_who_paint_a_release_end_in_what_one_ends_in(made, tmp_path, monkeypatch, moment):
     """Another one paints all of it before the first has the lock, or while the first is about to paint a shard."""
     shutil_copy(made / "light", tmp_path / "copy")
@@ -105,12 +105,12 @@ def test_the_last_painter_keeps_how_others_painted_meanwhile(made, tmp_path, mon
     def meanwhile(*arguments, **options):
         monkeypatch.setattr(paint, "paint_shard", work)
         (making := tmp_path / "copy" / f"{mine}.zarr/x.foreign.partial").touch()
-        paint_release(tmp_path / "copy", [other], painter=paint.Painter(look=paint.Look(size=40)))
+        paint_release(tmp_path / "copy", [other], painter=paint.RenderConfig(look=paint.Look(size=40)))
         assert making.exists()  # somebody is still at work
         return work(*arguments, **options)
 
     monkeypatch.setattr(paint, "paint_shard", meanwhile)
-    paint_release(tmp_path / "copy", [mine], painter=paint.Painter(look=paint.Look(size=48)))
+    paint_release(tmp_path / "copy", [mine], painter=paint.RenderConfig(look=paint.Look(size=48)))
     release = open_release(tmp_path / "copy")
     assert {name: subset.record.size for name, subset in release.subsets.items()} == {mine: 48, other: 40}
     assert verify(tmp_path / "copy").sound and release.manifest.complete
@@ -279,7 +279,7 @@ def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
 @pytest.mark.parametrize("way", [{}, {"paint": True, "distractors": "resample"}])
 def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
     subset = next(reversed(dmcvb_gen.open(str(made / "painted"), **way).subsets.values()))
-    from dmcvb_gen.readers import source as module
+    from dmcvb_gen.loaders import source as module
 
     made_blocks, real = [], module.Block
     monkeypatch.setattr(module, "Block", lambda *options: made_blocks.append(1) or real(*options))
@@ -501,7 +501,7 @@ def test_shards_are_painted_while_others_come_and_a_cut_loses_nothing(made, publ
     monkeypatch.setattr(fetching, "download", download)
     monkeypatch.setattr(painting, "paint_shard", paint_shard)
     with pytest.raises(StoreError, match="line went dead"):
-        fetching.fetch_and_paint(published, tmp_path / "r", painter=painting.Painter())
+        fetching.fetch_and_paint(published, tmp_path / "r", painter=painting.RenderConfig())
     assert painted and open_release(tmp_path / "r").subsets
     monkeypatch.undo()
     count = sum(c.painted for s in open_release(tmp_path / "r").subsets.values() for c in s.commits.values())

@@ -14,15 +14,15 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.behaviours.learning.networks import Actor, as_arrays
-from dmcvb_gen.behaviours.policies.actor import Policy, random_policy
-from dmcvb_gen.behaviours.policies.bundled import bundled_folder, bundled_policies, resolve_policies
-from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader, weight_shapes
-from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header, save_policy
-from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.policies.actor import Policy, random_policy
+from dmcvb_gen.policies.bundled import bundled_folder, bundled_policies, resolve_policies
+from dmcvb_gen.policies.header import Evaluation, PolicyHeader, weight_shapes
+from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.release.card import trained
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training.networks import Actor, as_arrays
 
 
 def header_of(task_id="walker-walk", **changes):
@@ -200,7 +200,7 @@ def test_a_header_says_how_its_policy_came_to_be():
 
 def test_policies_act_without_torch():
     code = "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
-    code += "from dmcvb_gen.behaviours.policies import actor, bundled, evaluation, paper, policy_file, simulate\n"
+    code += "from dmcvb_gen.policies import actor, bundled, evaluation, paper, policy_file, simulate\n"
     code += "from dmcvb_gen.tasks import get_task; task = get_task('walker-walk')\n"
     code += "policy = policy_file.load_policy(bundled.bundled_policies(task.id, 'expert')[0], task)\n"
     code += "print(simulate.simulate(task, [policy], [0], 0, ('t',), max_steps=2).action[0, 0])"
@@ -246,18 +246,18 @@ def test_a_placeless_header_has_the_last_names_of_paths_alone(path, name):
     header = header_of(
         training={"init_from": path, "settings": settings, "seed": 0}, command=f"{command} --set 'a=\"b\"'"
     )
-    bare = header.placeless()
+    bare = header.without_local_paths()
     assert bare.training == {"init_from": name, "settings": settings, "seed": 0}
     words = shlex.split(bare.command)
     assert words[-2:] == ["--set", 'a="b"'] and (words[4] if path else None) == name
     assert "alice" not in bare.model_dump_json() and (bare == header) == (path == name)
-    unreadable = header_of(command="x 'unclosed /home/alice/y").placeless()
+    unreadable = header_of(command="x 'unclosed /home/alice/y").without_local_paths()
     assert "alice" not in unreadable.command
 
 
 def test_no_bundled_policy_names_a_place():
     files = sorted(bundled_folder().rglob("*.safetensors"))
-    assert files and all(read_header(path).placeless() == read_header(path) for path in files)
+    assert files and all(read_header(path).without_local_paths() == read_header(path) for path in files)
 
 
 @pytest.mark.parametrize("level, count", [("expert", 1), ("medium", 1), ("mixed", 8)])

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.pool import IN_FLIGHT, Later, open_pool, run_all
+from dmcvb_gen.parallel import IN_FLIGHT, Future, open_pool, run_all
 
 
 def square(number, tick):
@@ -37,11 +37,11 @@ def send(number, tick):
             raise UnknownNameError("level", "exprt", ("expert", "medium"))
         return started, time.time(), os.getpid()
 
-    return Later(arrive)
+    return Future(arrive)
 
 
 def send_and_die(number, tick):
-    return Later(lambda: os.kill(os.getpid(), signal.SIGKILL))
+    return Future(lambda: os.kill(os.getpid(), signal.SIGKILL))
 
 
 def threads(number, tick):
@@ -119,7 +119,7 @@ def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
 
 PARENT = """
 import os, sys, time
-from dmcvb_gen.pool import run_all
+from dmcvb_gen.parallel import run_all
 
 def announce(number, tick):
     open(sys.argv[1] + f"/{os.getpid()}", "w").close()

@@ -22,19 +22,19 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release, transfer
+from dmcvb_gen.dataset.index import INDEX, card_files, take_in_card
+from dmcvb_gen.dataset.manifest import commit_path
+from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
+from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.generate.recipe import expand, load_recipe
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import CLAIM, publish
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.recipe import expand, load_recipe
-from dmcvb_gen.store import open_release, transfer
-from dmcvb_gen.store.index import INDEX, card_files, take_in_card
-from dmcvb_gen.store.manifest import commit_path
-from dmcvb_gen.store.remote import public, reason
-from dmcvb_gen.store.schema import EpisodeShape, array_specs
-from dmcvb_gen.store.writer import finish_release
+from dmcvb_gen.storage.remote import public, reason
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
 from tests.faults.proxy import Proxy

@@ -7,7 +7,7 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.benchmarks.questions import ask, pool, read_reports
+from dmcvb_gen.benchmarks.claims import ask, pool, read_reports
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 

@@ -10,10 +10,10 @@ import torch
 from torch.utils.data import DataLoader
 
 import dmcvb_gen
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.readers import source as source_module
-from dmcvb_gen.readers.blocks import stream
-from dmcvb_gen.store import open_release
+from dmcvb_gen.loaders import source as source_module
+from dmcvb_gen.loaders.blocks import stream
 
 NAME = "walker-walk/random/dynamic"
 

@@ -11,16 +11,16 @@ import zarr
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import parse_commit, write_json_atomically
+from dmcvb_gen.dataset.shards import chosen_shards
+from dmcvb_gen.dataset.writer import commit_path, finish_release, sha256_file
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
+from dmcvb_gen.generate.jobs import make_jobs, release_inputs
+from dmcvb_gen.generate.plan import make_plan
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
-from dmcvb_gen.rollout.plan import make_plan
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import parse_commit, write_json_atomically
-from dmcvb_gen.store.shards import chosen_shards
-from dmcvb_gen.store.writer import commit_path, finish_release, sha256_file
 from tests.conftest import roll_out, small_recipe
 
 NAME = "walker-walk/random/dynamic"
@@ -148,7 +148,7 @@ def test_a_commit_record_that_is_not_what_it_was_is_put_back(copy, field, change
 
 
 def test_a_release_keeps_its_own_codecs_when_the_code_has_new_ones(copy, monkeypatch):
-    monkeypatch.setattr("dmcvb_gen.store.writer.picture_layout_for", lambda setting: "zstd-9")
+    monkeypatch.setattr("dmcvb_gen.dataset.writer.picture_layout_for", lambda setting: "zstd-9")
     assert Regeneration(copy, [NAME], (2, 3)).check().sound
 
 

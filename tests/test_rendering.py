@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, make_exogenous
+from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.rendering import available_renderers, make_renderer, warp
 from dmcvb_gen.rendering.opengl import unavailable
@@ -33,7 +33,7 @@ def frames_of(task_id, setting_name, count=FRAMES):
         name: [episode_stream(1, ("render",), i, name) for i in range(2)]
         for name in ("camera", "color", "background", "style")
     }
-    labels = make_exogenous(task, setting, physics, generators, load_backgrounds()).flat()
+    labels = sample_distractors(task, setting, physics, generators, load_backgrounds()).flat()
     return task, setting, physics.reshape(-1, physics.shape[-1]), labels
 
 

@@ -16,24 +16,24 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.policies.actor import random_policy
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies
-from dmcvb_gen.behaviours.policies.policy_file import load_policy, save_policy
-from dmcvb_gen.behaviours.policies.simulate import simulate
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
+from dmcvb_gen.generate import estimate as estimating
+from dmcvb_gen.generate.estimate import estimate, measurements
+from dmcvb_gen.generate.plan import make_plan, prepare
+from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.names import LOCOMOTION, family_of
+from dmcvb_gen.policies.actor import random_policy
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.rendering.opengl import unavailable
-from dmcvb_gen.rollout import estimate as estimating
-from dmcvb_gen.rollout.estimate import estimate, measurements
-from dmcvb_gen.rollout.plan import make_plan, prepare
-from dmcvb_gen.rollout.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.seeding import episode_stream
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import parse_manifest
 from dmcvb_gen.tasks import get_task
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 
@@ -58,7 +58,7 @@ def test_two_workers_give_the_same_digests(small_release, tmp_path):
 def test_a_range_of_episodes_made_alone_gives_the_same_files(small_release, tmp_path):
     plan = prepare(make_plan(small_recipe(), tmp_path / "r", ["*/*/dynamic"], episodes=(2, 3)))
     assert [job.shard for job in plan.jobs] == [1] and len(plan.jobs[0].subsets) == 1
-    from dmcvb_gen.rollout.executors import run_jobs
+    from dmcvb_gen.generate.executors import run_jobs
 
     [result] = run_jobs(plan.jobs)
     whole = open_release(small_release)["walker-walk/random/dynamic"].commits[1]
@@ -157,7 +157,7 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 
 
 def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, tmp_path):
-    from dmcvb_gen.rollout.executors import run_jobs
+    from dmcvb_gen.generate.executors import run_jobs
 
     copy = tmp_path / "copy"
     shutil.copytree(small_release, copy)

@@ -10,23 +10,23 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.learning.networks import Actor, as_arrays
-from dmcvb_gen.behaviours.learning.run_log import COLUMNS
-from dmcvb_gen.behaviours.learning.selection import (
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.names import MAZE_TRAINED_LEVELS as MAZE_LEVELS
+from dmcvb_gen.policies.bundled import level_files
+from dmcvb_gen.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.policies.paper import medium_return
+from dmcvb_gen.policies.policy_file import read_header, save_policy
+from dmcvb_gen.training.networks import Actor, as_arrays
+from dmcvb_gen.training.pruning import LIMIT, prunable_checkpoints
+from dmcvb_gen.training.run_log import COLUMNS
+from dmcvb_gen.training.selection import (
     MIXED_COUNT,
     converge,
     pick_checkpoints,
     read_curve,
     select_checkpoints,
 )
-from dmcvb_gen.behaviours.learning.thinning import LIMIT, superfluous
-from dmcvb_gen.behaviours.policies.bundled import level_files
-from dmcvb_gen.behaviours.policies.header import Evaluation, PolicyHeader
-from dmcvb_gen.behaviours.policies.paper import medium_return
-from dmcvb_gen.behaviours.policies.policy_file import read_header, save_policy
-from dmcvb_gen.cli import main
-from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import MAZE_TRAINED_LEVELS as MAZE_LEVELS
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -185,7 +185,7 @@ def test_thinning_takes_nothing_that_the_selection_needs(seed):
     kept: dict[int, float] = {}
     for step, value in enumerate(values, 1):  # as a run does it: after every evaluation, not knowing the future
         kept[step] = float(value)
-        for gone in superfluous(kept, (0.0, 1000.0)):
+        for gone in prunable_checkpoints(kept, (0.0, 1000.0)):
             del kept[gone]
         assert len(kept) <= 400
     points = [(step, float(value), Path(str(step))) for step, value in enumerate(values, 1)]
@@ -204,16 +204,16 @@ def test_thinning_takes_nothing_that_the_selection_needs(seed):
 
 
 def test_short_runs_are_not_thinned_and_records_and_recent_ones_stay():
-    assert superfluous({step: 0.0 for step in range(LIMIT)}, (0, 1000)) == []
+    assert prunable_checkpoints({step: 0.0 for step in range(LIMIT)}, (0, 1000)) == []
     curve = {step: float(step % 7) for step in range(1000)}
-    gone = superfluous(curve, (0, 1000))
+    gone = prunable_checkpoints(curve, (0, 1000))
     assert not {0, 1, 2, 3, 4, 5, 6} & set(gone) and not set(range(980, 1000)) & set(gone) and len(gone) > 900
 
 
 def test_negative_returns_are_thinned_by_level_too():
     rng = np.random.default_rng(0)
     curve = {step: -1200 + 1.1 * step + float(rng.normal(0, 5)) for step in range(1000)}
-    left = set(curve) - set(superfluous(curve, (-2400.0, 0.0)))
+    left = set(curve) - set(prunable_checkpoints(curve, (-2400.0, 0.0)))
     levels = sorted(curve[step] for step in left)
     assert len(left) < 450 and max(np.diff(levels)) < 30  # 1 % of the range, 3 % of the way
 
@@ -269,7 +269,7 @@ def test_points_of_thinned_and_half_written_checkpoints(run_folder):
 
 
 def test_a_checkpoint_that_is_thinned_away_meanwhile_is_done_without(run_folder, monkeypatch):
-    import dmcvb_gen.behaviours.learning.selection as module
+    import dmcvb_gen.training.selection as module
 
     seen, load = [], module.load_policy
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.release.statistics import level_statistics, state_statistics, states_json
-from dmcvb_gen.store import open_release
 from dmcvb_gen.tasks import get_task
 
 

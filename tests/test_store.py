@@ -16,15 +16,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dmcvb_gen
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import check_relative_path, parse_commit, parse_manifest
+from dmcvb_gen.dataset.schema import create_arrays, picture_codecs, picture_spec
+from dmcvb_gen.dataset.writer import finish_release, sha256_file, subset_digest
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.publish import publish
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.plan import finish, make_plan, prepare
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import check_relative_path, parse_commit, parse_manifest
-from dmcvb_gen.store.schema import create_arrays, picture_codecs, picture_spec
-from dmcvb_gen.store.writer import finish_release, sha256_file, subset_digest
 from dmcvb_gen.tasks import get_task
 from tests.conftest import small_recipe
 
@@ -78,12 +78,12 @@ def test_a_release_reads_back_with_its_shapes_and_alignment(small_release):
 
 
 def test_repainting_a_stored_frame_gives_the_stored_pixels(small_release):
-    from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-    from dmcvb_gen.rollout.painting import renderer_for
+    from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
+    from dmcvb_gen.generate.painting import renderer_for
 
     subset = open_release(small_release)[NAME]
     episode = subset.episode(2)
-    labels = Exogenous(**{name: episode[f"exogenous/{name}"] for name in EXOGENOUS_NAMES})
+    labels = DistractorState(**{name: episode[f"exogenous/{name}"] for name in DISTRACTOR_STATE_NAMES})
     steps = [0, 3, 250, 500]
     renderer, _ = renderer_for(subset.record, "builtin", "train")
     np.testing.assert_array_equal(
@@ -195,7 +195,7 @@ def test_a_subset_without_its_marker_keeps_every_shard(small_release, tmp_path):
 
 
 def test_the_store_knows_no_tasks():
-    code = "import sys, dmcvb_gen.store; print([m for m in sys.modules if m in ('mujoco', 'dmcvb_gen.tasks')])"
+    code = "import sys, dmcvb_gen.dataset; print([m for m in sys.modules if m in ('mujoco', 'dmcvb_gen.tasks')])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
@@ -281,7 +281,7 @@ def test_a_release_is_read_through_a_url(small_release):
 
 
 def test_the_root_digest_names_the_data_and_not_the_machine(small_release):
-    from dmcvb_gen.store.index import read_index, root_digest
+    from dmcvb_gen.dataset.index import read_index, root_digest
 
     manifest = open_release(small_release).manifest
     listed = read_index(small_release).files

@@ -9,17 +9,17 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from dmcvb_gen.behaviours.learning import runs
-from dmcvb_gen.behaviours.learning.defaults import default_run, parse_settings, run_config
-from dmcvb_gen.behaviours.learning.episodes import standing_states
-from dmcvb_gen.behaviours.learning.runs import RunConfig, check_same
-from dmcvb_gen.behaviours.learning.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
-from dmcvb_gen.behaviours.learning.training import SacRun, open_run
-from dmcvb_gen.behaviours.policies.bundled import bundled_policies
-from dmcvb_gen.behaviours.policies.header import PolicyHeader
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training import runs
+from dmcvb_gen.training.defaults import default_run, parse_settings, run_config
+from dmcvb_gen.training.episodes import standing_states
+from dmcvb_gen.training.runs import RunConfig, check_same
+from dmcvb_gen.training.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
+from dmcvb_gen.training.training import SacRun, open_run
 
 torch.set_num_threads(1)
 TINY = dict(warmup_steps=64, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4)

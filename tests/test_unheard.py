@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.generate.plan import make_plan, prepare
+from dmcvb_gen.generate.recipe import expand
 from dmcvb_gen.names import LEVELS
-from dmcvb_gen.rollout.plan import make_plan, prepare
-from dmcvb_gen.rollout.recipe import expand
 from tests.conftest import small_recipe
 
 MAZE, WALKER = "ant-maze-empty7x7", "walker-walk"
@@ -31,7 +31,7 @@ def asked(monkeypatch):
         raise click.Abort()
 
     def ask(*arguments):
-        monkeypatch.setattr("dmcvb_gen.rollout.plan.make_plan", stop)
+        monkeypatch.setattr("dmcvb_gen.generate.plan.make_plan", stop)
         result = rollout(*arguments)
         assert result.exit_code == 1, result.output
         return {request.name: request for request in expand(recipes[-1])}

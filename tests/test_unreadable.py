@@ -12,19 +12,19 @@ import pytest
 from click.testing import CliRunner
 
 import dmcvb_gen
-from dmcvb_gen.behaviours.learning.runs import RunConfig
-from dmcvb_gen.behaviours.learning.training import open_run
-from dmcvb_gen.behaviours.policies.bundled import resolve_policies
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release, transfer
+from dmcvb_gen.dataset.index import INDEX
+from dmcvb_gen.dataset.manifest import MANIFEST, commit_path
+from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.errors import DmcvbError, PolicyFileError, StoreError
+from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.shards import damage
 from dmcvb_gen.release.verify import check_files
-from dmcvb_gen.store import open_release, transfer
-from dmcvb_gen.store.index import INDEX
-from dmcvb_gen.store.manifest import MANIFEST, commit_path
-from dmcvb_gen.store.reader import load_manifest
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.training import open_run
 from tests.faults import store_ops
 
 NAME = store_ops.NAMES[0]

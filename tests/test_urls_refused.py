@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.store.remote import local_path
+from dmcvb_gen.storage.remote import local_path
 
 URL = "s3://bucket/x"
 COMMANDS = {
@@ -47,7 +47,7 @@ def test_no_command_makes_a_folder_of_a_url(small_release, elsewhere, name):
 
 
 def _plan(root):
-    from dmcvb_gen.rollout.plan import make_plan
+    from dmcvb_gen.generate.plan import make_plan
     from tests.conftest import small_recipe
 
     make_plan(small_recipe(), URL)
@@ -78,7 +78,7 @@ def _card(root):
 
 
 def _preview(root):
-    from dmcvb_gen.rollout.preview import write_preview
+    from dmcvb_gen.generate.preview import write_preview
 
     write_preview(root, URL)
 
@@ -108,8 +108,8 @@ def _report(root):
 
 
 def _train(root):
-    from dmcvb_gen.behaviours.learning.runs import RunConfig
-    from dmcvb_gen.behaviours.learning.training import open_run
+    from dmcvb_gen.training.runs import RunConfig
+    from dmcvb_gen.training.training import open_run
 
     open_run(URL, RunConfig("walker-walk", "sac", 1, 0, {}), resume=False)
 

@@ -23,12 +23,12 @@ from PIL import Image
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, render_tables
-from dmcvb_gen.benchmarks.tables import plan_benchmark
+from dmcvb_gen.benchmarks.suites import plan_benchmark
 from dmcvb_gen.benchmarks.validate import _seen_warnings, only
 from dmcvb_gen.cli import main
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import parse_manifest
-from dmcvb_gen.store.writer import commit_path, finish_release
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import parse_manifest
+from dmcvb_gen.dataset.writer import commit_path, finish_release
 from tests.conftest import maze_recipe, rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/expert/dynamic"

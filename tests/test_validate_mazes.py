@@ -9,13 +9,13 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.agents.data import Source, load_data
-from dmcvb_gen.benchmarks.cells import data_score
 from dmcvb_gen.benchmarks.checks import check_labels, check_policy_returns, check_structure
+from dmcvb_gen.benchmarks.experiments import data_score
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.cli import main
-from dmcvb_gen.rollout.recipe import make_recipe
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import PolicyRecord
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import PolicyRecord
+from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from tests.conftest import roll_out

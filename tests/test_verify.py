@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.index import is_card
+from dmcvb_gen.dataset.writer import commit_path, finish_release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.verify import check_files, verify
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.index import is_card
-from dmcvb_gen.store.writer import commit_path, finish_release
 from tests.conftest import rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/random/dynamic"

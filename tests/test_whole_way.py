@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.store import open_release
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.tasks import get_task
 
 SIZE = 16

@@ -24,9 +24,9 @@ import torch
 from torch.utils.data import Dataset
 
 from dmcvb_gen.agents.learners import Batch
+from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.store import Subset
-from dmcvb_gen.store.pictures import training_pictures
 
 FRAMES = 3
 """Frames an observation; the first one of an episode is repeated (paper, appendix "Encoders")."""

@@ -377,7 +377,7 @@ class TD3BC(Policy):
 # -- inspection: what a frozen encoder still knows ------------------------------------------------
 
 
-class ObservationReadout(Learner):
+class ObservationProbe(Learner):
     """|| psi(phi(o)) - o ||^2 over psi, phi frozen."""
 
     def __init__(
@@ -402,7 +402,7 @@ class ObservationReadout(Learner):
         return {"loss": F.mse_loss(self.reconstruct(batch.observation).float(), batch.observation.float())}
 
 
-class StateReadout(Learner):
+class StateProbe(Learner):
     """|| s - h(phi(o)) ||^2 over an MLP h, phi frozen."""
 
     def __init__(self, encoder: nn.Module, state_size: int, lr=LEARNING_RATE):

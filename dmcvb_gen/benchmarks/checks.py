@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.dataset import Release, Subset, open_release
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
-from dmcvb_gen.pool import Tick, Workers, expect, ignore, in_order, open_pool
-from dmcvb_gen.readers.painted import PaintedSubset
-from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
+from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.paint import drift
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rollout.jobs import background_source
-from dmcvb_gen.store import Release, Subset, open_release
 from dmcvb_gen.tasks import get_task
 
 STANDARD_ERRORS = 4.0
@@ -49,8 +49,8 @@ class Structure:
     """
 
     checked: dict[str, int]
-    findings: tuple[Finding, ...]
-    warnings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
+    warnings: tuple[Issue, ...]
     seconds: float
 
     @property
@@ -58,7 +58,7 @@ class Structure:
         return not self.findings
 
 
-def check_policy_returns(subset: Subset) -> Iterator[Finding]:
+def check_policy_returns(subset: Subset) -> Iterator[Issue]:
     """Each policy's episodes return what its file says it returned when it was evaluated.
 
     That was over random starts and goals, in the policy's own maze, with the task's own time limit: episodes of fixed
@@ -77,7 +77,7 @@ def check_policy_returns(subset: Subset) -> Iterator[Finding]:
         tolerance += 0.01 * abs(said["mean"])
         if not abs(returns.mean() - said["mean"]) <= tolerance:
             worst = int(np.abs(returns - said["mean"]).argmax())
-            yield Finding(
+            yield Issue(
                 "returns",
                 subset.name,
                 f"mean return of policy {policy.name} is {returns.mean():.1f}, its file says {said['mean']:.1f} "
@@ -91,7 +91,7 @@ def _comparable(subset: Subset) -> bool:
     return subset.setting != FIXED and subset.record.max_steps == get_task(subset.task).max_steps
 
 
-def check_paper_returns(subset: Subset) -> Iterator[Finding]:
+def check_paper_returns(subset: Subset) -> Iterator[Issue]:
     """Warns where the mean return is not near the paper's table."""
     paper, expert = paper_returns(subset.task, subset.level), paper_returns(subset.task, "expert")
     if not paper or not len(subset.returns) or not _comparable(subset):
@@ -103,10 +103,10 @@ def check_paper_returns(subset: Subset) -> Iterator[Finding]:
     mean = float(subset.returns.mean())
     tolerance = scale + 2 * float(subset.returns.std()) / math.sqrt(len(subset.returns))
     if not abs(mean - paper["mean"]) <= tolerance:
-        yield Finding("paper", subset.name, f"mean return is {mean:.1f}, the paper's is {paper['mean']:.1f}")
+        yield Issue("paper", subset.name, f"mean return is {mean:.1f}, the paper's is {paper['mean']:.1f}")
 
 
-def check_labels(subset: Subset) -> Iterator[Finding]:
+def check_labels(subset: Subset) -> Iterator[Issue]:
     """The distractors' labels are what the setting's name says; imported data have none."""
     if subset.record.imported:
         return
@@ -120,9 +120,9 @@ def check_labels(subset: Subset) -> Iterator[Finding]:
         problems += _label_problems(kind, own, video, frame, color)
         for bad, message in problems:
             if bad.any():
-                yield Finding("labels", subset.name, message, episode, int(bad.argmax()))
+                yield Issue("labels", subset.name, message, episode, int(bad.argmax()))
     if (kind == "none") != (subset.record.backgrounds is None):
-        yield Finding("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
+        yield Issue("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
 
 
 def _label_problems(kind: str, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray):
@@ -147,7 +147,7 @@ def _label_problems(kind: str, own: np.ndarray, video: np.ndarray, frame: np.nda
     return problems + [(jumps, "the background skips frames")]
 
 
-def check_pictures(subset: Subset) -> Iterator[Finding]:
+def check_pictures(subset: Subset) -> Iterator[Issue]:
     """No frame is black or of one color, and no episode shows the same frame throughout."""
     most = PAINTED_EPISODES if isinstance(subset, PaintedSubset) else PICTURE_EPISODES
     chosen = subset.episodes[:: max(1, -(-len(subset.episodes) // most))]
@@ -157,9 +157,9 @@ def check_pictures(subset: Subset) -> Iterator[Finding]:
             low, high = flat.min(axis=1), flat.max(axis=1)
             for bad, message in ((high == 0, "is black"), ((low == high) & (high > 0), "is of one color")):
                 if bad.any():
-                    yield Finding("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax()))
+                    yield Issue("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax()))
             if len(frames) > 1 and (flat == flat[:1]).all() and high[0] > 0:
-                yield Finding("pictures", subset.name, f"{name} shows the same frame throughout", episode)
+                yield Issue("pictures", subset.name, f"{name} shows the same frame throughout", episode)
 
 
 def known_returns(release: Release) -> dict[str, np.ndarray]:
@@ -184,7 +184,7 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
 class _Longer:
     """A tick that is told of more than it expects to be told of by whom it is given to."""
 
-    def __init__(self, tick: Tick, more: int):
+    def __init__(self, tick: ProgressCallback, more: int):
         self._tick, self._more = tick, more
 
     def __call__(self, done: Any) -> None:
@@ -197,7 +197,7 @@ class _Longer:
 def check_structure(
     release: Release,
     backgrounds: str | None = None,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
     workers: Workers = 1,
 ) -> Structure:
     """All checks of a local release, or of some of its subsets.
@@ -225,11 +225,11 @@ def check_structure(
             findings += found
             warnings += odd
     for text in painter_drift(release, backgrounds):
-        warnings.append(Finding("painter", "pictures painted on reading", text))
+        warnings.append(Issue("painter", "pictures painted on reading", text))
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)
 
 
-def _check_subset(subset: Subset, tick: Tick) -> tuple[list[Finding], list[Finding]]:
+def _check_subset(subset: Subset, tick: ProgressCallback) -> tuple[list[Issue], list[Issue]]:
     """What is wrong, and what is odd."""
     tick(subset.name)
     found = [*check_policy_returns(subset), *check_labels(subset), *check_pictures(subset)]

@@ -17,14 +17,14 @@ import torch
 
 from dmcvb_gen.agents.data import Normalization, normalize_pixels
 from dmcvb_gen.agents.learners import Policy
-from dmcvb_gen.distractors import ExogenousWalk, load_backgrounds
+from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.distractors import DistractorSampler, load_backgrounds
+from dmcvb_gen.generate.jobs import video_source
+from dmcvb_gen.generate.painting import renderer_for
+from dmcvb_gen.generate.recipe import RendererChoice
 from dmcvb_gen.names import distractor_of
-from dmcvb_gen.rollout.jobs import video_source
-from dmcvb_gen.rollout.painting import renderer_for
-from dmcvb_gen.rollout.recipe import RendererChoice
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.store import Subset
-from dmcvb_gen.store.pictures import training_pictures
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -207,14 +207,14 @@ class Evaluator:
             pictures=np.stack(pictures) if pictures else None,
         )
 
-    def _walk(self) -> ExogenousWalk | None:
+    def _walk(self) -> DistractorSampler | None:
         """The distractors of the episodes; None for policies that see states."""
         if self.renderer is None:
             return None
         generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
-        return ExogenousWalk(self.task, self.setting, self.steps + 1, generators, self._videos, split=SPLIT)
+        return DistractorSampler(self.task, self.setting, self.steps + 1, generators, self._videos, split=SPLIT)
 
-    def _see(self, stack, physics, walk: ExogenousWalk, step: int, active: np.ndarray) -> np.ndarray:
+    def _see(self, stack, physics, walk: DistractorSampler, step: int, active: np.ndarray) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
         rows = np.flatnonzero(active)
         labels = walk.frame(step, physics)[rows]

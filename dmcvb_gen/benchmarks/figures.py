@@ -12,11 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import known_returns
-from dmcvb_gen.benchmarks.tables import Cell
+from dmcvb_gen.benchmarks.suites import Cell
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.names import FIXED, task_folder
-from dmcvb_gen.store import Release
+from dmcvb_gen.policies.paper import paper_returns
 
 DPI = 110
 COLUMNS = 3

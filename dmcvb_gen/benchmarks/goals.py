@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dmcvb_gen.dataset import Subset
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.store import Subset
 from dmcvb_gen.tasks import get_task
 
 Cells = tuple[tuple[int, int], tuple[int, int]]

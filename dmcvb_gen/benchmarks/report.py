@@ -17,19 +17,19 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from dmcvb_gen.behaviours.policies.paper import paper_returns
 from dmcvb_gen.benchmarks.checks import Structure, known_returns
+from dmcvb_gen.benchmarks.claims import QUESTIONS, ask
 from dmcvb_gen.benchmarks.figures import curve_figures, data_url, figure_url, label_of, place_of, return_figures
 from dmcvb_gen.benchmarks.paper import paper_score
-from dmcvb_gen.benchmarks.questions import QUESTIONS, ask
 from dmcvb_gen.benchmarks.setup import Setup
-from dmcvb_gen.benchmarks.tables import Cell, Missing
+from dmcvb_gen.benchmarks.suites import Cell, Missing
+from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.files import write_json, write_text
-from dmcvb_gen.names import ANT_MAZE, DISTRACTOR_KINDS, FIXED, VISIBLE, counted, family_of, task_folder
-from dmcvb_gen.release.finding import Finding
-from dmcvb_gen.rollout.info import return_statistics
-from dmcvb_gen.store import Release
-from dmcvb_gen.store.manifest import environment
+from dmcvb_gen.generate.info import return_statistics
+from dmcvb_gen.names import ANT_MAZE, DISTRACTOR_KINDS, FIXED, VISIBLE, family_of, pluralize, task_folder
+from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
@@ -73,7 +73,7 @@ def write_report(
     cells: Sequence[Cell],
     results: Results,
     missing: Sequence[Missing],
-    warnings: Sequence[Finding],
+    warnings: Sequence[Issue],
     seconds: float,
 ) -> tuple[Path, Path]:
     """Write report.html, report.md and report.json into the setup's folder; gives the paths of the page and of the JSON
@@ -257,12 +257,12 @@ def _score_text(entry: Mapping[str, Any] | None, profile: str) -> str:
 
 def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
     found, failed = len(facts["structure"]["findings"]), len(facts["failed"])
-    checked = ", ".join(counted(count, what) for what, count in facts["structure"]["checked"].items())
+    checked = ", ".join(pluralize(count, what) for what, count in facts["structure"]["checked"].items())
     there, asked = facts["episodes"]["there"], facts["episodes"]["asked"]
     if not facts["sound"]:
         kind = "unsound"
-        text = f"Not sound: {counted(found, 'findings')}"
-        text += (f", {counted(failed, 'cells')} failed" if failed else "") + f" in {checked}."
+        text = f"Not sound: {pluralize(found, 'findings')}"
+        text += (f", {pluralize(failed, 'cells')} failed" if failed else "") + f" in {checked}."
     elif not facts["complete"]:
         kind, text = "incomplete", f"Incomplete: {there:,} of {asked:,} episodes. Sound is what is there: {checked}."
     else:
@@ -271,7 +271,7 @@ def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
         text += f" Incomplete: {there:,} of {asked:,} episodes."
     done = len(facts["results"])
     text += f" {done} of {facts['cells_planned']} benchmark cells run [{facts['profile']['name']}]."
-    text += f" {counted(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
+    text += f" {pluralize(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
     return {"kind": kind, "text": text}
 
 

@@ -17,20 +17,20 @@ from typing import Any
 import torch
 
 from dmcvb_gen.agents.data import default_memory
-from dmcvb_gen.benchmarks.cells import Tick, policy_steps, run_cell, run_pretraining
+from dmcvb_gen.benchmarks.experiments import ProgressCallback, policy_steps, run_cell, run_pretraining
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.setup import Pretraining, Setup, pretraining_of
-from dmcvb_gen.benchmarks.tables import Cell
+from dmcvb_gen.benchmarks.suites import Cell
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_text
-from dmcvb_gen.pool import Needs, Workers, ignore, open_pool
+from dmcvb_gen.parallel import Needs, Workers, ignore, open_pool
 
 TICK_SECONDS = 0.2
 """Progress is told no more often: an Adam step on states takes less than telling of it."""
 
 
 def run_cells(
-    setup: Setup, cells: Sequence[Cell], workers: Workers = 1, tick: Tick = ignore
+    setup: Setup, cells: Sequence[Cell], workers: Workers = 1, tick: ProgressCallback = ignore
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Results of cells as they come; those that need no encoder are run beside the encoders' training.
 
@@ -89,17 +89,19 @@ def share_node(setup: Setup, memory: int | None) -> Setup:
     return dataclasses.replace(setup, memory=memory // 2)
 
 
-def try_cell(setup: Setup, cell: Cell, tick: Tick = ignore) -> dict[str, Any]:
+def try_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[str, Any]:
     """`run_cell`, its errors as a result."""
     return _attempt(run_cell, setup, cell, setup.cells / f"{cell.id}.log", tick)
 
 
-def try_pretraining(setup: Setup, work: Pretraining, tick: Tick = ignore) -> dict[str, Any]:
+def try_pretraining(setup: Setup, work: Pretraining, tick: ProgressCallback = ignore) -> dict[str, Any]:
     """`run_pretraining`, its errors as a result."""
     return _attempt(run_pretraining, setup, work, setup.encoders / f"{work.id}.log", tick)
 
 
-def _attempt(function: Callable, setup: Setup, item: Cell | Pretraining, log: Path, tick: Tick) -> dict[str, Any]:
+def _attempt(
+    function: Callable, setup: Setup, item: Cell | Pretraining, log: Path, tick: ProgressCallback
+) -> dict[str, Any]:
     try:
         with _Pace(tick) as paced:
             result = function(setup, item, paced)
@@ -116,7 +118,7 @@ def _attempt(function: Callable, setup: Setup, item: Cell | Pretraining, log: Pa
 class _Pace:
     """A tick that adds steps up and passes them on a few times a second."""
 
-    def __init__(self, tick: Tick):
+    def __init__(self, tick: ProgressCallback):
         self._tick, self._what, self._steps, self._told = tick, "", 0, time.monotonic()
 
     def __call__(self, what: str, steps: int) -> None:

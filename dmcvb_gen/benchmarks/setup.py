@@ -24,11 +24,11 @@ from dmcvb_gen.agents.dino import dino_digest
 from dmcvb_gen.benchmarks.evaluate import protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.profiles import Profile
-from dmcvb_gen.benchmarks.tables import Cell, Part, slug
+from dmcvb_gen.benchmarks.suites import Cell, Part, slug
+from dmcvb_gen.dataset import Release, open_release
+from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.loaders.painted import DEFAULT_CACHE, PaintedSubset, Painting, painted_release
 from dmcvb_gen.names import ANT_MAZE, family_of
-from dmcvb_gen.readers.painted import DEFAULT_CACHE, PaintedSubset, Painting, painted_release
-from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.writer import subset_digest
 
 RESULT_VERSION = 2
 

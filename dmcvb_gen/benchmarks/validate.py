@@ -17,15 +17,15 @@ from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
 from dmcvb_gen.benchmarks.setup import Setup, open_data
-from dmcvb_gen.benchmarks.tables import FEW_EPISODES, Cell, Missing, plan_benchmark
+from dmcvb_gen.benchmarks.suites import FEW_EPISODES, Cell, Missing, plan_benchmark
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError
+from dmcvb_gen.generate.jobs import video_source
 from dmcvb_gen.names import ANT_MAZE, select
-from dmcvb_gen.pool import Tick, Workers, ignore
-from dmcvb_gen.release.finding import Finding
-from dmcvb_gen.rollout.jobs import video_source
-from dmcvb_gen.store import Release
-from dmcvb_gen.store.remote import local_path
+from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.storage.remote import local_path
 
 STATE_BC_SHARE = 0.9
 """Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
@@ -46,7 +46,7 @@ class Validation:
     structure: Structure
     results: tuple[tuple[Cell, dict[str, Any]], ...]
     missing: tuple[Missing, ...]
-    warnings: tuple[Finding, ...]
+    warnings: tuple[Issue, ...]
     episodes: tuple[int, int]
     report: Path
     facts: Path
@@ -77,7 +77,7 @@ class Progress:
       done: called with each cell and its result.
     """
 
-    checking: Tick = ignore
+    checking: ProgressCallback = ignore
     total: Callable[[int], None] = field(default=lambda steps: None)
     training: Callable[[str, int], None] = field(default=lambda what, steps: None)
     done: Callable[[Cell, dict[str, Any]], None] = field(default=lambda cell, result: None)
@@ -197,18 +197,18 @@ def check_writable(folder: str | Path) -> None:
         raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
 
 
-def _few_warnings(release: Release, cells: Sequence[Cell]) -> list[Finding]:
+def _few_warnings(release: Release, cells: Sequence[Cell]) -> list[Issue]:
     """B2 asks what few expert episodes give; a release that has no more of them does not tell."""
     found = {}
     for part in (part for cell in cells if cell.benchmark == "b2" for part in cell.policy):
         there = len(release[part.subset].episodes)
         if part.episodes == there:
             text = f"b2 learns from {FEW_EPISODES} expert episodes, and {there} are all there are; roll out more"
-            found[part.subset] = Finding("learning", part.subset, text)
+            found[part.subset] = Issue("learning", part.subset, text)
     return list(found.values())
 
 
-def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> list[Finding]:
+def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> list[Issue]:
     """Evaluation shows what no data show (paper, section 5); data that were painted with it do not tell."""
     learned = dict.fromkeys(part.subset for cell in cells if not cell.agent.sees_state for part in cell.policy)
     found = []
@@ -220,11 +220,11 @@ def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | N
                 what, seen = "videos", record.backgrounds.get("digest") == shown
         if seen:
             text = f"painted with the {what} that evaluation shows: its scores are of distractors that were seen"
-            found.append(Finding("learning", record.name, text))
+            found.append(Issue("learning", record.name, text))
     return found
 
 
-def _learning_warnings(setup: Setup, results) -> list[Finding]:
+def _learning_warnings(setup: Setup, results) -> list[Issue]:
     """Expert data that BC on states cannot learn from is odd."""
     found = []
     for cell, result in results:
@@ -241,7 +241,7 @@ def _learning_warnings(setup: Setup, results) -> list[Finding]:
             reached, wanted, what = score["mean"], data["mean"], "a return, the data"
         if reached < STATE_BC_SHARE * wanted:
             message = f"BC(state) reaches {reached:.0f} {what} {wanted:.0f} [{setup.profile.name}]"
-            found.append(Finding("learning", cell.policy[0].subset, message))
+            found.append(Issue("learning", cell.policy[0].subset, message))
     return found
 
 

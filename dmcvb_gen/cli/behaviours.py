@@ -35,12 +35,12 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     """
     import torch
 
-    from dmcvb_gen.behaviours.learning.defaults import parse_settings, run_config
-    from dmcvb_gen.behaviours.learning.runs import read_config
-    from dmcvb_gen.behaviours.learning.training import open_run
-    from dmcvb_gen.behaviours.policies.paper import paper_returns
     from dmcvb_gen.errors import DmcvbError
+    from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.training.defaults import parse_settings, run_config
+    from dmcvb_gen.training.runs import read_config
+    from dmcvb_gen.training.training import open_run
 
     get_task(task)
     folder = out or Path("runs") / task
@@ -88,7 +88,7 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     dmcvb-gen select-checkpoints runs/walker-walk
     dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk --episodes 20
     """
-    from dmcvb_gen.behaviours.learning import selection as module
+    from dmcvb_gen.training import selection as module
 
     picked = module.select_checkpoints(run, episodes, seed, not sample, converged)
     if as_json:
@@ -136,15 +136,15 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
     dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
     dmcvb-gen evaluate-behaviour ant-maze-easy7x7a --level expert --level medium --pictures paths
     """
-    from dmcvb_gen.behaviours.policies.actor import random_policy
-    from dmcvb_gen.behaviours.policies.bundled import bundled_levels, levels_of, resolve_policies
-    from dmcvb_gen.behaviours.policies.evaluation import maze_scores, running_speed, walked_paths
-    from dmcvb_gen.behaviours.policies.paper import paper_returns
-    from dmcvb_gen.behaviours.policies.policy_file import load_policy, read_header
-    from dmcvb_gen.behaviours.policies.simulate import simulate
     from dmcvb_gen.errors import DmcvbError
+    from dmcvb_gen.generate.info import return_statistics
     from dmcvb_gen.names import ANT_MAZE, family_of
-    from dmcvb_gen.rollout.info import return_statistics
+    from dmcvb_gen.policies.actor import random_policy
+    from dmcvb_gen.policies.bundled import bundled_levels, levels_of, resolve_policies
+    from dmcvb_gen.policies.evaluation import maze_scores, running_speed, walked_paths
+    from dmcvb_gen.policies.paper import paper_returns
+    from dmcvb_gen.policies.policy_file import load_policy, read_header
+    from dmcvb_gen.policies.simulate import simulate
     from dmcvb_gen.tasks import get_task, task_ids
     from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
 

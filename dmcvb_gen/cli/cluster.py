@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dmcvb_gen.cli.common import format_duration, json_option, print_json, remote_option
-from dmcvb_gen.pool import Ray, Workers
+from dmcvb_gen.parallel import Ray, Workers
 
 executor_option = click.option(
     "--executor", type=click.Choice(["processes", "ray"]), default="processes", show_default=True, help="Who works."
@@ -21,7 +21,7 @@ ray_option = click.option(
 )
 
 
-def crew(workers: int, executor: str, address: str | None) -> Workers:
+def make_executor(workers: int, executor: str, address: str | None) -> Workers:
     """Who works, as the options say.
 
     Raises:
@@ -129,8 +129,8 @@ def status(place, options, as_json):
     \b
     dmcvb-gen status s3://bucket/mine
     """
-    from dmcvb_gen.rollout.progress import progress_of
-    from dmcvb_gen.rollout.site import site_of
+    from dmcvb_gen.generate.progress import progress_of
+    from dmcvb_gen.generate.site import site_of
 
     found = progress_of(site_of(place, options))
     if as_json:

@@ -8,8 +8,8 @@ import os
 import click
 
 from dmcvb_gen.cli.common import OutPath, ProgressBar, format_bytes, json_option, print_json, remote_option
-from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
 from dmcvb_gen.cli.release import episodes_option, only_option, transfers_option
+from dmcvb_gen.cli.render_options import look_of, look_options, painted_facts, show_painted, tell
 
 
 @click.command()
@@ -53,11 +53,11 @@ def fetch(context, url, only, episodes, painting, size, views, goal, out, option
 
 def _fetch_painted(url, out, only, episodes, look, given, as_json):
     from dmcvb_gen.release.fetch import fetch_and_paint
-    from dmcvb_gen.release.paint import Painter
+    from dmcvb_gen.release.paint import RenderConfig
 
     with (
         ProgressBar(as_json, unit="B", unit_scale=True, desc="fetched") as bytes_bar,
         ProgressBar(as_json, unit=" frames", unit_scale=True, desc="painted") as frames,
     ):
-        painter = Painter(look=look, workers=os.cpu_count() or 1, tick=frames, tell=tell)
+        painter = RenderConfig(look=look, workers=os.cpu_count() or 1, tick=frames, tell=tell)
         return fetch_and_paint(url, out, only, episodes, painter=painter, tick=bytes_bar, **given)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import click
 
-from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
+from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
 from dmcvb_gen.cli.common import OutPath, background_source, json_option, print_json
-from dmcvb_gen.cli.painting import look_of, look_options, painted_facts, show_painted, tell
 from dmcvb_gen.cli.release import episodes_option, frames_bar, only_option, workers_option
+from dmcvb_gen.cli.render_options import look_of, look_options, painted_facts, show_painted, tell
 
 
 @click.command()
@@ -35,12 +35,12 @@ def paint(
     dmcvb-gen rollout walker-walk --level expert --episodes 20 --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
-    from dmcvb_gen.release.paint import Painter, paint_release
+    from dmcvb_gen.release.paint import RenderConfig, paint_release
 
     videos = background_source(backgrounds) if backgrounds else None
-    team = crew(workers, executor, ray_address)
+    executor = make_executor(workers, executor, ray_address)
     with frames_bar(as_json) as bar:
-        painter = Painter(look_of(size, views, goal), team, device, videos, bar, tell)
+        painter = RenderConfig(look_of(size, views, goal), executor, device, videos, bar, tell)
         done = paint_release(path, only, episodes, painter)
     if as_json:
         print_json({"out": path} | painted_facts(done))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
+from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
 from dmcvb_gen.cli.common import (
     OutPath,
     ProgressBar,
@@ -20,8 +20,8 @@ from dmcvb_gen.cli.common import (
     print_json,
     remote_option,
 )
-from dmcvb_gen.cli.unheard import given_options, refuse
-from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS, counted
+from dmcvb_gen.cli.unused_options import given_options, refuse
+from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS, pluralize
 
 
 @click.command()
@@ -47,7 +47,7 @@ def verify(context, path, everything, backgrounds, workers, executor, ray_addres
     """
     from dmcvb_gen.release.verify import verify as run
     from dmcvb_gen.release.verify_url import WORKERS, verify_url
-    from dmcvb_gen.store.remote import is_url
+    from dmcvb_gen.storage.remote import is_url
 
     given = given_options(context)
     if is_url(path):
@@ -57,8 +57,8 @@ def verify(context, path, everything, backgrounds, workers, executor, ray_addres
     else:
         refuse(context, given, ("everything", "options"), f"{path} is no URL, and is read whole")
         with ProgressBar(as_json, unit=" checks") as bar:
-            team = crew(workers or 1, executor, ray_address)
-            result = run(path, backgrounds, bar, team)
+            executor = make_executor(workers or 1, executor, ray_address)
+            result = run(path, backgrounds, bar, executor)
     if as_json:
         findings = [dataclasses.asdict(finding) for finding in result.findings]
         facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
@@ -75,8 +75,8 @@ def _tell_verified(path, result):
         click.echo(f"... and {len(result.findings) - 50} more")
     for name, (here, planned) in result.incomplete.items():
         click.echo(f"{name}: {here:,} of {planned:,} episodes")
-    checked = ", ".join(counted(count, name) for name, count in result.checked.items())
-    verdict = "sound" if result.sound else counted(len(result.findings), "findings")
+    checked = ", ".join(pluralize(count, name) for name, count in result.checked.items())
+    verdict = "sound" if result.sound else pluralize(len(result.findings), "findings")
     if result.incomplete:
         here = result.checked["episodes"]
         planned = here + sum(planned - count for count, planned in result.incomplete.values())
@@ -151,7 +151,7 @@ def regenerate(
     path = path or manifest
     if check and out:
         raise click.UsageError("Give --check or --out, not both.")
-    work = Regeneration(path, only, episodes, backgrounds, device, crew(workers, executor, ray_address))
+    work = Regeneration(path, only, episodes, backgrounds, device, make_executor(workers, executor, ray_address))
     with frames_bar(as_json) as bar:
         outcome = work.remake(out, bar) if out else (work.check if check else work.repair)(bar)
     if as_json:
@@ -171,7 +171,7 @@ def regenerate(
                 click.echo(f"environment: {name} was {there}, is {here}")
             if not outcome.environment:
                 click.echo("environment: the same versions and processor as when the release was made")
-        made = counted(len(outcome.shards), "shards")
+        made = pluralize(len(outcome.shards), "shards")
         left = f"; {outcome.left} more not here" if outcome.left else ""
         nothing = "none of these shards is here" if outcome.left else "nothing is damaged or missing"
         click.echo(f"{out or path}: {made} made again{left}" if outcome.shards else f"{path}: {nothing}")
@@ -208,7 +208,7 @@ def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **o
 
     request = Repainting(path, out, backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
-        manifest = run(request, crew(workers, executor, ray_address), bar)
+        manifest = run(request, make_executor(workers, executor, ray_address), bar)
     if as_json:
         return print_json({"out": out, "complete": manifest.complete, "subsets": [s.name for s in manifest.subsets]})
     for subset in manifest.subsets:
@@ -239,10 +239,10 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
+    from dmcvb_gen.dataset.manifest import MANIFEST
     from dmcvb_gen.release.export.publishing import export_format, publish_export
     from dmcvb_gen.release.publish import publish as run
-    from dmcvb_gen.store.manifest import MANIFEST
-    from dmcvb_gen.store.remote import public
+    from dmcvb_gen.storage.remote import public
 
     exported = not (Path(path) / MANIFEST).exists() and export_format(path) is not None
     if exported and (no_pixels or take_over):
@@ -261,10 +261,10 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
 @contextlib.contextmanager
 def _left_behind(path):
     """A copy (of links) of a release without its pictures, beside it."""
+    from dmcvb_gen.dataset.index import CARD_FILES
     from dmcvb_gen.release.card import README, write_card
     from dmcvb_gen.release.paint import without_pictures
-    from dmcvb_gen.store.index import CARD_FILES
-    from dmcvb_gen.store.remote import storage_errors
+    from dmcvb_gen.storage.remote import storage_errors
 
     folder = Path(path)
     with storage_errors(folder, "write beside"):
@@ -340,9 +340,9 @@ def export(path, to, only, episodes, merge, video, workers, executor, ray_addres
     """
     from dmcvb_gen.release.export import export as run
 
-    team = crew(workers, executor, ray_address)
+    executor = make_executor(workers, executor, ray_address)
     with ProgressBar(as_json, unit=" episodes") as bar:
-        given = dict(merge=merge, video=video, workers=team, storage_options=options, tick=bar)
+        given = dict(merge=merge, video=video, workers=executor, storage_options=options, tick=bar)
         folders = run(path, to, out, only, episodes, **given)
     if as_json:
         return print_json([str(folder) for folder in folders])
@@ -374,7 +374,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
     if as_json:
         return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
     for subset in manifest.subsets:
-        click.echo(f"{subset.name}: {counted(subset.episodes, 'episodes')}")
+        click.echo(f"{subset.name}: {pluralize(subset.episodes, 'episodes')}")
 
 
 @click.command("diff")

@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from dmcvb_gen.cli.cluster import crew, executor_option, parse_bytes, parse_part, ray_option, slurm_script
+from dmcvb_gen.cli.cluster import executor_option, make_executor, parse_bytes, parse_part, ray_option, slurm_script
 from dmcvb_gen.cli.common import (
     OutPath,
     ProgressBar,
@@ -22,7 +22,7 @@ from dmcvb_gen.cli.common import (
     print_json,
     remote_option,
 )
-from dmcvb_gen.cli.unheard import check_maze_options, check_way, given_options, is_given, rewarded
+from dmcvb_gen.cli.unused_options import check_exclusive_options, check_maze_options, given_options, is_given, rewarded
 from dmcvb_gen.names import (
     ANT_MAZE,
     DIFFICULTIES,
@@ -31,11 +31,11 @@ from dmcvb_gen.names import (
     SPLITS,
     DistractorSetting,
     MazeName,
-    counted,
     family_of,
+    pluralize,
     task_folder,
 )
-from dmcvb_gen.store.remote import is_url, public
+from dmcvb_gen.storage.remote import is_url, public
 
 
 def _out_default(name: str) -> str:
@@ -110,12 +110,12 @@ def rollout(
         --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
-    from dmcvb_gen.rollout.estimate import raw_bytes
-    from dmcvb_gen.rollout.plan import describe, finish_site, make_plan, prepare
-    from dmcvb_gen.rollout.site import site_of
+    from dmcvb_gen.generate.estimate import raw_bytes
+    from dmcvb_gen.generate.plan import describe, finish_site, make_plan, prepare
+    from dmcvb_gen.generate.site import site_of
 
-    check_way(context)
-    team = crew(workers, options["executor"], options["ray_address"])
+    check_exclusive_options(context)
+    executor = make_executor(workers, options["executor"], options["ray_address"])
     by_warp = device != "cpu" and not options["recipe"] and not is_given(context, "renderer")
     options["renderer"] = "warp" if by_warp else options["renderer"]
     chosen = _recipe(context, options, going_on=bool(out))
@@ -137,13 +137,13 @@ def rollout(
     plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
     if init:
         return _tell_begun(plan, as_json)
-    _run(plan, team, as_json, whole=not part)
+    _run(plan, executor, as_json, whole=not part)
 
 
 def _tell_begun(plan, as_json):
     if as_json:
         return print_json({"out": plan.site.place, "jobs": len(plan.jobs), "already_done": plan.done})
-    click.echo(f"{plan.site.place}: begun, {counted(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N")
+    click.echo(f"{plan.site.place}: begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N")
 
 
 def _finish(site, finish_site, as_json):
@@ -152,7 +152,7 @@ def _finish(site, finish_site, as_json):
     if as_json:
         print_json({"out": site.place, "complete": manifest.complete, "incomplete": missing})
     elif missing:
-        lacking = counted(len(missing), "subsets")
+        lacking = pluralize(len(missing), "subsets")
         click.echo(f"{site.place}: not complete; shards are missing in {lacking}, e.g. {missing[0]}")
     else:
         click.echo(f"{site.place}: complete")
@@ -160,8 +160,8 @@ def _finish(site, finish_site, as_json):
 
 
 def _run(plan, workers, as_json, whole=True):
-    from dmcvb_gen.rollout.executors import run_jobs
-    from dmcvb_gen.rollout.plan import finish
+    from dmcvb_gen.generate.executors import run_jobs
+    from dmcvb_gen.generate.plan import finish
 
     started, steps, seconds = time.time(), 0, {}
     with _told_when_stopped(), _progress(plan, as_json) as bar:
@@ -190,7 +190,7 @@ def _run(plan, workers, as_json, whole=True):
     state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
     if not whole:
         state = "finished with --finish when all parts are there"
-    kept = f", {counted(plan.done, 'shards')} there already" if plan.done else ""
+    kept = f", {pluralize(plan.done, 'shards')} there already" if plan.done else ""
     rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
     click.echo(f"{place}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
     named = shlex.quote(str(place))
@@ -214,7 +214,7 @@ def parse_range(text: str | None) -> tuple[int, int] | None:
 
 def _recipe(context, options, going_on):
     """The recipe that a command line asks for; None where a release is to go on from its manifest."""
-    from dmcvb_gen.rollout.recipe import check_heard, load_recipe
+    from dmcvb_gen.generate.recipe import check_heard, load_recipe
 
     given = given_options(context)
     tasks = (*options["tasks"], *(_layout_task(layout) for layout in options["layouts"]))
@@ -241,7 +241,7 @@ NOT_WITH_RECIPE = {
 
 def _changed_recipe(recipe, tasks, options, given):
     """A recipe, narrowed and overridden by the options that were given beside it; none goes unheard."""
-    from dmcvb_gen.rollout.recipe import narrow, override
+    from dmcvb_gen.generate.recipe import narrow, override
 
     for name, cure in NOT_WITH_RECIPE.items():
         if name in given:
@@ -280,7 +280,7 @@ def _translated(options):
 
 
 def _recipe_from_options(tasks, options, given):
-    from dmcvb_gen.rollout.recipe import single_recipe
+    from dmcvb_gen.generate.recipe import single_recipe
 
     levels = options["levels"] or ("random",)
     if len({family_of(task) for task in tasks}) > 1:
@@ -338,7 +338,7 @@ def _told_when_stopped():
 
 
 def _measured(plan, workers, as_json):
-    from dmcvb_gen.rollout.estimate import estimate, measurements
+    from dmcvb_gen.generate.estimate import estimate, measurements
 
     with ProgressBar(as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
         return estimate(plan, workers, bar.update)
@@ -392,7 +392,7 @@ def _show_plan(plan, cost, workers, as_json):
     console.print(table)
     spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
     console.print(
-        f"{counted(cost.jobs, 'jobs')} to do, {counted(cost.done, 'shards')} done; "
+        f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; "
         f"{cost.steps:,} steps, {format_bytes(cost.bytes)}, "
         f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
         f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64."
@@ -409,7 +409,7 @@ def info(path, options, as_json):
     \b
     dmcvb-gen info releases/demo
     """
-    from dmcvb_gen.rollout.info import describe_release
+    from dmcvb_gen.generate.info import describe_release
 
     facts = describe_release(path, options)
     if as_json:
@@ -460,7 +460,7 @@ def preview(path, only, out, as_json, **options):
     \b
     dmcvb-gen preview releases/demo
     """
-    from dmcvb_gen.rollout.preview import write_preview
+    from dmcvb_gen.generate.preview import write_preview
 
     files = write_preview(path, out, only=only, **options)
     if as_json:
@@ -475,7 +475,7 @@ def preview(path, only, out, as_json, **options):
 @json_option
 def list_command(remote, options, as_json):
     """List tasks, levels, distractors, bundled behaviours, recipes and the renderers usable here."""
-    from dmcvb_gen.rollout.info import describe_package
+    from dmcvb_gen.generate.info import describe_package
 
     if remote:
         return _list_remote(remote, options, as_json)
@@ -506,7 +506,7 @@ def list_command(remote, options, as_json):
 
 
 def _list_remote(url, options, as_json) -> None:
-    from dmcvb_gen.store.catalog import releases_at
+    from dmcvb_gen.dataset.catalog import releases_at
 
     found = releases_at(url, options)
     if as_json:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.cluster import crew, executor_option, ray_option
+from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
 from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
-from dmcvb_gen.cli.unheard import given_options, refuse
-from dmcvb_gen.names import counted
+from dmcvb_gen.cli.unused_options import given_options, refuse
+from dmcvb_gen.names import pluralize
 
 TRAINING = (
     *("benchmarks", "agents", "profile", "scale", "seed"),
@@ -68,8 +68,8 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
         if not torch.cuda.is_available():
             raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
     workers, memory, weights = options.pop("workers"), options.pop("memory"), options.pop("dino_weights")
-    team = crew(workers, options.pop("executor"), options.pop("ray_address"))
-    threads = default_threads(workers) if isinstance(team, int) else 1  # of a task on a cluster
+    executor = make_executor(workers, options.pop("executor"), options.pop("ray_address"))
+    threads = default_threads(workers) if isinstance(executor, int) else 1  # of a task on a cluster
     train_unsound = options.pop("train_unsound")
     setup = Setup(
         root=str(path),
@@ -92,7 +92,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
             benchmarks=() if checks_only else benchmarks or ("b1",),
             agents=split_agents(agents),
             patterns=only,
-            workers=team,
+            workers=executor,
             train_unsound=train_unsound,
             progress=progress,
         )
@@ -137,9 +137,9 @@ def _show(result, profile) -> None:
             click.echo(f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}")
         if entry.left_out:
             click.echo(f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}")
-    checked = ", ".join(counted(count, name) for name, count in result.structure.checked.items())
+    checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
-    verdict = ["sound" if result.sound else counted(found, "findings")]
+    verdict = ["sound" if result.sound else pluralize(found, "findings")]
     if not result.complete:
         there, asked = result.episodes
         verdict = [
@@ -168,7 +168,7 @@ def questions(reports, as_json):
     """
     from dataclasses import asdict
 
-    from dmcvb_gen.benchmarks.questions import QUESTIONS, ask, pool, read_reports
+    from dmcvb_gen.benchmarks.claims import QUESTIONS, ask, pool, read_reports
 
     results = read_reports(reports)
     answers, pooled = ask(results), pool(results)

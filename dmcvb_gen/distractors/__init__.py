@@ -1,6 +1,6 @@
 """Distractors: what varies in the picture and nowhere else.
 
-`make_exogenous` expands a setting into per-frame labels, from random streams that physics never touches.
+`sample_distractors` expands a setting into per-frame labels, from random streams that physics never touches.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors.background import background_walk
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
 from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, floor_alpha_for
 from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at, nominal_target
 from dmcvb_gen.distractors.color import color_walk
-from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
 
 
-class ExogenousWalk:
+class DistractorSampler:
     """An episode batch's distractors, drawn ahead of the trajectory.
 
     The random walks need only the streams; where the agent is comes in frame by frame (`frame`) when
@@ -63,7 +63,7 @@ class ExogenousWalk:
         self._quaternion = quaternions(look_at(self._offset - nominal_target(offset, nominal), roll))
         self._video, self._index = background_walk(backgrounds.lengths, setting, frames, generators["background"])
 
-    def frame(self, frame: int, physics: np.ndarray) -> Exogenous:
+    def frame(self, frame: int, physics: np.ndarray) -> DistractorState:
         """Labels of one frame of all episodes, leading shape (episode,).
 
         Args:
@@ -71,7 +71,7 @@ class ExogenousWalk:
         """
         return self._labels(physics, slice(None), frame)
 
-    def whole(self, physics: np.ndarray) -> Exogenous:
+    def whole(self, physics: np.ndarray) -> DistractorState:
         """Labels of whole episodes, leading shape (episode, frame).
 
         Args:
@@ -79,7 +79,7 @@ class ExogenousWalk:
         """
         return self._labels(physics, slice(None), slice(physics.shape[1]))
 
-    def _labels(self, physics, episodes, frames) -> Exogenous:
+    def _labels(self, physics, episodes, frames) -> DistractorState:
         lead = physics.shape[:-1]
         flat = physics.reshape(-1, physics.shape[-1])
         if self._offset is None:
@@ -89,7 +89,7 @@ class ExogenousWalk:
             agent = centers_of_mass(self.task, flat).reshape(*lead, 3)
             position = (agent + self._offset[episodes, frames])[..., None, :]
             quaternion = self._quaternion[episodes, frames][..., None, :]
-        return Exogenous(
+        return DistractorState(
             camera_position=position.astype(np.float32),
             camera_quaternion=quaternion.astype(np.float32),
             material_rgb=self._colors[episodes, frames].astype(np.float32),
@@ -103,14 +103,14 @@ def _draw(rng: np.random.Generator, choices: Sequence[int]) -> int:
     return choices[int(rng.integers(len(choices)))]
 
 
-def make_exogenous(
+def sample_distractors(
     task: Task,
     setting: DistractorSetting,
     physics: np.ndarray,
     generators: Mapping[str, Sequence[np.random.Generator]],
     backgrounds: Backgrounds | None = None,
     split: str = "train",
-) -> Exogenous:
+) -> DistractorState:
     """Per-frame labels of whole episodes (Distracting Control Suite; DMC-VB, section 3.1).
 
     Args:
@@ -123,7 +123,7 @@ def make_exogenous(
       Labels with leading shape (episode, frame); an episode's labels depend on its own streams and states only,
       and a longer episode begins with the labels of a shorter one.
     """
-    return ExogenousWalk(task, setting, physics.shape[1], generators, backgrounds, split).whole(physics)
+    return DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split).whole(physics)
 
 
 __all__ = [
@@ -131,8 +131,8 @@ __all__ = [
     "SCALES",
     "Backgrounds",
     "DistractorSetting",
-    "ExogenousWalk",
+    "DistractorSampler",
     "floor_alpha_for",
     "load_backgrounds",
-    "make_exogenous",
+    "sample_distractors",
 ]

@@ -21,7 +21,7 @@ from dmcvb_gen.distractors.textures import FLOORS, surroundings, texture
 from dmcvb_gen.errors import BackgroundError
 from dmcvb_gen.files import replacing, write_text
 from dmcvb_gen.names import SPLITS
-from dmcvb_gen.store.remote import local_path
+from dmcvb_gen.storage.remote import local_path
 
 GENERATOR = 2
 """Version of what a seed means; clips of another version or seed are not mixed."""

@@ -15,25 +15,25 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from dmcvb_gen.behaviours.policies.header import origin_of
-from dmcvb_gen.behaviours.policies.paper import paper_returns
+from dmcvb_gen.dataset import Release, open_release
+from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
+from dmcvb_gen.dataset.manifest import Manifest
+from dmcvb_gen.dataset.schema import stored_name
 from dmcvb_gen.distractors import background, camera, color
 from dmcvb_gen.distractors.base import DistractorSetting
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import remove_partial, replacing, write_text
-from dmcvb_gen.names import ANT_MAZE, FIXED, counted, distractor_of
-from dmcvb_gen.readers.painted import Painting, painted_release
+from dmcvb_gen.generate.info import describe_release
+from dmcvb_gen.generate.preview import contact_sheet
+from dmcvb_gen.loaders.painted import Painting, painted_release
+from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of, pluralize
+from dmcvb_gen.policies.header import origin_of
+from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
-from dmcvb_gen.rollout.info import describe_release
-from dmcvb_gen.rollout.preview import contact_sheet
-from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.index import CARD_FOLDER, take_in_card
-from dmcvb_gen.store.manifest import Manifest
-from dmcvb_gen.store.remote import local_path
-from dmcvb_gen.store.schema import stored_name
+from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
@@ -219,8 +219,8 @@ def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
         held += "makes the pictures"
     text = (
         f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with {held}: "
-        f"{counted(len(facts['subsets']), 'subsets')}, "
-        f"{counted(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
+        f"{pluralize(len(facts['subsets']), 'subsets')}, "
+        f"{pluralize(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
     )
     return text.strip()
 

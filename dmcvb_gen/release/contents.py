@@ -10,15 +10,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
-from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.generate.jobs import video_source
+from dmcvb_gen.generate.painting import renderer_for
 from dmcvb_gen.release.import_tfds import imported_specs
-from dmcvb_gen.rollout.jobs import video_source
-from dmcvb_gen.rollout.painting import renderer_for
-from dmcvb_gen.store import Subset
-from dmcvb_gen.store.pictures import picture_of
-from dmcvb_gen.store.schema import EpisodeShape, subset_specs
+from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
@@ -29,7 +29,7 @@ PIXEL_TOLERANCE = 2.0
 """Mean absolute difference of a repainted frame, grey levels of 255; on the same machine it is 0."""
 
 
-def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[Finding]:
+def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
     """All that can be checked of a subset.
 
     Args:
@@ -51,56 +51,56 @@ def _sample(count: int, wanted: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
 
 
-def check_values(subset: Subset) -> Iterator[Finding]:
+def check_values(subset: Subset) -> Iterator[Issue]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
     episodes = subset.episodes
     specs = subset_specs(EpisodeShape.of(task), subset.record)
     for spec in imported_specs(subset.record) if subset.record.imported else specs:
         if spec.name not in subset.arrays:
-            yield Finding("shapes", subset.name, f"array {spec.name} is missing")
+            yield Issue("shapes", subset.name, f"array {spec.name} is missing")
             return
         array = subset.array(spec.name)
         rows = (subset.record.max_steps + 1,) if spec.steps else ()
         wanted = (subset.record.episodes, *rows, *spec.shape)
         if array.shape != wanted or array.dtype != np.dtype(spec.dtype):
-            yield Finding("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
+            yield Issue("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
             return
     seen: dict[bytes, int] = {}
     for episode, length in zip(map(int, episodes), map(int, subset.lengths), strict=True):
         if not 0 < length <= subset.record.max_steps:
-            yield Finding("lengths", subset.name, f"length {length} is not in 1..{subset.record.max_steps}", episode)
+            yield Issue("lengths", subset.name, f"length {length} is not in 1..{subset.record.max_steps}", episode)
             continue
         names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
         values = subset.episode(episode, [*names, "return", "terminated"])
         for name in names:
             bad = ~np.isfinite(values[name].reshape(len(values[name]), -1)).all(axis=1)
             if bad.any():
-                yield Finding("finite", subset.name, f"{name} is not finite", episode, int(bad.argmax()))
+                yield Issue("finite", subset.name, f"{name} is not finite", episode, int(bad.argmax()))
         if np.abs(values["action"]).max() > 1:
             step = int(np.abs(values["action"]).max(axis=1).argmax())
-            yield Finding("actions", subset.name, "an action is outside [-1, 1]", episode, step)
+            yield Issue("actions", subset.name, "an action is outside [-1, 1]", episode, step)
         total = float(values["reward"].astype(np.float64).sum())
         if not abs(total - float(values["return"])) <= 1e-6 * max(1.0, abs(total)):
-            yield Finding(
+            yield Issue(
                 "returns", subset.name, f"rewards sum to {total:.4f}, return is {values['return']:.4f}", episode
             )
         longer = max(1, subset.record.max_steps / task.max_steps)
         low, high = (longer * bound for bound in task.return_range)
         if not low <= total <= high:
-            yield Finding("returns", subset.name, f"return {total:.2f} is outside {low:g}..{high:g}", episode)
+            yield Issue("returns", subset.name, f"return {total:.2f} is outside {low:g}..{high:g}", episode)
         if (
             bool(values["terminated"]) != (values["discount"][-1] == 0)
             or (length < subset.record.max_steps) > values["terminated"]
         ):
-            yield Finding("lengths", subset.name, "length, discount and terminated do not agree", episode)
+            yield Issue("lengths", subset.name, "length, discount and terminated do not agree", episode)
         key = values["action"].tobytes()
         if key in seen:
-            yield Finding("duplicates", subset.name, f"has the actions of episode {seen[key]}", episode)
+            yield Issue("duplicates", subset.name, f"has the actions of episode {seen[key]}", episode)
         seen[key] = episode
 
 
-def check_physics(subset: Subset) -> Iterator[Finding]:
+def check_physics(subset: Subset) -> Iterator[Issue]:
     """Sampled steps simulated again: state, reward and next physics state are the stored ones."""
     task = get_task(subset.task)
     known = np.ones(task.state_size, bool)
@@ -116,13 +116,13 @@ def check_physics(subset: Subset) -> Iterator[Finding]:
             for row, step in enumerate(steps):
                 gap = np.abs(state[row] - values["state"][step])[known].max()
                 if not gap <= STATE_TOLERANCE:
-                    yield Finding("states", subset.name, f"physics gives a state {gap:.3g} away", episode, int(step))
+                    yield Issue("states", subset.name, f"physics gives a state {gap:.3g} away", episode, int(step))
             result = batch.step(values["action"][steps])
             after = batch.set_physics(values["physics"][steps + 1])
             for row, step in enumerate(steps):
                 gap = abs(result.reward[row] - values["reward"][step])
                 if not gap <= REWARD_TOLERANCE:
-                    yield Finding(
+                    yield Issue(
                         "rewards",
                         subset.name,
                         f"reward is {values['reward'][step]:.5f}, the physics gives {result.reward[row]:.5f}",
@@ -131,10 +131,10 @@ def check_physics(subset: Subset) -> Iterator[Finding]:
                     )
                 gap = np.abs(result.state[row] - after[row])[known].max()
                 if not gap <= STATE_TOLERANCE * 10:
-                    yield Finding("physics", subset.name, f"the action leads {gap:.3g} away", episode, int(step))
+                    yield Issue("physics", subset.name, f"the action leads {gap:.3g} away", episode, int(step))
 
 
-def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Finding]:
+def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
     """Sampled frames painted again from physics and labels; frames that are black or never change."""
     recorded = subset.record.backgrounds
     source = video_source(subset.root, subset.record, backgrounds)
@@ -142,7 +142,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
     if recorded:
         digest = load_backgrounds(source, split).digest
         if digest != recorded["digest"]:
-            yield Finding(
+            yield Issue(
                 "pixels", subset.name, f"backgrounds {source!r} are not those of the manifest; give --backgrounds"
             )
             return
@@ -153,7 +153,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
             episode, length = int(subset.episodes[index]), int(subset.lengths[index])
             values = subset.episode(episode)
             steps = _sample(length + 1, SAMPLE_FRAMES)
-            labels = Exogenous(**{name: values[f"exogenous/{name}"] for name in EXOGENOUS_NAMES})
+            labels = DistractorState(**{name: values[f"exogenous/{name}"] for name in DISTRACTOR_STATE_NAMES})
             for name in subset.pixel_arrays:
                 stored = values[name][steps]
                 view, hidden = picture_of(name) or (name, False)
@@ -161,10 +161,10 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Fin
                 gaps = np.abs(painted.astype(int) - stored).reshape(len(steps), -1).mean(axis=1)
                 for step, gap in zip(steps, gaps, strict=True):
                     if gap > PIXEL_TOLERANCE:
-                        yield Finding("pixels", subset.name, f"{name} is {gap:.1f} grey levels off", episode, int(step))
+                        yield Issue("pixels", subset.name, f"{name} is {gap:.1f} grey levels off", episode, int(step))
                 if stored.max() == 0:
-                    yield Finding("pixels", subset.name, f"{name} is black", episode)
+                    yield Issue("pixels", subset.name, f"{name} is black", episode)
                 elif (stored == stored[:1]).all() and len(steps) > 1:
-                    yield Finding("pixels", subset.name, f"{name} never changes", episode)
+                    yield Issue("pixels", subset.name, f"{name} never changes", episode)
     finally:
         renderer.close()

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
+from dmcvb_gen.dataset.writer import sha256_file, subset_path
 from dmcvb_gen.release.episode_table import COLUMNS, PICTURE, TABLE
 from dmcvb_gen.release.hub import on_the_hub, parse_hub_url
-from dmcvb_gen.store import Release
-from dmcvb_gen.store.manifest import MANIFEST, Manifest
-from dmcvb_gen.store.remote import public
-from dmcvb_gen.store.writer import sha256_file, subset_path
+from dmcvb_gen.storage.remote import public
 
 LICENSES = {
     "CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/",

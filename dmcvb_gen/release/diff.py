@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.names import counted
-from dmcvb_gen.store import Release, Subset, open_release
-from dmcvb_gen.store.manifest import CommitRecord, SubsetRecord, subset_path
+from dmcvb_gen.dataset import Release, Subset, open_release
+from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, subset_path
+from dmcvb_gen.names import pluralize
 
 SHOWN = 5
 """Shards named of a subset before the rest is counted."""
@@ -92,7 +92,7 @@ def _shards(one: Subset, other: Subset) -> list[Difference]:
 
 def _spans(spans: Sequence[tuple[int, int]]) -> str:
     named = ", ".join(f"{first}:{last}" for first, last in spans[:SHOWN])
-    return named + (f" and {counted(len(spans) - SHOWN, 'shards')} more" if len(spans) > SHOWN else "")
+    return named + (f" and {pluralize(len(spans) - SHOWN, 'shards')} more" if len(spans) > SHOWN else "")
 
 
 def _digests(commit: CommitRecord) -> dict[str, str]:

@@ -17,13 +17,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
+from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.index import CARD_FOLDER
+from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.rollout.jobs import background_source
-from dmcvb_gen.rollout.painting import renderer_for
-from dmcvb_gen.store import Release, Subset
-from dmcvb_gen.store.index import CARD_FOLDER
-from dmcvb_gen.store.pictures import Pictures, shown, training_pictures
+from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.generate.painting import renderer_for
 
 TABLE = f"{CARD_FOLDER}/episodes.parquet"
 CONFIG = "episodes"
@@ -167,7 +167,9 @@ def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
     renderer, _ = renderer_for(subset.record, background_source(Path(subset.root), subset.record))
     try:
         physics = subset.read("physics", episodes)[:, 0]
-        labels = Exogenous(**{name: subset.read(f"exogenous/{name}", episodes)[:, 0] for name in EXOGENOUS_NAMES})
+        labels = DistractorState(
+            **{name: subset.read(f"exogenous/{name}", episodes)[:, 0] for name in DISTRACTOR_STATE_NAMES}
+        )
         yield from renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]
     finally:
         renderer.close()

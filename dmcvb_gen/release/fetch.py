@@ -19,12 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
-from dmcvb_gen.errors import StoreError
-from dmcvb_gen.pool import Tick, expect, ignore
-from dmcvb_gen.release.hub import on_the_hub
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.index import CARD_FILES, CARD_FOLDER, INDEX, Index, is_card, parse_index, write_release
-from dmcvb_gen.store.manifest import (
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.index import CARD_FILES, CARD_FOLDER, INDEX, Index, is_card, parse_index, write_release
+from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     CommitRecord,
     FileRecord,
@@ -37,10 +34,13 @@ from dmcvb_gen.store.manifest import (
     shard_count,
     subset_path,
 )
-from dmcvb_gen.store.remote import file_system, local_path, public, storage_errors
-from dmcvb_gen.store.shards import ShardKey, chosen_shards
-from dmcvb_gen.store.transfer import download, in_parallel, protocol, read_object, retry
-from dmcvb_gen.store.writer import LOCK, finish_release, mark_created, only_writer, read_commits
+from dmcvb_gen.dataset.shards import ShardKey, chosen_shards
+from dmcvb_gen.dataset.transfer import download, in_parallel, protocol, read_object, retry
+from dmcvb_gen.dataset.writer import LOCK, finish_release, mark_created, read_commits, write_lock
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.release.hub import on_the_hub
+from dmcvb_gen.storage.remote import file_system, local_path, public, storage_errors
 
 AHEAD = 64
 """Shards of a Hugging Face repository that are asked for at once."""
@@ -63,7 +63,7 @@ def fetch(
     *,
     options: dict[str, Any] | None = None,
     workers: int = 8,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
 ) -> Moved:
     """Bring a published release, or the shards of it that hold some episodes; run again, it goes on or adds.
 
@@ -78,7 +78,7 @@ def fetch(
         there is no room; access is refused.
     """
     folder, source = local_path(out), Source.find(url, options)
-    with Arrival.at(folder, source, only, episodes, workers, tick) as arrival:
+    with Download.at(folder, source, only, episodes, workers, tick) as arrival:
         moved = arrival.bring()
         arrival.finish()
     return moved
@@ -93,25 +93,25 @@ def fetch_and_paint(
     painter: Any,
     options: dict[str, Any] | None = None,
     workers: int = 8,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
 ) -> tuple[Moved, Any]:
     """`fetch`, and paint the pictures that travelled without; a shard is painted while the next ones come.
 
     Args:
-      painter: a `release.paint.Painter`.
+      painter: a `release.paint.RenderConfig`.
 
     Returns:
-      What was moved, and a `release.paint.Painted`.
+      What was moved, and a `release.paint.RenderResult`.
 
     Raises:
       DmcvbError: as `fetch` and `release.paint.paint_release` do; what has come and was painted stays.
     """
-    from dmcvb_gen.release.paint import Studio  # who only fetches has no simulator
+    from dmcvb_gen.release.paint import RenderSession  # who only fetches has no simulator
 
     folder, source = local_path(out), Source.find(url, options)
-    with Arrival.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
+    with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
         names, painted = {name for name, _ in arrival.shards}, arrival.painted
-        studio = Studio.open(open_release(folder), names, painter, arrival.unpainted, painted)
+        studio = RenderSession.open(open_release(folder), names, painter, arrival.unpainted, painted)
         studio.expect(arrival.unpainted_commits)
         arrived: queue.SimpleQueue = queue.SimpleQueue()
         bringing = threading.Thread(target=_bring, args=(arrival, arrived), name="fetch")
@@ -125,7 +125,7 @@ def fetch_and_paint(
     return arrival.moved, studio.report(manifest, found)
 
 
-def _bring(arrival: Arrival, arrived: queue.SimpleQueue) -> None:
+def _bring(arrival: Download, arrived: queue.SimpleQueue) -> None:
     """Tell of each shard that has come without pictures, then of the end, or of what went wrong."""
     try:
         arrival.bring(arrived.put)
@@ -207,7 +207,7 @@ class Source:
         ]
 
 
-class Arrival:
+class Download:
     """Shards of a published release on their way to a folder.
 
     Attributes:
@@ -218,7 +218,9 @@ class Arrival:
       stop: set to have no more files asked for.
     """
 
-    def __init__(self, out: Path, source: Source, shards: dict[ShardKey, SubsetRecord], workers: int, tick: Tick):
+    def __init__(
+        self, out: Path, source: Source, shards: dict[ShardKey, SubsetRecord], workers: int, tick: ProgressCallback
+    ):
         self.out, self.source, self.shards, self._workers, self._tick = out, source, shards, workers, tick
         self.stop, self.moved = threading.Event(), Moved(0, 0, 0)
         listed = [source.listed(commit_path(*key)) for key in shards]
@@ -237,9 +239,9 @@ class Arrival:
         only: Sequence[str],
         episodes: tuple[int, int] | None,
         workers: int,
-        tick: Tick,
+        tick: ProgressCallback,
         with_pictures: bool = False,
-    ) -> Iterator[Arrival]:
+    ) -> Iterator[Download]:
         """An arrival whose folder is locked and has the metadata and a manifest that says that it is a part.
 
         Args:
@@ -252,7 +254,7 @@ class Arrival:
         arrival = cls(out, source, shards, workers, tick)
         with storage_errors(out, "write to"):
             out.mkdir(parents=True, exist_ok=True)
-            with only_writer(out):
+            with write_lock(out):
                 arrival._keep_painted()
                 arrival._check_room(with_pictures)
                 coming = [file for _, commit in arrival.commits.values() for file in commit.files]

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
+from dmcvb_gen.dataset.append import is_grown_from
+from dmcvb_gen.dataset.index import INDEX, Index, is_card, is_replaced, keeps, parse_index
+from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord, Manifest, parse_manifest, subset_path
+from dmcvb_gen.dataset.shards import ShardKey
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, sha256_file
-from dmcvb_gen.pool import Tick, expect, ignore
-from dmcvb_gen.store.growth import is_grown_from
-from dmcvb_gen.store.index import INDEX, Index, is_card, is_replaced, keeps, parse_index
-from dmcvb_gen.store.manifest import MANIFEST, FileRecord, Manifest, parse_manifest, subset_path
-from dmcvb_gen.store.remote import is_refusal, reason, refused, storage_errors
-from dmcvb_gen.store.shards import ShardKey
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.storage.remote import is_refusal, reason, refused, storage_errors
 
 BATCH = 90
 """Files a commit: the Hub asks for fewer than 100."""
@@ -80,7 +80,9 @@ def newest_of(url: str) -> tuple[str, str]:
     return repository, folder
 
 
-def publish_to_hub(root: Path, manifest: Manifest, index: Index, url: str, tick: Tick = ignore, api=None) -> int:
+def publish_to_hub(
+    root: Path, manifest: Manifest, index: Index, url: str, tick: ProgressCallback = ignore, api=None
+) -> int:
     """Put a release into a data set repository (made if it is not there), and tag it; gives how many files were moved.
 
     Args:

@@ -18,19 +18,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
-from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
-from dmcvb_gen.pool import Tick, expect, ignore
-from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
-from dmcvb_gen.release.tfrecord import offsets, read_example
-from dmcvb_gen.rendering.base import MAX_SIZE
-from dmcvb_gen.rollout.recipe import DEFAULT_EPISODES_PER_SHARD
-from dmcvb_gen.store.manifest import IMPORTED, MANIFEST, Manifest, SubsetRecord, environment, local_manifest
-from dmcvb_gen.store.pictures import picture_arrays, picture_of
-from dmcvb_gen.store.remote import local_path
-from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
-from dmcvb_gen.store.writer import (
+from dmcvb_gen.dataset.manifest import IMPORTED, MANIFEST, Manifest, SubsetRecord, environment, local_manifest
+from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
+from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, array_specs
+from dmcvb_gen.dataset.writer import (
     create_subset,
     finish_release,
     read_commits,
@@ -39,6 +30,15 @@ from dmcvb_gen.store.writer import (
     start_release,
     write_shard,
 )
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
+from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD
+from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
+from dmcvb_gen.release.tfrecord import offsets, read_example
+from dmcvb_gen.rendering.base import MAX_SIZE
+from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -78,7 +78,7 @@ def import_tfds(
     setting: str | None = None,
     name: str = "dmc-vb-original",
     partial: bool = False,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
 ) -> Manifest:
     """Import subsets, of locomotion and of mazes; run again, it goes on where it stopped.
 
@@ -287,7 +287,7 @@ def _episodes_to_come(record: SubsetRecord, out: Path) -> int:
     return record.episodes - sum(commit.episode_count for commit in read_commits(out, record).values())
 
 
-def _import_subset(source: _Source, out: Path, tick: Tick) -> None:
+def _import_subset(source: _Source, out: Path, tick: ProgressCallback) -> None:
     record = source.record
     task = get_task(record.task)
     rows = record.max_steps + 1

@@ -19,20 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.files import copy_file, sha256_file, write_json
-from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
-from dmcvb_gen.pool import Tick, Workers, expect, ignore, open_pool
-from dmcvb_gen.release.regenerate import environment_difference
-from dmcvb_gen.release.shards import damage, read_commit
-from dmcvb_gen.rollout.jobs import background_source
-from dmcvb_gen.rollout.painting import frame_count, paint, renderers
-from dmcvb_gen.rollout.plan import painting_facts, subset_attributes
-from dmcvb_gen.rollout.recipe import check_size
-from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.index import INDEX, ZARR_JSON, refuse_altered_folder
-from dmcvb_gen.store.manifest import (
+from dmcvb_gen.dataset import Release, open_release
+from dmcvb_gen.dataset.index import INDEX, ZARR_JSON, refuse_altered_folder
+from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     CommitRecord,
     Manifest,
@@ -41,12 +30,23 @@ from dmcvb_gen.store.manifest import (
     environment,
     write_json_atomically,
 )
-from dmcvb_gen.store.pictures import Pictures, picture_of, stored_pictures
-from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.remote import local_path, storage_errors
-from dmcvb_gen.store.schema import EpisodeShape, subset_specs
-from dmcvb_gen.store.shards import ShardKey, chosen_shards
-from dmcvb_gen.store.writer import add_arrays, finish_release, finish_together, only_writer, write_pictures
+from dmcvb_gen.dataset.pictures import Pictures, picture_of, stored_pictures
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
+from dmcvb_gen.dataset.shards import ShardKey, chosen_shards
+from dmcvb_gen.dataset.writer import add_arrays, finish_release, finish_together, write_lock, write_pictures
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.files import copy_file, sha256_file, write_json
+from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.generate.painting import frame_count, paint, renderers
+from dmcvb_gen.generate.plan import painting_facts, subset_attributes
+from dmcvb_gen.generate.recipe import check_size
+from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
+from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.release.regenerate import environment_diff
+from dmcvb_gen.release.shards import damage, read_commit
+from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 
 ABOUT_THE_PLACE = ("device",)
@@ -91,7 +91,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Painter:
+class RenderConfig:
     """Who paints, and how.
 
     Attributes:
@@ -107,7 +107,7 @@ class Painter:
     workers: Workers = 1
     device: str = "cpu"
     backgrounds: str | None = None
-    tick: Tick = ignore
+    tick: ProgressCallback = ignore
     tell: Callable[[str], None] = field(default=ignore)
 
 
@@ -131,7 +131,7 @@ class PaintShard:
 
 
 @dataclass(frozen=True)
-class Painted:
+class RenderResult:
     """What painting gave.
 
     Attributes:
@@ -153,8 +153,8 @@ def paint_release(
     root: str | Path,
     only: Sequence[str] = (),
     episodes: tuple[int, int] | None = None,
-    painter: Painter | None = None,
-) -> Painted:
+    painter: RenderConfig | None = None,
+) -> RenderResult:
     """Fill in the pictures of a release; what is painted already is left alone, so run again it goes on.
 
     Args:
@@ -167,13 +167,13 @@ def paint_release(
       DmcvbError: nothing fits, a shard is damaged, the videos are not those of the manifest, pictures of another look
         are there already, or the disk is full.
     """
-    root, painter = Path(root), painter or Painter()
+    root, painter = Path(root), painter or RenderConfig()
     open_release(root)  # or says what is wrong with it
-    with storage_errors(root, "write to"), only_writer(root, wait=60):
+    with storage_errors(root, "write to"), write_lock(root, wait=60):
         release = open_release(root)
         shards = [key for key in chosen_shards(release.manifest, only, episodes) if key[0] in release.subsets]
         todo = [key for key in shards if (c := release[key[0]].commits.get(key[1])) and not c.painted]
-        studio = Studio.open(release, {name for name, _ in shards}, painter, needed={name for name, _ in todo})
+        studio = RenderSession.open(release, {name for name, _ in shards}, painter, needed={name for name, _ in todo})
         studio.expect([release[name].commits[shard] for name, shard in todo])
     waiting: queue.SimpleQueue = queue.SimpleQueue()
     for key in [*todo, None]:
@@ -185,27 +185,27 @@ def paint_release(
 
 
 @dataclass(frozen=True)
-class Studio:
+class RenderSession:
     """A release's folder that is ready to be painted in: its manifest says which pictures, and its arrays are there.
 
     Attributes:
       root, manifest: of the release.
       backgrounds: of each subset to paint, "builtin" or the folder of its videos.
       known: subsets whose pictures should have the digests that are known.
-      drift: see `Painted`.
+      drift: see `RenderResult`.
     """
 
     root: Path
     manifest: Manifest
-    painter: Painter
+    painter: RenderConfig
     backgrounds: Mapping[str, str]
     known: frozenset[str]
     drift: tuple[str, ...]
 
     @classmethod
     def open(
-        cls, release: Release, names: set[str], painter: Painter, needed: set[str], painted: set[str] | None = None
-    ) -> Studio:
+        cls, release: Release, names: set[str], painter: RenderConfig, needed: set[str], painted: set[str] | None = None
+    ) -> RenderSession:
         """Make a release ready; its folder must be locked.
 
         Args:
@@ -285,11 +285,11 @@ class Studio:
         subset = Subset(str(self.root), record, {shard: commit}, {})
         return PaintShard(subset, shard, self.backgrounds[name], self.painter.device, name in self.known)
 
-    def report(self, manifest: Manifest, found: Iterable[tuple[str, bool, bool]]) -> Painted:
+    def report(self, manifest: Manifest, found: Iterable[tuple[str, bool, bool]]) -> RenderResult:
         """What came of it."""
         found = list(found)
         differing = tuple(sorted(name for name, had, same in found if had and not same))
-        return Painted(manifest, len(found), sum(had for _, had, _ in found), differing, self.drift)
+        return RenderResult(manifest, len(found), sum(had for _, had, _ in found), differing, self.drift)
 
 
 def _resized(manifest: Manifest) -> frozenset[str]:
@@ -323,7 +323,7 @@ def drift(
             was, now = record.renderer.get(name, "nothing"), here.get(name, "nothing")
             if name not in ABOUT_THE_PLACE and was != now:
                 found[f"{record.renderer['name']}'s {name} is {now} here, {was} in the manifest"] = None
-    for name, (there, now) in environment_difference(manifest).items() if records else ():
+    for name, (there, now) in environment_diff(manifest).items() if records else ():
         if name not in ABOUT_THE_PLACE:
             found[f"{name} is {now} here, {there} where the release was made"] = None
     return tuple(found)
@@ -372,7 +372,7 @@ def _derived(
     return {"name": name, "lineage": (*old.lineage, entry)}
 
 
-def paint_shard(work: PaintShard, tick: Tick = ignore) -> tuple[str, bool, bool]:
+def paint_shard(work: PaintShard, tick: ProgressCallback = ignore) -> tuple[str, bool, bool]:
     """Paint one shard in place.
 
     Returns:
@@ -396,14 +396,16 @@ def paint_shard(work: PaintShard, tick: Tick = ignore) -> tuple[str, bool, bool]
 
 
 def shard_pictures(
-    subset: Subset, episodes: np.ndarray, backgrounds: str, device: str = "cpu", tick: Tick = ignore
+    subset: Subset, episodes: np.ndarray, backgrounds: str, device: str = "cpu", tick: ProgressCallback = ignore
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Picture arrays of episodes, painted from what is stored of them, see `rollout.painting.paint`."""
     record, task = subset.record, get_task(subset.task)
     length = subset.read("length", episodes)
     used = int(length.max()) + 1
     physics = subset.read("physics", episodes)[:, :used]
-    exogenous = Exogenous(**{name: subset.read(f"exogenous/{name}", episodes)[:, :used] for name in EXOGENOUS_NAMES})
+    exogenous = DistractorState(
+        **{name: subset.read(f"exogenous/{name}", episodes)[:, :used] for name in DISTRACTOR_STATE_NAMES}
+    )
     renderer, _ = renderers.get(record, backgrounds, device)
     yield from paint(task, renderer, physics, exogenous, length, record.max_steps + 1, tick, _stored(record))
 

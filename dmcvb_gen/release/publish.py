@@ -13,12 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
-from dmcvb_gen.errors import StoreError
-from dmcvb_gen.pool import Tick, expect, ignore
-from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.release.shards import wrong_bytes
-from dmcvb_gen.store.growth import is_grown_from
-from dmcvb_gen.store.index import (
+from dmcvb_gen.dataset.append import is_grown_from
+from dmcvb_gen.dataset.index import (
     INDEX,
     Index,
     card_files,
@@ -29,16 +25,15 @@ from dmcvb_gen.store.index import (
     parse_index,
     read_index,
 )
-from dmcvb_gen.store.manifest import (
+from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     FileRecord,
     Manifest,
     parse_manifest,
     shard_count,
 )
-from dmcvb_gen.store.reader import load_manifest
-from dmcvb_gen.store.remote import file_system, public, storage_errors
-from dmcvb_gen.store.transfer import (
+from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.dataset.transfer import (
     create_object,
     in_parallel,
     put_object,
@@ -46,7 +41,12 @@ from dmcvb_gen.store.transfer import (
     retry,
     upload,
 )
-from dmcvb_gen.store.writer import read_commits
+from dmcvb_gen.dataset.writer import read_commits
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.release.fetch import Moved
+from dmcvb_gen.release.shards import wrong_bytes
+from dmcvb_gen.storage.remote import file_system, public, storage_errors
 
 CLAIM = "publishing.json"
 
@@ -66,7 +66,7 @@ def index_of(root: Path, manifest: Manifest) -> Index:
     index = read_index(root)
     if index is None:
         listed = sorted([*data_files(root, manifest, commits), *card_files(root)], key=lambda file: file.path)
-        return Index(manifest_sha256=digest, files=tuple(listed)).sealed()
+        return Index(manifest_sha256=digest, files=tuple(listed)).with_checksum()
     if index.manifest_sha256 != digest:
         raise StoreError(f"{root / MANIFEST} does not have the digest that {INDEX} says; `dmcvb-gen verify` says more")
     return index
@@ -82,7 +82,7 @@ def publish(
     options: dict[str, Any] | None = None,
     workers: int = 8,
     take_over: bool = False,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
 ) -> Moved:
     """Put a complete release at a URL; run again after an interruption, it goes on.
 

@@ -16,30 +16,13 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.files import (
-    copy_file,
-    folder_in_the_making,
-    parse_json,
-    remove_partial,
-    sha256_bytes,
-    sha256_file,
-    write_json,
-)
-from dmcvb_gen.pool import Tick, Workers, ignore
-from dmcvb_gen.release.shards import damage, read_commit
-from dmcvb_gen.rollout.executors import run_jobs
-from dmcvb_gen.rollout.jobs import make_jobs, release_inputs
-from dmcvb_gen.rollout.plan import copy_inputs, create_groups
-from dmcvb_gen.rollout.site import FolderSite
-from dmcvb_gen.store.index import ZARR_JSON, restore_index, restored_commit, trusted_index
-from dmcvb_gen.store.manifest import CommitRecord, Manifest, SubsetRecord, environment
-from dmcvb_gen.store.pictures import SHOWN
-from dmcvb_gen.store.reader import load_manifest
-from dmcvb_gen.store.remote import local_path, storage_errors
-from dmcvb_gen.store.schema import EpisodeShape, subset_specs
-from dmcvb_gen.store.shards import chosen_shards
-from dmcvb_gen.store.writer import (
+from dmcvb_gen.dataset.index import ZARR_JSON, restore_index, restored_commit, trusted_index
+from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, environment
+from dmcvb_gen.dataset.pictures import SHOWN
+from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
+from dmcvb_gen.dataset.shards import chosen_shards
+from dmcvb_gen.dataset.writer import (
     CREATED,
     commit_path,
     find_array,
@@ -53,6 +36,23 @@ from dmcvb_gen.store.writer import (
     subset_digest,
     subset_path,
 )
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.files import (
+    copy_file,
+    folder_in_the_making,
+    parse_json,
+    remove_partial,
+    sha256_bytes,
+    sha256_file,
+    write_json,
+)
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.jobs import make_jobs, release_inputs
+from dmcvb_gen.generate.plan import copy_inputs, create_groups
+from dmcvb_gen.generate.site import FolderSite
+from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.release.shards import damage, read_commit
+from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 
 
@@ -127,7 +127,7 @@ class Outcome:
         return all(shard.equal is not False and (shard.was is None or shard.repaired) for shard in self.shards)
 
 
-def environment_difference(manifest: Manifest) -> dict[str, tuple[str, str]]:
+def environment_diff(manifest: Manifest) -> dict[str, tuple[str, str]]:
     """What of this machine is in none of the environments that made the release: name -> (there, here)."""
     here = environment()
     return {
@@ -177,7 +177,7 @@ class Regeneration:
     device: str | None = None
     workers: Workers = 1
 
-    def check(self, tick: Tick = ignore) -> Outcome:
+    def check(self, tick: ProgressCallback = ignore) -> Outcome:
         """Make shards again and compare their digests with the release; the release is not changed.
 
         Of a part that was fetched, or a rollout that is not finished, the shards that are here are made.
@@ -205,9 +205,9 @@ class Regeneration:
             else outcome
             for outcome in outcomes
         ]
-        return Outcome(tuple(outcomes), environment_difference(manifest), len(chosen) - len(here))
+        return Outcome(tuple(outcomes), environment_diff(manifest), len(chosen) - len(here))
 
-    def repair(self, tick: Tick = ignore) -> Outcome:
+    def repair(self, tick: ProgressCallback = ignore) -> Outcome:
         """Make damaged and missing shards again, in place; sound ones are not touched.
 
         A shard is taken only if it has the bytes that its commit record (or the subset's digest) promises; where the
@@ -230,7 +230,7 @@ class Regeneration:
         elif manifest.complete:
             copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
             restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})
-        return Outcome(tuple(outcomes), environment_difference(manifest))
+        return Outcome(tuple(outcomes), environment_diff(manifest))
 
     def _wanted(self, manifest: Manifest) -> dict[tuple[str, int], SubsetRecord]:
         """The shards that should be here."""
@@ -272,7 +272,7 @@ class Regeneration:
             settle(record, commit, was, verdicts[record.name])
         return outcomes
 
-    def remake(self, out: str | Path, tick: Tick = ignore) -> Outcome:
+    def remake(self, out: str | Path, tick: ProgressCallback = ignore) -> Outcome:
         """Write a release beside, from the manifest of `root`; run again, it goes on where it stopped.
 
         Args:
@@ -305,7 +305,7 @@ class Regeneration:
             if equal is None and record.digest and digests[record.name]:
                 equal = digests[record.name] == record.digest
             outcomes.append(_outcome(root, out, record, commit, None, equal))
-        return Outcome(tuple(outcomes), environment_difference(manifest))
+        return Outcome(tuple(outcomes), environment_diff(manifest))
 
     def _make(self, manifest, shards, folder, tick, copy=False) -> Iterator[CommitRecord]:
         """Make shards in `folder` (with the policies and videos that they come from, if they are to be copied)."""

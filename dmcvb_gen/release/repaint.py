@@ -15,33 +15,33 @@ from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.dataset import Release, open_release
+from dmcvb_gen.dataset.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, VersionEntry, environment
+from dmcvb_gen.dataset.pictures import stored_pictures, view_arrays
+from dmcvb_gen.dataset.reader import Subset, load_manifest
+from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, subset_specs
+from dmcvb_gen.dataset.writer import create_subset, finish_together, read_commits, start_release
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.labels import EXOGENOUS_NAMES, Exogenous
-from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, distractor_of, family_of, select
-from dmcvb_gen.pool import Tick, Workers, expect, ignore, run_all
-from dmcvb_gen.release.shards import damage
-from dmcvb_gen.rollout.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
-from dmcvb_gen.rollout.painting import (
+from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
+from dmcvb_gen.generate.painting import (
     check_renderer,
-    exogenous_of,
+    distractor_state_of,
     frame_count,
     label_arrays,
     len_rows,
     paint,
     renderers,
 )
-from dmcvb_gen.rollout.plan import copy_inputs, painting_facts, subset_attributes
-from dmcvb_gen.rollout.recipe import Recipe, check_size, make_recipe
-from dmcvb_gen.rollout.site import FolderSite, leave
-from dmcvb_gen.rollout.worker import make_shard
-from dmcvb_gen.store import Release, open_release
-from dmcvb_gen.store.manifest import MANIFEST, Addition, CommitRecord, Manifest, SubsetRecord, environment
-from dmcvb_gen.store.pictures import stored_pictures, view_arrays
-from dmcvb_gen.store.reader import Subset, load_manifest
-from dmcvb_gen.store.remote import local_path
-from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, subset_specs
-from dmcvb_gen.store.writer import create_subset, finish_together, read_commits, start_release
+from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
+from dmcvb_gen.generate.recipe import Recipe, check_size, make_recipe
+from dmcvb_gen.generate.site import FolderSite, leave
+from dmcvb_gen.generate.worker import make_shard
+from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, distractor_of, family_of, select
+from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, run_all
+from dmcvb_gen.release.shards import damage
+from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -114,7 +114,7 @@ def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec
     return tuple(ArraySpec(name, LABEL_TYPES[label], (size, size), ("height", "width")) for label, name in names)
 
 
-def repaint(request: Repainting, workers: Workers = 1, tick: Tick = ignore) -> Manifest:
+def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = ignore) -> Manifest:
     """Write a release with new pictures of the episodes of another; run again, it goes on where it stopped.
 
     Args:
@@ -271,7 +271,7 @@ def _new_manifest(release: Release, pairs: Mapping[str, Pair], request: Repainti
         lineage=(*old.lineage, lineage),
     )
     additions = tuple(
-        Addition(
+        VersionEntry(
             version=manifest.version,
             recipe=recipe.model_dump(mode="json"),
             generator=manifest.generator,
@@ -321,7 +321,7 @@ def _pattern(record: SubsetRecord) -> dict[str, Any]:
 # -- painting -------------------------------------------------------------------------------------
 
 
-def paint_shards(work: PaintJob, tick: Tick = ignore) -> tuple[CommitRecord, ...]:
+def paint_shards(work: PaintJob, tick: ProgressCallback = ignore) -> tuple[CommitRecord, ...]:
     """Paint and commit a shard of each of a job's subsets.
 
     Raises:
@@ -333,7 +333,9 @@ def paint_shards(work: PaintJob, tick: Tick = ignore) -> tuple[CommitRecord, ...
     return tuple(commit for commit, _ in made)
 
 
-def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tuple[CommitRecord, Callable[[], None]]:
+def _paint_shard(
+    job: Job, pair: Pair, labels: Sequence[str], tick: ProgressCallback
+) -> tuple[CommitRecord, Callable[[], None]]:
     source, record, task = pair.source, pair.record, get_task(pair.record.task)
     broken = damage(Path(source.root), source.record, job.shard)
     if broken:
@@ -346,10 +348,10 @@ def _paint_shard(job: Job, pair: Pair, labels: Sequence[str], tick: Tick) -> tup
         renderer, videos = renderers.get(record, pair.inputs.backgrounds, job.device)
         if pair.keep_labels:
             used = int(length.max()) + 1
-            stored = {name: source.read(f"exogenous/{name}", episodes)[:, :used] for name in EXOGENOUS_NAMES}
-            exogenous = Exogenous(**stored)
+            stored = {name: source.read(f"exogenous/{name}", episodes)[:, :used] for name in DISTRACTOR_STATE_NAMES}
+            exogenous = DistractorState(**stored)
         else:
-            exogenous = exogenous_of(record, job.seed, job.names, episodes, values["physics"], length, videos)
+            exogenous = distractor_state_of(record, job.seed, job.names, episodes, values["physics"], length, videos)
         physics = values["physics"][:, : len_rows(exogenous)]
         names = stored_pictures(record, bool(task.goal_geoms))
         yield from paint(task, renderer, physics, exogenous, length, rows, tick, names)

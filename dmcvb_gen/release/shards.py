@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from dmcvb_gen.dataset.manifest import CommitRecord, FileRecord, SubsetRecord, parse_commit
+from dmcvb_gen.dataset.writer import commit_path, shard_episodes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes, sha256_file
-from dmcvb_gen.store.manifest import CommitRecord, FileRecord, SubsetRecord, parse_commit
-from dmcvb_gen.store.writer import commit_path, shard_episodes
 
 NOTHING: Mapping[str, str] = {}
 

@@ -11,14 +11,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.files import sha256_file
-from dmcvb_gen.pool import Pool, Tick, Workers, expect, ignore, in_order, open_pool
-from dmcvb_gen.release.finding import Finding
-from dmcvb_gen.release.shards import wrong_bytes
-from dmcvb_gen.store import Subset, open_release
-from dmcvb_gen.store.index import INDEX, Index, read_index, root_digest
-from dmcvb_gen.store.manifest import (
+from dmcvb_gen.dataset import Subset, open_release
+from dmcvb_gen.dataset.index import INDEX, Index, read_index, root_digest
+from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     CommitRecord,
     FileRecord,
@@ -30,8 +25,13 @@ from dmcvb_gen.store.manifest import (
     shard_count,
     subset_path,
 )
-from dmcvb_gen.store.remote import storage_errors
-from dmcvb_gen.store.writer import subset_digest
+from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool
+from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.release.shards import wrong_bytes
+from dmcvb_gen.storage.remote import storage_errors
 
 SHARDS = 8
 """Shards whose bytes are checked as one piece of work."""
@@ -54,7 +54,7 @@ class Verification:
     """
 
     checked: dict[str, int]
-    findings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
     incomplete: dict[str, tuple[int, int]] = field(default_factory=dict)
     digest: str | None = None
     finished: bool = True
@@ -73,7 +73,7 @@ class Verification:
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def check_files(root: Path, workers: Workers | Pool = 1, tick: Tick = ignore) -> Iterator[Finding]:
+def check_files(root: Path, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> Iterator[Issue]:
     """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`.
 
     Args:
@@ -84,16 +84,16 @@ def check_files(root: Path, workers: Workers | Pool = 1, tick: Tick = ignore) ->
         with storage_errors(root / MANIFEST):
             manifest = parse_manifest((root / MANIFEST).read_bytes(), MANIFEST)
     except StoreError as error:
-        yield Finding("files", MANIFEST, f"is damaged: {error}")
+        yield Issue("files", MANIFEST, f"is damaged: {error}")
         return
     try:
         index = read_index(root)
     except StoreError as error:
-        yield Finding("files", INDEX, f"is damaged: {error}")
+        yield Issue("files", INDEX, f"is damaged: {error}")
         index = None
     else:
         if index is None and manifest.digest is not None:
-            yield Finding("files", INDEX, "is missing; fetch it again")
+            yield Issue("files", INDEX, "is missing; fetch it again")
     works, checked = _works(root, manifest), set()
     expect(tick, len(works) + len(manifest.subsets))
     found = in_order(_check_shards, works, workers, tick)
@@ -111,17 +111,17 @@ def check_files(root: Path, workers: Workers | Pool = 1, tick: Tick = ignore) ->
             yield from _check_extra(root, manifest, index)
 
 
-def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]) -> Iterator[Finding]:
+def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]) -> Iterator[Issue]:
     for file in index.files:
         if file.path not in checked:
             yield from _check_file(root, file, subset_of(manifest, file.path))
     if sha256_file(root / MANIFEST) != index.manifest_sha256:
-        yield Finding("files", MANIFEST, f"does not have the digest that {INDEX} says")
+        yield Issue("files", MANIFEST, f"does not have the digest that {INDEX} says")
     elif manifest.digest is not None and root_digest(index.files, manifest) != manifest.digest:
-        yield Finding("files", MANIFEST, f"its root digest is not that of the files in {INDEX}")
+        yield Issue("files", MANIFEST, f"its root digest is not that of the files in {INDEX}")
 
 
-def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Finding]:
+def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue]:
     """Files of a finished release that no digest speaks of, and that readers may yet take for data."""
     listed = {file.path for file in index.files} | {MANIFEST, INDEX}
     with storage_errors(root):
@@ -130,7 +130,7 @@ def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Findi
             ours = name.startswith(PREVIEWS) or any(part.startswith(".") for part in name.split("/"))
             if not ours and name not in listed and path.is_file():
                 text = f"{name} is listed nowhere: no part of the release; move it elsewhere"
-                yield Finding("files", subset_of(manifest, name), text)
+                yield Issue("files", subset_of(manifest, name), text)
 
 
 def subset_of(manifest: Manifest, path: str) -> str:
@@ -141,9 +141,9 @@ def subset_of(manifest: Manifest, path: str) -> str:
     return path
 
 
-def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Iterator[Finding]:
+def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Iterator[Issue]:
     if wrong := wrong_bytes(root, file):
-        yield Finding("files", where, f"{file.path}{what} {wrong}")
+        yield Issue("files", where, f"{file.path}{what} {wrong}")
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class _Shards:
 class _Checked:
     """What the bytes of some shards gave: findings, the files that were looked at, the records that can be read."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
     files: tuple[str, ...]
     commits: Mapping[int, CommitRecord]
 
@@ -174,7 +174,7 @@ def _works(root: Path, manifest: Manifest) -> list[_Shards]:
     ]
 
 
-def _check_shards(work: _Shards, tick: Tick = ignore) -> _Checked:
+def _check_shards(work: _Shards, tick: ProgressCallback = ignore) -> _Checked:
     """Commit records and their files."""
     root, record, commits, checked, findings = work.root, work.record, {}, [], []
     tick(record.name)
@@ -182,13 +182,13 @@ def _check_shards(work: _Shards, tick: Tick = ignore) -> _Checked:
         path = commit_path(record.name, shard)
         if not (root / path).is_file():
             if work.wanted:
-                findings.append(Finding("files", record.name, f"shard {shard} is missing: no {path}"))
+                findings.append(Issue("files", record.name, f"shard {shard} is missing: no {path}"))
             continue
         try:
             with storage_errors(root / path):
                 commit = commits[shard] = checked_commit((root / path).read_bytes(), path, record, shard)
         except StoreError as error:
-            findings.append(Finding("files", record.name, f"{path} is damaged: {error}"))
+            findings.append(Issue("files", record.name, f"{path} is damaged: {error}"))
             continue
         for file in commit.files:
             checked.append(file.path)
@@ -196,15 +196,15 @@ def _check_shards(work: _Shards, tick: Tick = ignore) -> _Checked:
     return _Checked(tuple(findings), tuple(checked), commits)
 
 
-def _check_digest(record: SubsetRecord, commits: Mapping[int, CommitRecord]) -> Iterator[Finding]:
+def _check_digest(record: SubsetRecord, commits: Mapping[int, CommitRecord]) -> Iterator[Issue]:
     if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
-        yield Finding("files", record.name, "its commit records do not give the digest of the manifest")
+        yield Issue("files", record.name, "its commit records do not give the digest of the manifest")
 
 
 def verify(
     path: str | Path,
     backgrounds: str | None = None,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
     workers: Workers | Pool = 1,
     names: Collection[str] | None = None,
 ) -> Verification:
@@ -250,7 +250,7 @@ def verify(
     return Verification(counts, tuple(findings), incomplete, release.manifest.digest, finished)
 
 
-def _check_subset(work: tuple[Subset, str | None], tick: Tick) -> list[Finding]:
+def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> list[Issue]:
     subset, backgrounds = work
     tick(subset.name)
     try:
@@ -262,4 +262,4 @@ def _check_subset(work: tuple[Subset, str | None], tick: Tick) -> list[Finding]:
     try:
         return list(contents.check_contents(subset, backgrounds))
     except StoreError as error:
-        return [Finding("files", subset.name, str(error))]
+        return [Issue("files", subset.name, str(error))]

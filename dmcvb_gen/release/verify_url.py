@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.index import INDEX, root_digest
+from dmcvb_gen.dataset.manifest import FileRecord, commit_path, shard_count
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.dataset.transfer import in_parallel, list_files, protocol, remote_sha256, retry
+from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.pool import Tick, expect, ignore
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.fetch import Source
-from dmcvb_gen.release.finding import Finding
+from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import Verification, subset_of
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.index import INDEX, root_digest
-from dmcvb_gen.store.manifest import FileRecord, commit_path, shard_count
-from dmcvb_gen.store.reader import Subset
-from dmcvb_gen.store.transfer import in_parallel, list_files, protocol, remote_sha256, retry
-from dmcvb_gen.store.writer import subset_digest
 
 SAMPLE_FILES = 40
 """Files that are read where not all are asked for; spread evenly over the release."""
@@ -32,7 +32,7 @@ def verify_url(
     url: str,
     options: dict[str, Any] | None = None,
     everything: bool = False,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
     workers: int = WORKERS,
 ) -> Verification:
     """Check a published release where it is.
@@ -49,21 +49,21 @@ def verify_url(
     source = Source.find(url, options)
     findings = []
     if source.manifest.digest not in (None, root_digest(source.index.files, source.manifest)):
-        findings.append(Finding("files", INDEX, "its files do not give the root digest of the manifest"))
+        findings.append(Issue("files", INDEX, "its files do not give the root digest of the manifest"))
     chosen = list(source.index.files)
     if not everything:
         places = np.unique(np.linspace(0, len(chosen) - 1, min(SAMPLE_FILES, len(chosen))).round().astype(int))
         chosen = [chosen[place] for place in places]
 
-    def look(file: FileRecord) -> Finding | None:
+    def look(file: FileRecord) -> Issue | None:
         path = f"{source.base}/{file.path}"
         try:
             digest = retry(source.place, file.path, lambda: remote_sha256(source.filesystem, path, file.bytes), "read")
         except StoreError as error:
-            return Finding("files", subset_of(source.manifest, file.path), str(error))
+            return Issue("files", subset_of(source.manifest, file.path), str(error))
         if digest == file.sha256:
             return None
-        return Finding("files", subset_of(source.manifest, file.path), f"{file.path} does not have its digest")
+        return Issue("files", subset_of(source.manifest, file.path), f"{file.path} does not have its digest")
 
     expect(tick, len(chosen))
     looked = in_parallel(look, chosen, workers, lambda _: tick(1))
@@ -73,7 +73,7 @@ def verify_url(
     try:
         release = open_release(url, options)
     except StoreError as error:
-        return Verification(counts, (*findings, Finding("files", "commits", str(error))))
+        return Verification(counts, (*findings, Issue("files", "commits", str(error))))
     findings += _missing(source, damaged)
     listed, finished = {file.path: file for file in source.index.files}, source.manifest.complete
     for subset in release.subsets.values():
@@ -85,7 +85,7 @@ def verify_url(
     return Verification(counts, tuple(findings), release.shortfalls, release.manifest.digest, finished)
 
 
-def _missing(source: Source, damaged: Collection[str]) -> list[Finding]:
+def _missing(source: Source, damaged: Collection[str]) -> list[Issue]:
     """Files that the index lists and that are not there, or have another size, as far as the place can be listed.
 
     Args:
@@ -102,11 +102,11 @@ def _missing(source: Source, damaged: Collection[str]) -> list[Finding]:
         size = there[file.path].get("size") if file.path in there else -1
         text = f"{file.path} is missing or has another size"
         if size not in (None, file.bytes) and file.path not in damaged:
-            found.append(Finding("files", subset_of(source.manifest, file.path), text))
+            found.append(Issue("files", subset_of(source.manifest, file.path), text))
     return found
 
 
-def _disagreements(subset: Subset, listed: Mapping[str, FileRecord]) -> list[Finding]:
+def _disagreements(subset: Subset, listed: Mapping[str, FileRecord]) -> list[Issue]:
     """What the commit records of a subset say otherwise than the index or the manifest.
 
     Args:
@@ -117,8 +117,8 @@ def _disagreements(subset: Subset, listed: Mapping[str, FileRecord]) -> list[Fin
         other = [file.path for file in commit.files if listed.get(file.path) != file]
         if other and commit_path(subset.name, shard) in listed:
             text = f"shard {shard}: its commit record and {INDEX} do not agree about {other[0]}"
-            found.append(Finding("files", subset.name, text))
+            found.append(Issue("files", subset.name, text))
     whole = len(subset.commits) == shard_count(subset.record)
     if whole and subset.record.digest not in (None, subset_digest(subset.commits)):
-        found.append(Finding("files", subset.name, "its commit records do not give the digest of the manifest"))
+        found.append(Issue("files", subset.name, "its commit records do not give the digest of the manifest"))
     return found

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.tasks.base import Task
 
 MIN_SIZE, MAX_SIZE = 8, 1024
@@ -34,7 +34,7 @@ class Renderer(abc.ABC):
     def render(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> np.ndarray:
@@ -51,7 +51,7 @@ class Renderer(abc.ABC):
         """
 
     def render_pair(
-        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+        self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """The frames as `render` paints them, and the same with `hide_goal`."""
         return self.render(physics, exogenous, views), self.render(physics, exogenous, views, hide_goal=True)
@@ -81,7 +81,7 @@ def check_size(size: int) -> None:
         raise RenderingError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side")
 
 
-def check_frames(task: Task, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None) -> list[int]:
+def check_frames(task: Task, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None) -> list[int]:
     """Indices of the asked views; raises where frames and labels do not belong together."""
     if physics.ndim != 2 or physics.shape[1] != task.physics_size or len(physics) != len(exogenous):
         raise ValueError(f"physics {physics.shape} and {len(exogenous)} labels are not frames of {task.id}")

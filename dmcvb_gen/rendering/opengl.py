@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
@@ -106,7 +106,7 @@ class OpenglRenderer(Renderer):
     def render(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> np.ndarray:
@@ -125,7 +125,7 @@ class OpenglRenderer(Renderer):
     def render_labels(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> dict[str, np.ndarray]:

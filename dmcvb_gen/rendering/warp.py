@@ -19,8 +19,8 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
@@ -211,7 +211,7 @@ class WarpRenderer(Renderer):
     def render(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> np.ndarray:
@@ -225,7 +225,7 @@ class WarpRenderer(Renderer):
     def render_labels(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> dict[str, np.ndarray]:
@@ -338,7 +338,7 @@ class WarpRenderer(Renderer):
         found = np.stack([geom_materials(self.task, int(look)) for look in looks])
         return found if len(looks) == 1 else found[place]
 
-    def _set_sky(self, context, exogenous: Exogenous, worlds: int) -> None:
+    def _set_sky(self, context, exogenous: DistractorState, worlds: int) -> None:
         """Each world's sky: the model's own, or a video frame on every face."""
         wp, mjm = _warp(), self._mujoco_model
         skies = np.flatnonzero(mjm.tex_type == 2)

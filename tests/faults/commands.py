@@ -1,4 +1,4 @@
-"""Commands run in children forked from a process that has imported everything; killed, limited and watched."""
+"""Commands run in children forked from a process that has imported everything; killed, limited and metadata_files."""
 
 from __future__ import annotations
 

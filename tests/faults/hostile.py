@@ -178,7 +178,7 @@ YAML_BOMBS = [
 
 @functools.cache
 def valid_policy() -> bytes:
-    from dmcvb_gen.behaviours.policies.bundled import resolve_policies
+    from dmcvb_gen.policies.bundled import resolve_policies
 
     return Path(resolve_policies("walker-walk", "expert", None)[0]).read_bytes()
 
@@ -359,9 +359,9 @@ def changed_pictures(draw) -> Files:
 
 
 def _read_all(root: str) -> None:
+    from dmcvb_gen.dataset import open_release
+    from dmcvb_gen.generate.info import describe_release
     from dmcvb_gen.release.verify import check_files
-    from dmcvb_gen.rollout.info import describe_release
-    from dmcvb_gen.store import open_release
 
     release = open_release(root)
     list(check_files(Path(root)))
@@ -377,8 +377,8 @@ def take_release(folder: Path) -> None:
 
 
 def take_recipe(folder: Path) -> None:
-    from dmcvb_gen.rollout.plan import make_plan
-    from dmcvb_gen.rollout.recipe import expand, load_recipe
+    from dmcvb_gen.generate.plan import make_plan
+    from dmcvb_gen.generate.recipe import expand, load_recipe
 
     recipe = load_recipe(folder / "recipe.yaml")
     expand(recipe)
@@ -388,7 +388,7 @@ def take_recipe(folder: Path) -> None:
 def take_policy(folder: Path) -> None:
     import numpy as np
 
-    from dmcvb_gen.behaviours.policies.policy_file import load_policy
+    from dmcvb_gen.policies.policy_file import load_policy
     from dmcvb_gen.tasks import get_task
 
     task = get_task("walker-walk")
@@ -425,12 +425,12 @@ def take_published(folder: Path) -> None:
 
 def take_names(folder: Path) -> None:
     """A URL, a subset's name and a pattern out of names.json, each given to whoever takes such."""
+    from dmcvb_gen.dataset.manifest import check_relative_path
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.release.export import export
     from dmcvb_gen.release.fetch import fetch
     from dmcvb_gen.release.hub import parse_hub_url
-    from dmcvb_gen.store.manifest import check_relative_path
-    from dmcvb_gen.store.remote import file_system
+    from dmcvb_gen.storage.remote import file_system
 
     name = json.loads((folder / "names.json").read_bytes())
     calls: list[Callable[[], Any]] = [
@@ -636,7 +636,7 @@ class _Guard:
 
 def serve() -> None:
     """Take cases from standard input, a line each: its kind and its files."""
-    from dmcvb_gen.store import transfer
+    from dmcvb_gen.dataset import transfer
 
     transfer.PAUSE = 0  # what is damaged for good is fetched anew several times
     sys.dont_write_bytecode = True

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset.manifest import Manifest, SubsetRecord
+from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, array_specs
+from dmcvb_gen.dataset.writer import create_subset, finish_release, shard_episodes, start_release, write_shard
 from dmcvb_gen.release.fetch import fetch as bring
 from dmcvb_gen.release.publish import publish as put
 from dmcvb_gen.release.verify import check_files
-from dmcvb_gen.store import open_release
-from dmcvb_gen.store.manifest import Manifest, SubsetRecord
-from dmcvb_gen.store.schema import ArraySpec, EpisodeShape, array_specs
-from dmcvb_gen.store.writer import create_subset, finish_release, shard_episodes, start_release, write_shard
 
 SIZE, ROWS, EPISODES, EPISODES_PER_SHARD = 4, 5, 3, 2
 WALKER = EpisodeShape(("pixels",), False, {"height": (0, 1), "velocity": (1, 4)}, 6, 4, 9, 2, ROWS - 1)

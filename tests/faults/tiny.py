@@ -12,7 +12,7 @@ import numpy as np
 from dmcvb_gen.rendering.base import Renderer, check_frames
 
 
-class Painter(Renderer):
+class RenderConfig(Renderer):
     """Pictures whose every byte follows from the bytes of the state, the labels and the view."""
 
     def __init__(self, name, task, size):
@@ -35,6 +35,6 @@ class Painter(Renderer):
 
 def shrink() -> None:
     """Have this process (and those that are forked from it) paint so."""
-    from dmcvb_gen.rollout import painting
+    from dmcvb_gen.generate import painting
 
-    painting.make_renderer = lambda name, task, size, **settings: Painter(name, task, size)
+    painting.make_renderer = lambda name, task, size, **settings: RenderConfig(name, task, size)

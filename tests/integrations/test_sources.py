@@ -8,7 +8,7 @@ import pytest
 import zarr
 
 import dmcvb_gen
-from dmcvb_gen.readers.blocks import stack_channels
+from dmcvb_gen.loaders.blocks import stack_channels
 from dmcvb_gen.release.export import export
 
 

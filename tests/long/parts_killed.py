@@ -20,7 +20,7 @@ import urllib.request
 
 import pytest
 
-from dmcvb_gen.store.manifest import parse_manifest
+from dmcvb_gen.dataset.manifest import parse_manifest
 from tests.test_cluster import contents, recipe_file, whole  # noqa: F401  (fixtures)
 from tests.test_publish import CREDENTIALS
 

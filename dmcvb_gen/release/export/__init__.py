@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
+from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
 from dmcvb_gen.names import select
-from dmcvb_gen.pool import Tick, Workers, expect, ignore, open_pool
-from dmcvb_gen.readers.release import ReleaseReader, open_for_reading
+from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
-from dmcvb_gen.store.manifest import Manifest
-from dmcvb_gen.store.remote import local_path, storage_errors
+from dmcvb_gen.storage.remote import local_path, storage_errors
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def export(
     video: bool = False,
     workers: Workers = 1,
     storage_options: dict | None = None,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
 ) -> list[Path]:
     """Write subsets in another format; each is there whole, or not at all. Run again, it goes on where it stopped.
 
@@ -225,7 +225,7 @@ def _episodes(release: ReleaseReader, name: str, asked: tuple[int, int] | None) 
     return tuple(wanted)
 
 
-def _write(work: _Work, tick: Tick = ignore) -> None:
+def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
     """Write one folder, whole or not at all."""
     release = open_for_reading(work.path, work.storage_options)
     sources = [Source(release, release[name], list(episodes), tick) for name, episodes in work.subsets]

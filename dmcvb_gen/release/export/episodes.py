@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmcvb_gen.readers.release import ReleaseReader, SubsetReader
-from dmcvb_gen.store import Manifest
-from dmcvb_gen.store.pictures import Pictures, shown
+from dmcvb_gen.dataset import Manifest
+from dmcvb_gen.dataset.pictures import Pictures, shown
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 
 
 @dataclass(frozen=True)

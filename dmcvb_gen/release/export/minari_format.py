@@ -16,12 +16,12 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from dmcvb_gen import files
+from dmcvb_gen.generate.jobs import BUILTIN
+from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
+from dmcvb_gen.loaders.release import ReleaseReader
 from dmcvb_gen.names import ANT_MAZE, FIXED, HIDDEN, VISIBLE, DistractorSetting, hides_goal
-from dmcvb_gen.readers.register import ENTRY_POINT, NAMESPACE, environment_id
-from dmcvb_gen.readers.release import ReleaseReader
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.references import reference_returns
-from dmcvb_gen.rollout.jobs import BUILTIN
 from dmcvb_gen.version import __version__
 
 

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
+from dmcvb_gen.dataset.manifest import FileRecord
+from dmcvb_gen.dataset.transfer import in_parallel, upload
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.pool import Tick, expect, ignore
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export import FORMATS
 from dmcvb_gen.release.hub import client_errors, new_api, newest_of
 from dmcvb_gen.release.publish import Moved
-from dmcvb_gen.store.manifest import FileRecord
-from dmcvb_gen.store.remote import file_system, public
-from dmcvb_gen.store.transfer import in_parallel, upload
+from dmcvb_gen.storage.remote import file_system, public
 
 LEROBOT_INFO = "meta/info.json"
 
@@ -33,7 +33,7 @@ def publish_export(
     *,
     options: dict[str, Any] | None = None,
     workers: int = 8,
-    tick: Tick = ignore,
+    tick: ProgressCallback = ignore,
     api: Any = None,
 ) -> Moved:
     """Put an export at a URL; run again after an interruption, it goes on.

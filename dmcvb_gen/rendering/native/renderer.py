@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.labels import Exogenous
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
 from dmcvb_gen.rendering.native import records as columns
 from dmcvb_gen.rendering.native.compiled import call
@@ -74,20 +74,20 @@ class NativeRenderer(Renderer):
     def render(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> np.ndarray:
         return self._paint(physics, exogenous, views, not hide_goal, hide_goal)[int(hide_goal)]
 
     def render_pair(
-        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None = None
+        self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Renderer`; the second ones are painted again only where the goal is."""
         return self._paint(physics, exogenous, views, True, True)
 
     def _paint(
-        self, physics: np.ndarray, exogenous: Exogenous, views: Sequence[str] | None, shown: bool, hidden: bool
+        self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None, shown: bool, hidden: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Frames with and without the goal; none where they are not asked for."""
         indices = check_frames(self.task, physics, exogenous, views)
@@ -106,7 +106,7 @@ class NativeRenderer(Renderer):
     def render_labels(
         self,
         physics: np.ndarray,
-        exogenous: Exogenous,
+        exogenous: DistractorState,
         views: Sequence[str] | None = None,
         hide_goal: bool = False,
     ) -> dict[str, np.ndarray]:
@@ -128,7 +128,7 @@ class NativeRenderer(Renderer):
 
     # -- arguments ----------------------------------------------------------------------------
 
-    def _parts(self, physics: np.ndarray, exogenous: Exogenous) -> Iterator[tuple[np.ndarray, dict]]:
+    def _parts(self, physics: np.ndarray, exogenous: DistractorState) -> Iterator[tuple[np.ndarray, dict]]:
         """Frames to paint together, with their poses: never more backgrounds than there is room for."""
         order = np.lexsort((exogenous.background_frame, exogenous.background_video))
         keys = np.stack([exogenous.background_video[order], exogenous.background_frame[order]], axis=1)
@@ -140,7 +140,7 @@ class NativeRenderer(Renderer):
             yield rows, self._kinematics(physics[rows])
             first += len(rows)
 
-    def _frames(self, poses: dict[str, np.ndarray], exogenous: Exogenous, view: int) -> Frames:
+    def _frames(self, poses: dict[str, np.ndarray], exogenous: DistractorState, view: int) -> Frames:
         scene, count = self._scene, len(exogenous)
         backgrounds = zip(exogenous.background_video.tolist(), exogenous.background_frame.tolist(), strict=True)
         sky = [self._textures.background(*key) if key[0] >= 0 else scene.sky for key in backgrounds]

@@ -2,7 +2,7 @@
 
 An ant that can walk straight to a goal in an open maze gets through any maze when it is shown a point on the
 way instead of the goal. That needs the layout, so no behaviour policy sees it; it learns where such points lie
-(`behaviours.learning.guided`).
+(`training.guided`).
 """
 
 from __future__ import annotations

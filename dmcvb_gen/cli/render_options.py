@@ -1,0 +1,64 @@
+"""What `paint` and `fetch --paint` share: options of the pictures, what is told before painting and after."""
+
+from __future__ import annotations
+
+import click
+
+from dmcvb_gen.names import GOAL_PICTURES, pluralize
+
+_OPTIONS = (
+    click.option("--size", type=click.IntRange(1), help="Pixels a side.  [default: the manifest's]"),
+    click.option("--views", metavar="A,B", help="Mazes: only these views, e.g. egocentric.  [default: all]"),
+    click.option("--goal", type=click.Choice(GOAL_PICTURES), help="Mazes: only such pictures.  [default: both]"),
+)
+
+
+def look_options(command):
+    """--size, --views and --goal."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+def look_of(size, views, goal):
+    """The `Look` that the options ask for."""
+    from dmcvb_gen.release.paint import Look
+
+    return Look(size, tuple(name.strip() for name in views.split(",")) if views else None, goal)
+
+
+def tell(text):
+    """Say beside the output what is other here than where the release was made."""
+    click.echo(f"note: {text}", err=True)
+
+
+def painted_facts(done):
+    """What painting gave, for programs."""
+    return dict(
+        shards=done.shards,
+        known=done.known,
+        differing=list(done.differing),
+        drift=list(done.drift),
+        complete=done.manifest.complete,
+        digest=done.manifest.digest,
+    )
+
+
+def show_painted(place, done):
+    """What painting gave, for people."""
+    painted = f"{pluralize(done.shards, 'shards')} painted; {_compared(done)}."
+    click.echo(f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}")
+    for name in done.differing[:10]:
+        click.echo(f"  differs: {name}")
+    if done.differing:
+        click.echo(
+            "  what differs here is noted above" if done.drift else "  versions and processor are those of the release"
+        )
+
+
+def _compared(done) -> str:
+    if not done.known:
+        return "no digests of these pictures were known"
+    if done.differing:
+        return f"{len(done.differing)} of {done.known} differ from the known digests"
+    return f"equal to the known digests ({done.known} of {done.shards})"

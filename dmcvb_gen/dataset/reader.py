@@ -1,0 +1,386 @@
+"""Reading a release: a folder (or any fsspec URL) in, subsets and episodes out; what is not committed is not there."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import zarr
+
+from dmcvb_gen.dataset.manifest import (
+    MANIFEST,
+    CommitRecord,
+    Manifest,
+    SubsetRecord,
+    checked_commit,
+    commit_path,
+    local_manifest,
+    parse_manifest,
+    shard_count,
+    subset_path,
+)
+from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.dataset.writer import read_commits
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.names import pluralize
+from dmcvb_gen.storage.remote import file_system, is_url, public, storage_errors
+
+MAX_STEP_BYTES = 2**20
+"""Bytes of a step that is no picture, at most."""
+MANY_EPISODES = 10**6
+"""An array with more episodes than that, and ten times the manifest's, is damaged or hostile."""
+
+
+class StoredArray:
+    """One array of a subset, read as it is indexed; damaged bytes and lost connections are one line with a cure.
+
+    Attributes:
+      name: e.g. "pixels/top".
+      shape, dtype, ndim: as in numpy; an entry for each episode that the subset will have.
+      dimensions: names of the axes.
+    """
+
+    def __init__(self, array: zarr.Array, name: str, place: str, unpainted: np.ndarray | None = None, cure: str = ""):
+        self._array, self._place, self.name = array, place, name
+        self._unpainted, self._cure = unpainted, cure
+        self.shape, self.dtype, self.ndim = array.shape, array.dtype, array.ndim
+        self.dimensions = tuple(map(str, getattr(array.metadata, "dimension_names", None) or ()))
+
+    def __repr__(self) -> str:
+        return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
+
+    def __getitem__(self, selection: Any) -> np.ndarray:
+        self._check_painted(selection[0] if isinstance(selection, tuple) else selection)
+        with storage_errors(self._place, decoding=True):
+            return cast(np.ndarray, self._array[selection])
+
+    def rows(self, episodes: np.ndarray) -> np.ndarray:
+        """(episode, ...) values of episodes in any order; of arrays with steps, those in a row are read at once.
+
+        Zarr's own selection of scattered rows takes thirty times as long for pictures.
+        """
+        self._check_painted(episodes)
+        with storage_errors(self._place, decoding=True):
+            if self.ndim == 1:
+                return cast(np.ndarray, self._array.oindex[episodes])
+            runs = np.split(episodes, np.flatnonzero(np.diff(episodes) != 1) + 1)
+            return np.concatenate([self._array[int(run[0]) : int(run[-1]) + 1] for run in runs])
+
+    def _check_painted(self, selection: Any) -> None:
+        """Raises StoreError for an episode without pictures, which would read as black."""
+        if self._unpainted is None or not self._unpainted.any():
+            return
+        missing = np.flatnonzero(np.atleast_1d(self._unpainted[selection]))
+        if len(missing):
+            raise StoreError(self._cure)
+
+
+class Subset:
+    """One subset of a release, read-only.
+
+    Attributes:
+      record: what the manifest says of it.
+      commits: shard -> commit record, of the committed shards.
+    """
+
+    def __init__(self, root: str, record: SubsetRecord, commits: Mapping[int, CommitRecord], storage_options: dict):
+        self.root, self.record, self.commits = root, record, dict(commits)
+        self._storage_options = storage_options
+
+    @property
+    def name(self) -> str:
+        return self.record.name
+
+    @property
+    def task(self) -> str:
+        return self.record.task
+
+    @property
+    def level(self) -> str:
+        return self.record.level
+
+    @property
+    def setting(self) -> str:
+        return self.record.setting
+
+    def __repr__(self) -> str:
+        return f"<Subset {self.name}: {len(self.episodes)} of {self.record.episodes} episodes>"
+
+    def __getstate__(self) -> dict[str, Any]:  # zarr handles are opened again where the subset lands
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("group", "lengths", "returns", "paths")
+        }
+
+    @functools.cached_property
+    def group(self) -> zarr.Group:
+        """The Zarr group, read-only."""
+        options = self._storage_options if is_url(self.root) else None
+        with storage_errors(self.path, decoding=True):
+            return zarr.open_group(self.path, mode="r", storage_options=options)
+
+    @property
+    def path(self) -> str:
+        """Folder or URL of the Zarr group."""
+        return f"{self.root}/{subset_path(self.name)}"
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        return dict(self.group.attrs)
+
+    @functools.cached_property
+    def paths(self) -> dict[str, str]:
+        """Array name -> path in the Zarr group, see `schema.stored_name`."""
+        with storage_errors(self.path, decoding=True):
+            members = self.group.members(max_depth=None)
+            return {str(item.attrs.get("array", path)): path for path, item in members if isinstance(item, zarr.Array)}
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        """Names of all arrays, e.g. "pixels", "pixels/top", "exogenous/camera_position"."""
+        return tuple(sorted(self.paths))
+
+    def array(self, name: str) -> StoredArray:
+        """One array, read when indexed, with an entry for each episode that the subset will have.
+
+        Raises:
+          UnknownNameError: the subset has no such array.
+        """
+        picture = picture_of(name) is not None
+        if name not in self.paths:
+            if picture and not self.record.pixels:
+                raise StoreError(self._without_pictures)
+            raise UnknownNameError(f"array of {self.name}", name, self.arrays)
+        unpainted = self.unpainted if picture else None
+        with storage_errors(self.path, decoding=True):
+            array = self.group[self.paths[name]]
+            assert isinstance(array, zarr.Array)  # `paths` names arrays alone
+            self._check_shape(array, name)
+            return StoredArray(array, name, f"{self.path}/{self.paths[name]}", unpainted, self._without_pictures)
+
+    @property
+    def unpainted(self) -> np.ndarray:
+        """(episode of the whole subset,) bool: committed, but without pictures."""
+        without = np.zeros(self.record.episodes, bool)
+        for commit in self.commits.values():
+            without[slice(*commit.episodes)] = not commit.painted
+        return without
+
+    @property
+    def _without_pictures(self) -> str:
+        return (
+            f"{self.name} has no pictures for (all of) its episodes; paint them: `dmcvb-gen paint "
+            f"{public(self.root)}`, or open the release with paint=True"
+        )
+
+    def _check_shape(self, array: zarr.Array, name: str) -> None:
+        """Raises StoreError for an array of more episodes, steps or bytes a step than the manifest can mean."""
+        record = self.record
+        largest = (record.max_steps + 1) * max(16 * record.size**2, MAX_STEP_BYTES)
+        entry = math.prod(array.shape[1:]) * array.dtype.itemsize
+        rows = array.shape[1] if array.ndim > 1 else 1
+        episodes = array.shape[0] if array.ndim else 0
+        many = episodes > max(10 * record.episodes, MANY_EPISODES)
+        if not episodes or many or entry > largest or rows > record.max_steps + 1:
+            raise StoreError(
+                f"{name} of {self.name} is {array.dtype} {array.shape}, which does not fit {record.episodes} episodes "
+                f"of {record.max_steps} steps; regenerate or fetch the release again"
+            )
+
+    @property
+    def pixel_arrays(self) -> tuple[str, ...]:
+        return tuple(name for name in self.arrays if picture_of(name) is not None)
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """(episode,) int: indices of the committed episodes."""
+        ranges = [np.arange(*self.commits[shard].episodes) for shard in sorted(self.commits)]
+        return np.concatenate(ranges) if ranges else np.zeros(0, int)
+
+    @functools.cached_property
+    def lengths(self) -> np.ndarray:
+        """(episode,) int32: transitions of each committed episode, in the order of `episodes`."""
+        return self.array("length")[:][self.episodes]
+
+    @functools.cached_property
+    def returns(self) -> np.ndarray:
+        """(episode,) float64: return of each committed episode, in the order of `episodes`."""
+        return self.array("return")[:][self.episodes]
+
+    @property
+    def steps(self) -> int:
+        """Transitions in all committed episodes."""
+        return sum(commit.steps for commit in self.commits.values())
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all committed shard files."""
+        return sum(file.bytes for commit in self.commits.values() for file in commit.files)
+
+    def read(self, array: str, episodes: slice | Iterable[int] | None = None) -> np.ndarray:
+        """Values of one array.
+
+        Args:
+          array: a name out of `arrays`.
+          episodes: indices of committed episodes (all of them by default).
+
+        Returns:
+          (episode, step, ...) for arrays with steps, rows past an episode's length are zero; else (episode, ...).
+        """
+        source = self.array(array)
+        if episodes is None:
+            chosen = self.episodes
+        elif isinstance(episodes, slice):
+            chosen = self.episodes[np.isin(self.episodes, np.arange(self.record.episodes)[episodes])]
+        else:
+            chosen = np.atleast_1d(np.asarray(list(episodes), int))
+            missing = np.setdiff1d(chosen, self.episodes)
+            if len(missing):
+                raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
+        if not len(chosen):
+            return np.zeros((0, *source.shape[1:]), source.dtype)
+        return source.rows(chosen)
+
+    def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """One episode, cut to its length L.
+
+        Returns:
+          Arrays by name: L + 1 rows of pixels, state, physics and labels; L rows of action, reward and discount.
+        """
+        length = int(self.read("length", [index])[0])
+        values = {}
+        for name in self.arrays if arrays is None else arrays:
+            value = self.read(name, [index])[0]
+            if self.array(name).ndim > 1:
+                value = value[: length if name in ("action", "reward", "discount") else length + 1]
+            values[name] = value
+        return values
+
+
+def _ranges(indices: np.ndarray) -> str:
+    if not len(indices):
+        return "none yet"
+    breaks = np.flatnonzero(np.diff(indices) != 1)
+    starts, ends = np.r_[0, breaks + 1], np.r_[breaks, len(indices) - 1]
+    return ", ".join(f"{indices[a]}..{indices[b]}" for a, b in zip(starts, ends, strict=True))
+
+
+class Release:
+    """A release, read-only: `manifest` and `subsets` (name -> Subset)."""
+
+    def __init__(self, root: str, manifest: Manifest, subsets: Mapping[str, Subset]):
+        self.root, self.manifest, self.subsets = root, manifest, subsets
+
+    def __repr__(self) -> str:
+        return f"<Release {self.manifest.name} {self.manifest.version}: {pluralize(len(self.subsets), 'subsets')}>"
+
+    def __getitem__(self, name: str) -> Subset:
+        if name in self.shortfalls and name not in self.subsets:
+            raise StoreError(
+                f"{name} belongs to {self.manifest.name}, but none of its episodes are here: not made or fetched yet, "
+                f"or damaged; `dmcvb-gen verify {public(self.root)}` says which"
+            )
+        if name not in self.subsets:
+            raise UnknownNameError("subset", name, self.subsets)
+        return self.subsets[name]
+
+    @property
+    def shortfalls(self) -> dict[str, tuple[int, int]]:
+        """Subsets of the manifest that are not whole here -> (episodes here, episodes that belong to them)."""
+        here = {record.name: 0 for record in self.manifest.subsets}
+        here |= {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        planned = {record.name: record.episodes for record in self.manifest.subsets}
+        return {name: (count, planned[name]) for name, count in here.items() if count < planned[name]}
+
+    @property
+    def path(self) -> Path:
+        """The folder of a local release."""
+        if is_url(self.root):
+            raise StoreError(f"{public(self.root)} is not a local folder; fetch it first")
+        return Path(self.root)
+
+
+def open_release(path: str | Path, storage_options: dict | None = None, skip: Collection[str] = frozenset()) -> Release:
+    """Open a release for reading.
+
+    Args:
+      path: its folder, or an fsspec URL such as "s3://bucket/name".
+      storage_options: passed to fsspec for a URL.
+      skip: subsets that are known to be damaged, to be left out.
+
+    Raises:
+      StoreError: there is no release, or its manifest or a commit record is damaged.
+    """
+    path, options = str(path), storage_options or {}
+
+    def wanted(manifest: Manifest) -> list[SubsetRecord]:
+        return [record for record in manifest.subsets if record.name not in skip]
+
+    if not is_url(path):
+        root = Path(path)
+        manifest = local_manifest(root)
+        commits = {subset.name: read_commits(root, subset) for subset in wanted(manifest)}
+    else:
+        if path.startswith("file:") and "://" not in path:
+            path = "file://" + path.removeprefix("file:")
+        path = path.rstrip("/")
+        filesystem, base = file_system(path, options)
+        with storage_errors(path):
+            try:
+                text = filesystem.cat_file(f"{base}/{MANIFEST}")
+            except FileNotFoundError:
+                raise StoreError(f"{public(path)} holds no release (no {MANIFEST}); check the URL") from None
+            manifest = parse_manifest(text, f"{public(path)}/{MANIFEST}")
+            commits = {
+                subset.name: _remote_commits(filesystem, base, subset, path, manifest.complete)
+                for subset in wanted(manifest)
+            }
+    subsets = {record.name: Subset(path, record, commits[record.name], options) for record in wanted(manifest)}
+    return Release(path, manifest, {name: subset for name, subset in subsets.items() if len(subset.commits)})
+
+
+def load_manifest(root: str | Path) -> tuple[Path, Manifest]:
+    """A local release's folder and manifest.
+
+    Args:
+      root: the folder, or a manifest's file, whose folder may hold nothing else.
+
+    Raises:
+      StoreError: there is none, it is a URL, damaged, or cannot be read.
+    """
+    if is_url(str(root)):
+        raise StoreError(f"{public(str(root))} is not a local folder; fetch it first")
+    root = Path(root)
+    with storage_errors(root):
+        if root.is_file():
+            return root.parent, parse_manifest(root.read_bytes(), str(root))
+    return root, local_manifest(root)
+
+
+def _remote_commits(
+    filesystem: Any, base: str, subset: SubsetRecord, place: str, complete: bool
+) -> dict[int, CommitRecord]:
+    """The committed shards of a subset at a URL, shard -> record.
+
+    What cannot be read is raised: left out, it would be a release with fewer episodes. But where keys may not be
+    listed, buckets refuse those that do not exist, as a release that is being made lacks some.
+    """
+    paths = {f"{base}/{commit_path(subset.name, shard)}": shard for shard in range(shard_count(subset))}
+    found = filesystem.cat(list(paths), on_error="return")
+    if not isinstance(found, dict):  # fsspec gives what a single path has
+        found = {next(iter(paths)): found}
+    absent = (FileNotFoundError, NotADirectoryError, *(() if complete else (PermissionError,)))
+    shards = {path.lstrip("/"): shard for path, shard in paths.items()}  # some file systems give other slashes back
+    commits = {}
+    for path, text in found.items():
+        if isinstance(text, absent):
+            continue
+        if isinstance(text, BaseException):
+            raise text
+        shard = shards[path.lstrip("/")]
+        where = f"{public(place)}/{commit_path(subset.name, shard)}"
+        commits[shard] = checked_commit(text, where, subset, shard)
+    return commits

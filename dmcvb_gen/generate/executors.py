@@ -1,0 +1,105 @@
+"""Doing many jobs: in this process, in worker processes or on a Ray cluster; the data do not depend on which."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
+from dmcvb_gen.generate.jobs import Job
+from dmcvb_gen.generate.painting import frame_count
+from dmcvb_gen.generate.site import leave
+from dmcvb_gen.generate.worker import JobResult, run_job
+from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.tasks import get_task
+
+PROCESS_BYTES = 1 << 30
+"""Memory of a worker before it holds any episode: libraries, models, a renderer's buffers."""
+GPU_SHARE = 0.25
+"""Of a GPU, for a worker that paints there; the rest of its time it simulates."""
+
+
+def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: ProgressCallback = ignore) -> Iterator[JobResult]:
+    """Run jobs and give their results as they come.
+
+    Args:
+      workers: processes, each with physics on one core; 1 works in this process, with physics on all cores; or a Ray
+        cluster.
+      tick: told how many frames were painted since the last call; it expects full episodes at first, and then such as
+        those that are done (mazes end early).
+
+    Raises:
+      StoreError: a worker was killed (often for memory); what was committed is safe.
+    """
+    kept = "what was committed is safe: run the same command again (fewer --episodes-per-shard need less memory)"
+    alone = workers == 1 or len(jobs) <= 1 and isinstance(workers, int)
+    with open_pool(workers, tick=tick, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
+        for job in jobs:
+            pool.submit(job, run_job, job, os.cpu_count() or 1 if alone else 1)
+        expected = _Expected(jobs)
+        expect(tick, expected.frames)
+        try:
+            for job, result in pool.results():
+                expected.done(job, result)
+                expect(tick, expected.frames)
+                yield result
+        finally:
+            for site in {job.site for job in jobs}:
+                leave(site)
+
+
+class _Expected:
+    """How many frames jobs paint, all in all: full episodes where none is known, then such as those that are done."""
+
+    def __init__(self, jobs: Sequence[Job]):
+        self._open: Counter = Counter()
+        self._ended: Counter = Counter()
+        self._painted: Counter = Counter()
+        for job in jobs:
+            self._open[self._kind(job)] += self._planned(job)
+
+    def done(self, job: Job, result: JobResult) -> None:
+        """A job ended: others of its task and level end as early."""
+        kind, planned, episodes = self._kind(job), self._planned(job), len(job.episodes) * len(job.subsets)
+        self._open[kind] -= planned
+        self._ended[kind] += planned
+        self._painted[kind] += round(planned * (result.steps + episodes) / (job.frames + episodes))
+
+    @property
+    def frames(self) -> int:
+        shares = {kind: self._painted[kind] / planned for kind, planned in self._ended.items()}
+        to_come = (planned * shares.get(kind, 1) for kind, planned in self._open.items())
+        return sum(self._painted.values()) + round(sum(to_come))
+
+    @staticmethod
+    def _kind(job: Job) -> tuple[str, str]:
+        return job.subsets[0].task, job.subsets[0].level
+
+    @staticmethod
+    def _planned(job: Job) -> int:
+        count = len(job.episodes)
+        return sum(frame_count(record, count * record.max_steps, count) for record in job.subsets)
+
+
+def needs_of(jobs: Sequence[Job]) -> Needs:
+    """What a job takes at most."""
+    cuda = any(job.device != "cpu" for job in jobs)
+    return Needs(memory=max(map(_memory, jobs), default=0), gpus=GPU_SHARE if cuda else 0)
+
+
+def _memory(job: Job) -> int:
+    """Bytes that a job holds at its height: all that was simulated, and two picture arrays of one setting."""
+    record = job.subsets[0]
+    specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
+    rows = len(job.episodes) * (record.max_steps + 1)
+    simulated = sum(_row_bytes(spec) for spec in specs if not spec.picture)
+    pictures = 2 * max((_row_bytes(spec) for spec in specs if spec.picture), default=0)
+    return PROCESS_BYTES + rows * (simulated + pictures)
+
+
+def _row_bytes(spec) -> int:
+    size = 8
+    for count in spec.shape:
+        size *= count
+    return size // 8 if spec.picture else size

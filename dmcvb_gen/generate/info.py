@@ -1,0 +1,91 @@
+"""What is in a release and in the package, as plain values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.names import DIFFICULTIES, DISTRACTOR_KINDS, FIXED, GOAL_MODES, LEVELS
+from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.version import __version__
+
+
+def return_statistics(returns: np.ndarray) -> dict[str, float]:
+    """Mean, std, min, quartiles and max of episode returns (NaN without episodes)."""
+    if not len(returns):
+        return {name: float("nan") for name in ("mean", "std", "min", "p25", "median", "p75", "max")}
+    low, p25, median, p75, high = np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))
+    values = dict(mean=returns.mean(), std=returns.std(), min=low, p25=p25, median=median, p75=p75, max=high)
+    return {name: float(value) for name, value in values.items()}
+
+
+def describe_release(path: str | Path, storage_options: dict | None = None) -> dict[str, Any]:
+    """Subsets of a release with episodes, steps, bytes and returns, the paper's row beside each.
+
+    Raises:
+      StoreError: there is no release at `path`.
+    """
+    release = open_release(path, storage_options)
+    subsets = []
+    for name, subset in release.subsets.items():
+        subsets.append(
+            dict(
+                name=name,
+                episodes=len(subset.episodes),
+                episodes_planned=subset.record.episodes,
+                complete=len(subset.episodes) == subset.record.episodes,
+                steps=subset.steps,
+                bytes=subset.bytes,
+                bytes_per_step=subset.bytes / max(subset.steps, 1),
+                size=subset.record.size,
+                renderer=subset.record.renderer.get("name"),
+                digest=subset.record.digest,
+                returns=return_statistics(subset.returns),
+                paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
+            )
+        )
+    return dict(
+        name=release.manifest.name,
+        version=release.manifest.version,
+        generator=release.manifest.generator,
+        complete=release.manifest.complete,
+        digest=release.manifest.digest,
+        steps=sum(subset["steps"] for subset in subsets),
+        bytes=sum(subset["bytes"] for subset in subsets),
+        subsets=subsets,
+    )
+
+
+def describe_package() -> dict[str, Any]:
+    """Tasks, levels, distractors, bundled behaviours, recipes, and renderers with why they cannot start here."""
+    from dmcvb_gen.generate.recipe import shipped_recipes
+    from dmcvb_gen.policies.bundled import bundled_levels
+    from dmcvb_gen.rendering import available_renderers
+    from dmcvb_gen.tasks import get_task, task_ids
+
+    tasks = []
+    for task_id in task_ids():
+        task = get_task(task_id)
+        tasks.append(
+            dict(
+                id=task_id,
+                state=task.state_size,
+                action=task.action_size,
+                max_steps=task.max_steps,
+                views=list(task.views),
+                behaviours=bundled_levels(task_id),
+            )
+        )
+    return dict(
+        version=__version__,
+        tasks=tasks,
+        levels=list(LEVELS),
+        distractors=list(DISTRACTOR_KINDS),
+        difficulties=list(DIFFICULTIES),
+        maze_settings=list(GOAL_MODES),
+        recipes=list(shipped_recipes()),
+        renderers=available_renderers(),
+    )

@@ -1,0 +1,245 @@
+"""From states to stored pictures: physics states and a subset's record in, labels and picture arrays out.
+
+What a rollout, a repaint, a check and a reader that paints on read have in common.
+"""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Callable, Collection, Iterator
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset.pictures import picture_arrays
+from dmcvb_gen.distractor_state import DistractorState
+from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
+from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.names import distractor_of
+from dmcvb_gen.parallel import ProgressCallback, ignore
+from dmcvb_gen.rendering import available_renderers, make_renderer
+from dmcvb_gen.rendering.base import Renderer
+from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.base import Task
+
+PAINT_FRAMES = 2004
+"""Frames painted between two ticks of the progress bar."""
+SIMULATION_STREAMS = ("initial_state", "policy")
+"""Streams of an episode that the simulation uses; the others are the distractors'."""
+
+
+def check_renderer(name: str) -> None:
+    """Raises an error when a renderer is unknown or cannot start here."""
+    available = available_renderers()
+    if name not in available:
+        raise UnknownNameError("renderer", name, available)
+    if available[name]:
+        raise RenderingError(f"renderer {name!r} cannot start here: {available[name]}")
+
+
+def renderer_for(
+    record: SubsetRecord, backgrounds: str, split: str | None = None, device: str = "cpu", **overrides: Any
+) -> tuple[Renderer, Any]:
+    """The renderer of a subset (and its backgrounds, None where the setting shows none).
+
+    Args:
+      backgrounds: "builtin" or a folder of videos.
+      split: "train" or "val" videos; the record's by default.
+      device: "cpu" or "cuda".
+      overrides: name and samples, where not the record's.
+    """
+    task, setting = get_task(record.task), distractor_of(record.task, record.setting)
+    videos = None if setting.kind == "none" else load_backgrounds(backgrounds, split or record.split)
+    choice = {"name": record.renderer["name"], "samples": record.renderer.get("samples")} | overrides
+    name = choice.pop("name")
+    renderer = make_renderer(
+        name,
+        task,
+        record.size,
+        backgrounds=videos,
+        floor_alpha=floor_alpha_for(task, setting),
+        device=device,
+        **choice,
+    )
+    return renderer, videos
+
+
+class RendererCache:
+    """Renderers by what decides them, so that the shards of a subset share one; one at a time, they are large."""
+
+    def __init__(self):
+        self._made: dict[tuple, tuple[Renderer, Any]] = {}
+
+    def get(self, record: SubsetRecord, backgrounds: str, device: str) -> tuple[Renderer, Any]:
+        """As `renderer_for`."""
+        setting = distractor_of(record.task, record.setting)
+        key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
+        key += (backgrounds, record.split, device)
+        if key not in self._made:
+            self.close()
+            self._made[key] = renderer_for(record, backgrounds, record.split, device)
+            atexit.unregister(self.close)
+            atexit.register(self.close)  # now, before OpenGL's library ends: it may have come with this renderer
+        return self._made[key]
+
+    def close(self) -> None:
+        """Free what is held."""
+        for renderer, _ in self._made.values():
+            renderer.close()
+        self._made.clear()
+
+
+renderers = RendererCache()
+"""Of this process."""
+
+
+def distractor_state_of(
+    record: SubsetRecord,
+    seed: int,
+    names: tuple[str, ...],
+    episodes: np.ndarray,
+    physics: np.ndarray,
+    length: np.ndarray,
+    backgrounds: Any,
+) -> DistractorState:
+    """Distractor labels of episodes, leading shape (episode, row); rows past an episode's end are zero.
+
+    Args:
+      seed, names: of the episodes' streams.
+      episodes: (episode,) indices in the subset.
+      physics: (episode, row, physics) float64.
+      length: (episode,) transitions of each.
+      backgrounds: the videos, None where the setting shows none.
+    """
+    task = get_task(record.task)
+    rows = int(length.max()) + 1
+    after = np.arange(rows)[None] > length[:, None]
+    padded = physics[:, :rows].copy()
+    last = physics[np.arange(len(physics)), length]
+    padded[after] = np.repeat(last, after.sum(axis=1), axis=0)  # a state that MuJoCo can be put into
+    generators = {
+        name: [episode_stream(seed, names, int(i), name) for i in episodes]
+        for name in STREAMS
+        if name not in SIMULATION_STREAMS
+    }
+    setting = distractor_of(record.task, record.setting)
+    return sample_distractors(task, setting, padded, generators, backgrounds, split=record.split)
+
+
+def frame_count(record: SubsetRecord, steps: int, episodes: int) -> int:
+    """How many frames a tick is told of for some episodes of a subset: of each view, where it has pictures."""
+    return (steps + episodes) * (len(record.views) if record.pixels else 1)
+
+
+def paint(
+    task: Task,
+    renderer: Renderer,
+    physics: np.ndarray,
+    exogenous: DistractorState,
+    length: np.ndarray,
+    rows: int,
+    tick: ProgressCallback = ignore,
+    arrays: Collection[str] | None = None,
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Pictures of episodes, one array at a time.
+
+    Args:
+      arrays: only these, by name; all of the task's views, with the goal and without it, by default.
+
+    Yields:
+      (name, (episode, rows, size, size, 3) uint8); rows past an episode's end stay zero.
+    """
+    episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
+    size, total = renderer.size, len(episode)
+    names = zip(picture_arrays(task.views), picture_arrays(task.views, hide_goal=True), strict=True)
+    for view, (name, hidden_name) in zip(task.views, names, strict=True):
+        if arrays is not None and name not in arrays and hidden_name not in arrays:
+            continue
+        picture, without_goal = np.zeros((len(physics), rows, size, size, 3), np.uint8), []
+        hides, seen = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays), np.zeros(0, int)
+        spans: list = []
+        if hides:
+            seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
+            seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
+        for first in range(0, total, PAINT_FRAMES):
+            frames = np.arange(first, min(first + PAINT_FRAMES, total))
+            twice = np.isin(frames, seen)
+            for both, some in ((False, frames[~twice]), (True, frames[twice])):
+                if len(some):
+                    e, r = episode[some], row[some]
+                    paint_them: Callable[..., Any] = renderer.render_pair if both else renderer.render
+                    painted = paint_them(physics[e, r], exogenous[e, r], views=[view])
+                    picture[e, r] = (painted[0] if both else painted)[:, 0]
+                    without_goal += [(e, r, painted[1][:, 0])] if both else []
+            tick(len(frames))
+        if arrays is None or name in arrays:
+            yield name, picture
+        if not hides:
+            continue
+        shown = [picture[e, rows[0]].copy() for e, rows in spans]
+        hidden = picture
+        for e, r, frames in without_goal:
+            hidden[e, r] = frames
+        for (one, rows_of), before in zip(spans, shown, strict=True):
+            behind = hidden[one, rows_of[0]]
+            covered = (behind != before).any(axis=-1, keepdims=True)
+            hidden[one, rows_of[1:]] = np.where(covered, behind, hidden[one, rows_of[1:]])
+        yield hidden_name, hidden
+
+
+def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: DistractorState) -> np.ndarray:
+    """Indices of the frames in which the goal (or its shadow) may change a pixel; the others share their pictures."""
+    if not hasattr(task, "goal_in_sight"):
+        return np.arange(len(physics))
+    return np.flatnonzero(task.goal_in_sight(view, physics, exogenous))
+
+
+def _spans_of_one_background(
+    task: Task,
+    view: str,
+    size: int,
+    physics: np.ndarray,
+    exogenous: DistractorState,
+    episode: np.ndarray,
+    row: np.ndarray,
+    seen: np.ndarray,
+) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+    """Frames that need no picture of their own with the goal hidden.
+
+    Where the camera stands still, and nothing that moves is near the goal, what is behind the goal is the same in
+    every frame of an episode: one hidden picture tells it for all.
+
+    Returns:
+      What is left of `seen`, and (episode, rows): hide the goal in the first of the rows, copy its pixels to the rest.
+    """
+    if not len(seen) or not hasattr(task, "goal_alone"):
+        return seen, []
+    index = task.views.index(view)
+    alone = np.zeros(len(episode), bool)
+    alone[seen] = task.goal_alone(physics[episode[seen], row[seen]], size)
+    spans = []
+    for e in np.unique(episode[seen]):
+        frames = np.flatnonzero(alone & (episode == e))
+        poses = [field[e, row[frames], index] for field in (exogenous.camera_position, exogenous.camera_quaternion)]
+        if len(frames) > 1 and all((pose == pose[0]).all() for pose in poses):
+            spans.append((int(e), row[frames]))
+            alone[frames[0]] = False
+        else:
+            alone[frames] = False
+    return seen[~alone[seen]], spans
+
+
+def len_rows(exogenous: DistractorState) -> int:
+    """Rows of labels with leading shape (episode, row)."""
+    return exogenous.background_video.shape[1]
+
+
+def label_arrays(exogenous: DistractorState, length: np.ndarray, rows: int) -> Iterator[tuple[str, np.ndarray]]:
+    """The labels under their stored names, rows past an episode's end zero."""
+    for name, value in exogenous.items():
+        full = np.zeros((value.shape[0], rows, *value.shape[2:]), value.dtype)
+        full[:, : value.shape[1]] = value
+        full[np.arange(rows)[None] > length[:, None]] = 0
+        yield f"exogenous/{name}", full

@@ -1,0 +1,506 @@
+"""From a recipe to work: checks everything that can be wrong, then lists the jobs; no episode is made here."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from dmcvb_gen.dataset.append import merged
+from dmcvb_gen.dataset.index import (
+    INDEX,
+    POLICIES,
+    ZARR_JSON,
+    metadata_files,
+    parse_index,
+    refuse_altered,
+    refuse_altered_folder,
+    trusted_index,
+)
+from dmcvb_gen.dataset.manifest import (
+    MANIFEST,
+    FileRecord,
+    Manifest,
+    PolicyRecord,
+    SubsetRecord,
+    environment,
+    subset_path,
+)
+from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
+from dmcvb_gen.dataset.shards import chosen_shards
+from dmcvb_gen.dataset.transfer import in_parallel
+from dmcvb_gen.dataset.writer import create_subset, finish_release, finish_together, mark_created, start_release
+from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.errors import BackgroundError, StoreError
+from dmcvb_gen.files import copy_file, json_bytes, sha256_bytes, sha256_file, write_bytes
+from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs, part_of
+from dmcvb_gen.generate.painting import check_renderer, renderer_for
+from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
+from dmcvb_gen.generate.site import CONNECTIONS, BucketSite, FolderSite, Site
+from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
+from dmcvb_gen.parallel import ignore
+from dmcvb_gen.policies.bundled import resolve_policies
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
+from dmcvb_gen.tasks.base import Task
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a rollout will do.
+
+    Attributes:
+      site: where the release is made.
+      manifest: of the release as it will be.
+      inputs: of each subset, by name; None where the release's own copies serve.
+      jobs: what is still to do, settings that share trajectories together.
+      done: committed shards that are there already.
+    """
+
+    site: Site
+    manifest: Manifest
+    inputs: Mapping[str, Inputs] | None
+    jobs: tuple[Job, ...]
+    done: int
+
+    @property
+    def episodes(self) -> int:
+        return sum(len(job.episodes) * len(job.subsets) for job in self.jobs)
+
+    @property
+    def steps(self) -> int:
+        return sum(job.frames for job in self.jobs)
+
+
+def make_plan(
+    recipe: Recipe | None,
+    out: str | Path | Site,
+    only: Sequence[str] = (),
+    device: str | None = None,
+    episodes: tuple[int, int] | None = None,
+    part: tuple[int, int] = (1, 1),
+    pixels: bool = True,
+) -> Plan:
+    """Check a recipe and list its jobs.
+
+    Args:
+      recipe: None goes on with the release that is there, from its manifest alone.
+      out: the release's folder or site; what is committed there already is left out of the jobs.
+      only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
+      device: where pictures are painted; by default where the release that is there was begun, or on the CPU.
+      episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
+      part: (K, N): of all jobs, done or not, every N-th from the K-th on.
+      pixels: paint pictures; without, `release.paint` can do it later.
+
+    Raises:
+      DmcvbError: anything that would fail later, found before any work.
+    """
+    site = out if isinstance(out, Site) else FolderSite(local_path(out))
+    there = site.manifest()
+    if recipe is not None:
+        manifest, inputs = describe(recipe, device or "cpu", pixels)
+    elif there is not None:
+        _check_goes_on(there, site, device, pixels)
+        manifest, inputs = there, None
+    else:
+        raise StoreError(f"{site.place} holds no release to go on with; give TASKs or --recipe")
+    asked = {record.name for record in manifest.subsets}
+    grown = manifest if there is None else merged(there, manifest, site.place)
+    grown = grown.model_copy(update={"subsets": tuple(record for record in grown.subsets if record.name in asked)})
+    shards = chosen_shards(grown, only, episodes)
+    records = list({record.name: record for record in shards.values()}.values())
+    done = site.commits(records) if there is not None else {}
+    jobs = part_of(make_jobs(grown, shards, site, None if site.slow else inputs, device), part)
+    left = left_to_do(jobs, done)
+    return Plan(site, manifest, inputs, left, _count(jobs) - _count(left))
+
+
+def _check_goes_on(there: Manifest, site: Site, device: str | None, pixels: bool) -> None:
+    """Raises StoreError where a release that goes on from its manifest cannot be as the options want it."""
+    painted = any(record.pixels for record in there.subsets)
+    if not pixels and painted:
+        raise StoreError(
+            f"{site.place} was begun with pictures and goes on with them; leave out --no-pixels, or give TASKs or "
+            "--recipe with another --out"
+        )
+    if device not in (None, "cpu") and not painted:
+        raise StoreError(
+            f"{site.place} was begun without pictures, so none are painted on {device}; leave out --device"
+        )
+
+
+def _count(jobs: Sequence[Job]) -> int:
+    return sum(len(job.subsets) for job in jobs)
+
+
+# -- what the release will be ---------------------------------------------------------------------
+
+
+def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[Manifest, dict[str, Inputs]]:
+    """The manifest of a recipe's release, as it is before any shard, and what each subset is made from.
+
+    The manifest names no place of this machine: policies and videos go by where the release keeps its copies.
+
+    Raises:
+      DmcvbError: a name, a policy, the videos or the renderer cannot be used.
+    """
+    check_renderer(recipe.renderer.backend)
+    requests = expand(recipe)
+    records, inputs = {}, {}
+    painted: dict[tuple, dict[str, Any]] = {}
+    for request in requests:
+        files = request.level != "random" and resolve_policies(request.task, request.level, request.policy) or []
+        record = _record(recipe, request, files)
+        look = (record.task, distractor_of(record.task, record.setting))
+        if look not in painted:
+            painted[look] = painting_facts(record, recipe.backgrounds, device)
+        records[request.name] = record.model_copy(update=painted[look] | {"pixels": pixels})
+        inputs[request.name] = Inputs(tuple(map(str, files)), recipe.backgrounds)
+    manifest = Manifest(
+        name=recipe.name,
+        version=recipe.version,
+        license=recipe.license,
+        authors=recipe.authors,
+        recipe=_without_local_paths(recipe, requests, records),
+        subsets=tuple(records.values()),
+        environments=(environment(device),),
+    )
+    return manifest, inputs
+
+
+def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> SubsetRecord:
+    """What the manifest says of a subset, but for what its painter says of itself."""
+    task = get_task(request.task)
+    per_goal = request.episodes_per_goal
+    goals = per_goal and request.episodes // per_goal
+    if goals:
+        fixed_pairs(as_maze(task).layout, goals, recipe.seed)
+    return SubsetRecord(
+        name=request.name,
+        task=request.task,
+        level=request.level,
+        setting=request.setting,
+        episodes=request.episodes,
+        episodes_per_shard=request.episodes_per_shard,
+        size=recipe.size,
+        deterministic=request.deterministic,
+        policies=tuple(_policy_record(path, task) for path in files),
+        renderer={"name": recipe.renderer.backend, "samples": recipe.renderer.samples},
+        family=task.family,
+        views=tuple(task.views),
+        hidden_goal=bool(task.goal_geoms) and hides_goal(request.setting),
+        max_steps=request.max_steps,
+        fixed_goals=goals,
+        episodes_per_goal=per_goal,
+        split=recipe.split,
+    )
+
+
+def _policy_record(path: Path, task: Task) -> PolicyRecord:
+    policy = load_policy(path, task)
+    header = policy.header.without_local_paths().model_dump(mode="json")
+    return PolicyRecord(name=path.stem, digest=policy.digest, path=policy_path(path), header=header)
+
+
+def policy_path(file: str | Path) -> str:
+    """Where a release keeps its copy of a policy file."""
+    return f"{POLICIES}{sha256_file(file)[:16]}.safetensors"
+
+
+def painting_facts(record: SubsetRecord, backgrounds: str, device: str) -> dict[str, Any]:
+    """`renderer` and `backgrounds` of a subset's record, from a painter that was started for it.
+
+    Raises:
+      DmcvbError: the videos or the renderer cannot be used.
+    """
+    renderer, videos = renderer_for(record, backgrounds, device=device)
+    facts = renderer.describe()
+    renderer.close()
+    shown = None
+    if videos:
+        source = BUILTIN if backgrounds == BUILTIN else f"backgrounds/{videos.digest[:16]}"
+        shown = {"source": source, "split": record.split, "digest": videos.digest}
+    return {"renderer": record.renderer | facts, "backgrounds": shown}
+
+
+def _without_local_paths(
+    recipe: Recipe, requests: Sequence[SubsetRequest], records: Mapping[str, SubsetRecord]
+) -> dict:
+    """The recipe for the manifest: files and folders of this machine go by the release's copies."""
+    copies: dict[str, dict[str, None]] = {}
+    for request in requests:
+        if request.policy:
+            found = copies.setdefault(request.policy, {})
+            found |= dict.fromkeys(str(policy.path) for policy in records[request.name].policies)
+    data = recipe.model_dump(mode="json")
+    for pattern in data["subsets"]:
+        pattern["policies"] = {level: ",".join(copies[given]) for level, given in pattern["policies"].items()}
+    shown = {record.backgrounds["source"] for record in records.values() if record.backgrounds}
+    data["backgrounds"] = shown.pop() if shown else BUILTIN
+    return data
+
+
+# -- the release's folder or bucket ---------------------------------------------------------------
+
+
+def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False, shared: bool = False) -> Plan:
+    """Create the release: its manifest, policies, videos and empty arrays; a plan whose manifest is the one there.
+
+    Args:
+      expected_bytes: room that will be needed in the folder.
+      other_versions: go on although packages have other versions here than where the release was begun.
+      shared: other machines write to the folder too, so the manifest is written by the first of all alone.
+
+    Raises:
+      StoreError: what is there contradicts this recipe or was begun with other versions; it cannot be written, or the
+        disk lacks the room.
+    """
+    there = plan.site.manifest()
+    if there is not None:
+        if not other_versions:
+            check_versions(there)
+    if isinstance(plan.site, FolderSite):
+        manifest = _prepare_folder(plan, plan.site.root, there, expected_bytes, shared)
+    elif there is None:
+        manifest = _prepare_bucket(plan, cast(BucketSite, plan.site))
+    else:
+        manifest = _grow_bucket(plan, cast(BucketSite, plan.site), there)
+    return replace(plan, manifest=manifest)
+
+
+def check_versions(manifest: Manifest) -> None:
+    """Raises StoreError where a package has another version here than where a release was begun."""
+    begun, here = manifest.environments[0] if manifest.environments else {}, environment()
+    for name, version in here.items():
+        if name not in ("system", "cpu", "device") and begun.get(name, version) != version:
+            raise StoreError(
+                f"the release was begun with {name} {begun[name]} and this is {name} {version}, which may change bits; "
+                f"install {name} {begun[name]}, or give --other-versions"
+            )
+
+
+def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
+    kept = there is not None and merged(there, plan.manifest, str(root)) is there
+    if there is not None and kept and (shared or _is_done(there, plan)):
+        manifest = there
+    else:
+        manifest = start_release(root, plan.manifest)
+    free = shutil.disk_usage(root).free
+    if expected_bytes > free:
+        raise StoreError(
+            f"about {expected_bytes / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free "
+            f"at {root}; make room, choose another --out or fewer --episodes"
+        )
+    wanted = {record.name for job in plan.jobs for record in job.subsets}
+    records = [
+        record
+        for record in manifest.subsets
+        if shared
+        or record.name in wanted
+        or ((root / subset_path(record.name) / ZARR_JSON).is_file() and not record.imported)  # which may grow
+    ]
+    if plan.inputs is not None:
+        copy_inputs(root, [record for record in records if record.name in plan.inputs], plan.inputs)
+    create_groups(root, manifest, records)
+    return manifest
+
+
+def _prepare_bucket(plan: Plan, site: BucketSite) -> Manifest:
+    """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
+    with _desk(site) as folder:
+        begun = _begun(folder, plan, plan.manifest, plan.manifest.subsets)
+        strange = set(site.listing()) - set(begun) - {MANIFEST}
+        if strange and site.manifest() is None:
+            raise StoreError(
+                f"{site.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
+            )
+        in_parallel(lambda name: site.write(name, begun[name].read_bytes()), list(begun), CONNECTIONS, ignore)
+    if site.create(MANIFEST, json_bytes(plan.manifest)):
+        return plan.manifest
+    first = site.manifest()
+    if first is None:
+        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
+    return _grow_bucket(plan, site, first)
+
+
+@contextlib.contextmanager
+def _desk(site: Site) -> Iterator[Path]:
+    """A folder of one's own in a site's scratch, for a moment; no room there is one line."""
+    with storage_errors(site.workshop, "write to"), tempfile.TemporaryDirectory(dir=site.workshop) as folder:
+        yield Path(folder)
+
+
+def _begun(root: Path, plan: Plan, manifest: Manifest, records: Sequence[SubsetRecord]) -> dict[str, Path]:
+    """Everything of subsets but shards, made in a folder: path in the release -> file."""
+    if plan.inputs is not None:
+        copy_inputs(root, records, plan.inputs)
+    create_groups(root, manifest, records)
+    made = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+    return {name: path for name, path in made.items() if not Path(name).name.startswith(".")}
+
+
+def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
+    """The manifest of a bucket once it holds all that is asked for; what is new is put there first, the manifest last.
+
+    Raises:
+      StoreError: what is there contradicts what is asked for, or somebody else grows the release at the same time.
+    """
+    manifest = merged(there, plan.manifest, site.place)
+    if manifest is there:
+        return there
+    old = {record.name: record for record in there.subsets}
+    changed = [record for record in manifest.subsets if record != old.get(record.name)]
+    with _desk(site) as root:
+        listed = site.listing()
+        for record in changed:
+            if record.name in old:  # its arrays are there, and get room for more episodes
+                _bring_metadata(site, record, listed, root)
+        begun = _begun(root, plan, manifest, changed)
+        _refuse_altered_bucket(site, there, begun)
+        new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
+        in_parallel(lambda name: site.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
+    if site.manifest() != there:
+        raise StoreError(f"{site.place} was grown by somebody else meanwhile; run the same command again")
+    site.remove(INDEX)  # written again when the release is finished
+    site.write(MANIFEST, json_bytes(manifest))
+    return manifest
+
+
+def _refuse_altered_bucket(site: BucketSite, there: Manifest, begun: Mapping[str, Path]) -> None:
+    """See `refuse_altered`; what is as it is to become was put there when growing was interrupted."""
+    text = site.read(INDEX) if there.digest else None
+    if text is None:
+        return
+    listed = metadata_files(parse_index(text, f"{site.place}/{INDEX}"))
+
+    def digest(file: FileRecord) -> str | None:
+        data = site.read(file.path)
+        return None if data is None else sha256_bytes(data)
+
+    found = dict(zip([file.path for file in listed], in_parallel(digest, listed, CONNECTIONS, ignore), strict=True))
+    left = [f for f in listed if f.path not in begun or found[f.path] != sha256_file(begun[f.path])]
+    refuse_altered(left, found.get, site.place)
+
+
+def _bring_metadata(site: BucketSite, record: SubsetRecord, listed: Iterable[str], root: Path) -> None:
+    """A subset's zarr.json files as the bucket has them, to the byte."""
+    folder = f"{subset_path(record.name)}/"
+    names = [name for name in listed if name.startswith(folder) and name.endswith("/zarr.json")]
+    for name, text in zip(names, in_parallel(site.read, names, CONNECTIONS, ignore), strict=True):
+        write_bytes(root / name, text or b"")
+    mark_created(root, record)
+
+
+def copy_inputs(root: Path, records: Iterable[SubsetRecord], inputs: Mapping[str, Inputs]) -> None:
+    """Give a release its copies of the subsets' policies, and of videos that the package does not bring.
+
+    Raises:
+      StoreError: the folder cannot be written.
+    """
+    try:
+        for record in records:
+            for policy, source in zip(record.policies, inputs[record.name].policies, strict=True):
+                if policy.path and not (root / policy.path).exists():
+                    copy_file(source, root / policy.path)
+            videos = (record.backgrounds or {}).get("source", BUILTIN)
+            if videos != BUILTIN and not Path(videos).is_absolute():  # absolute: releases of version 1 hold no copies
+                _copy_videos(inputs[record.name].backgrounds, root / videos)
+    except OSError as error:
+        raise StoreError(f"cannot write to {root}: {error.strerror or error}; choose a writable --out") from None
+
+
+def _copy_videos(source: str, target: Path) -> None:
+    """Copy a source's videos under numbers for names, which keep their order; those for evaluation too."""
+    for split in SPLITS:
+        try:
+            videos = load_backgrounds(source, split).files
+        except BackgroundError:
+            continue  # the split that pictures show was opened before; another may not be there
+        for video, files in enumerate(videos):
+            for frame, file in enumerate(files):
+                name = f"{video:05d}" if len(files) == 1 else f"{video:05d}/{frame:05d}"
+                copy = target / split / f"{name}{file.suffix.lower()}"
+                if not copy.exists():
+                    copy_file(file, copy)
+
+
+def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord]) -> None:
+    """Create the (empty) Zarr groups of subsets, where they are not there already.
+
+    Raises:
+      StoreError: the folder cannot be written.
+    """
+    for record in records:
+        specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
+        create_subset(root, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
+
+
+def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any]:
+    """What a subset's Zarr group says of itself to someone who has nothing else."""
+    task = get_task(record.task)
+    version, generator = manifest.origin(record.name)
+    return {
+        "task": record.task,
+        "level": record.level,
+        "setting": record.setting,
+        "release": f"{manifest.name} {version}",
+        "schema_version": manifest.schema_version,
+        "generator": generator,
+        "state_fields": {name: [part.start, part.stop] for name, part in task.state_slices.items()},
+        "views": list(task.views),
+        "seconds_per_step": 2 * task.control_timestep,
+        "policies": [policy.name for policy in record.policies] or ["random"],
+        "layout": "row t: observation t, action t, reward of action t; row `length`: the last observation alone",
+    }
+
+
+def finish(plan: Plan) -> Manifest:
+    """Write the digests of what is whole into the manifest, when all workers are through."""
+    return plan.manifest if _is_done(plan.manifest, plan) else finish_site(plan.site)
+
+
+def _is_done(manifest: Manifest, plan: Plan) -> bool:
+    """Whether a release has its digests and nothing was to be made: then they stay as they are."""
+    return manifest.complete and manifest.digest is not None and not plan.jobs
+
+
+def finish_site(site: Site) -> Manifest:
+    """Write a release's digests: of every file, of the subsets that are whole, and of all; those it has, it keeps.
+
+    Raises:
+      StoreError: nothing was begun there, a file is missing or not what it was, or the place cannot be written.
+    """
+    manifest = site.manifest()
+    if manifest is None:
+        raise StoreError(f"{site.place} holds no release; begin it with --init")
+    if isinstance(site, FolderSite):
+        whole = manifest.complete and manifest.digest and trusted_index(site.root, manifest)
+        if not whole:
+            return finish_together(site.root)
+        refuse_altered_folder(site.root, manifest)
+        return manifest
+    bucket = cast(BucketSite, site)
+    _refuse_altered_bucket(bucket, manifest, {})
+    if manifest.complete and manifest.digest and site.read(INDEX):
+        return manifest
+    commits = site.commits(manifest.subsets)
+    with _desk(site) as mirror:
+        shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
+        small = [path for path in site.listing() if path not in shards | {MANIFEST, INDEX}]
+
+        def bring(path: str) -> None:
+            data = site.read(path)
+            if data is not None:
+                write_bytes(mirror / path, data)
+
+        in_parallel(bring, small, CONNECTIONS, ignore)
+        manifest = finish_release(mirror, manifest, commits)
+        for name in (INDEX, MANIFEST):
+            bucket.write(name, (mirror / name).read_bytes())
+    return manifest

@@ -1,0 +1,216 @@
+"""A look at a release: episodes in, a contact sheet (PNG) and a video out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from dmcvb_gen.dataset import Subset, open_release
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.extras import installed
+from dmcvb_gen.names import ANT_MAZE, select
+from dmcvb_gen.storage.remote import local_path, storage_errors
+
+SHEET_COLUMNS = 10
+"""Frames of an episode on the contact sheet, evenly spaced."""
+VIDEO_FRAMES, VIDEO_FPS = 200, 20
+RAMP, RAMP_PLACES = ((60, 20, 90), (30, 145, 140), (250, 230, 40)), (0.0, 0.5, 1.0)
+"""Colors of distances to a goal, from the farthest to the nearest."""
+FORMATS = ("mp4", "webp", "gif")
+LABEL_HEIGHT = 14
+
+
+def _enlarge(frames: np.ndarray, scale: int) -> np.ndarray:
+    """(..., height, width, 3) nearest-neighbor enlargement."""
+    return frames.repeat(scale, axis=-3).repeat(scale, axis=-2)
+
+
+def _label(text: str, width: int) -> np.ndarray:
+    """(LABEL_HEIGHT, width, 3): a caption."""
+    picture = Image.new("RGB", (width, LABEL_HEIGHT), (255, 255, 255))
+    ImageDraw.Draw(picture).text((2, 1), text, fill=(0, 0, 0))
+    return np.asarray(picture)
+
+
+def _top(subset: Subset) -> str:
+    return shown(subset, ["top"]).arrays[0]
+
+
+def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale: int) -> np.ndarray:
+    """(step, h, w, 3): the top view under the distance field, with the path walked so far."""
+    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.ant_maze import as_maze
+    from dmcvb_gen.tasks.ant_maze.distance import floor_pixels, look_up, make_field
+    from dmcvb_gen.tasks.ant_maze.layouts import CELL
+
+    task = as_maze(get_task(subset.task))
+    frames = _enlarge(values[_top(subset)][steps], scale)
+    size, reach = frames.shape[1], max(task.layout.shape) * CELL / 2  # the outer walls end at the edge
+    place = (np.arange(size) + 0.5) / size * 2 * reach - reach
+    x, y = (part.ravel() for part in np.meshgrid(place, -place))
+    where = np.stack([x, y], axis=1)
+    state = values["state"]
+    goal = state[0, task.state_slices["target_position"]]
+    field = make_field(task.reward, task.layout, goal)
+    floor = floor_pixels(task.layout)[0].astype(float)
+    stacked = np.broadcast_to(field.values, (len(where), *field.values.shape))
+    distance = look_up("geodesic", task.layout, stacked, where) / field.largest
+    open_ = look_up("geodesic", task.layout, np.broadcast_to(floor, stacked.shape), where) > 0.5
+    near = [np.interp(1 - distance, RAMP_PLACES, channel) for channel in zip(*RAMP, strict=True)]
+    colors = np.stack(near, axis=-1).reshape(size, size, 3)
+    blend = np.where(open_.reshape(size, size, 1), 0.45, 0.0)
+    frames = (frames * (1 - blend) + colors * blend).astype(np.uint8)
+    position = state[:, task.state_slices["walker_position"]][:, :2]
+    points = np.stack([(position[:, 0] / reach + 1) / 2 * size, (1 - position[:, 1] / reach) / 2 * size], axis=1)
+    out = []
+    for frame, step in zip(frames, steps, strict=True):
+        picture = Image.fromarray(frame)
+        draw = ImageDraw.Draw(picture)
+        if step > 0:
+            draw.line([tuple(point) for point in points[: step + 1]], fill=(255, 40, 40), width=max(1, scale // 2))
+        gx, gy = (goal[0] / reach + 1) / 2 * size, (1 - goal[1] / reach) / 2 * size
+        draw.ellipse([gx - scale, gy - scale, gx + scale, gy + scale], outline=(0, 255, 0))
+        out.append(np.asarray(picture))
+    return np.stack(out)
+
+
+def _fitting(name: str, width: int) -> str:
+    """As many of a subset's names, from the last on, as a caption of so many pixels has room for."""
+    parts = name.split("/")
+    endings = ["/".join(parts[first:]) for first in range(len(parts))]
+    return next((text for text in endings if ImageFont.load_default().getlength(text) <= width), parts[-1])
+
+
+def _has_map(subset: Subset) -> bool:
+    return subset.record.family == ANT_MAZE and "top" in shown(subset).views
+
+
+def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
+    """Evenly spaced frames of one episode side by side, a row a view, under a caption; (h, w, 3) uint8."""
+    length = int(subset.read("length", [episode])[0])
+    steps = np.linspace(0, length, columns).round().astype(int)
+    rows = []
+    for name in shown(subset).arrays:
+        frames = subset.episode(episode, [name, "length"])[name][steps]
+        rows.append(np.concatenate(list(_enlarge(frames, scale)), axis=1))
+    if _has_map(subset):
+        drawn = _map(subset, subset.episode(episode, ["state", _top(subset)]), steps, scale)
+        rows.append(np.concatenate(list(drawn), axis=1))
+    picture = np.concatenate(rows)
+    value = float(subset.read("return", [episode])[0])
+    caption = f"{subset.name}  episode {episode}  {length} steps  return {value:.1f}"
+    return np.concatenate([_label(caption, picture.shape[1]), picture])
+
+
+def contact_sheet(
+    subsets: Sequence[Subset], episodes: int = 4, columns: int = SHEET_COLUMNS, scale: int = 2
+) -> np.ndarray:
+    """Strips of the first episodes of each subset under each other; (height, width, 3) uint8."""
+    strips = [
+        episode_strip(subset, int(episode), columns, scale)
+        for subset in subsets
+        for episode in subset.episodes[:episodes]
+    ]
+    width = max(strip.shape[1] for strip in strips)
+    strips = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]
+    return np.concatenate(strips)
+
+
+def video_frames(
+    subsets: Sequence[Subset], scale: int = 2, frames: int = VIDEO_FRAMES, episode: int | None = None
+) -> np.ndarray:
+    """An episode of every subset side by side, the first by default; (frame, height, width, 3) uint8."""
+    columns = []
+    for subset in subsets:
+        shown_one = int(subset.episodes[0]) if episode is None else episode
+        values = subset.episode(shown_one, ["state", *shown(subset).arrays])
+        views = [values[name] for name in shown(subset).arrays]
+        steps = np.minimum(np.arange(frames), len(views[0]) - 1)
+        rows = [_enlarge(view[steps], scale) for view in views]
+        if _has_map(subset):
+            rows.append(_map(subset, values, steps, scale))
+        picture = np.concatenate(rows, axis=1)
+        label = _label(_fitting(subset.name, picture.shape[2]), picture.shape[2])
+        columns.append(np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1))
+    per_row = min(len(columns), int(np.ceil(np.sqrt(len(columns) * 1.5))))
+    height = max(column.shape[1] for column in columns)
+    width = max(column.shape[2] for column in columns)
+    columns = [
+        np.pad(c, ((0, 0), (0, height - c.shape[1]), (0, width - c.shape[2]), (0, 0)), constant_values=255)
+        for c in columns
+    ]
+    while len(columns) % per_row:
+        columns.append(np.full_like(columns[0], 255))
+    rows = [np.concatenate(columns[i : i + per_row], axis=2) for i in range(0, len(columns), per_row)]
+    return np.concatenate(rows, axis=1)
+
+
+def write_preview(
+    path: str | Path,
+    out: str | Path | None = None,
+    *,
+    only: Sequence[str] = (),
+    episodes: int = 4,
+    scale: int = 2,
+    frames: int = VIDEO_FRAMES,
+    episode: int | None = None,
+    video: str | None = None,
+) -> list[Path]:
+    """Write contact_sheet.png and preview.mp4 (or .webp, .gif) of a release.
+
+    Args:
+      out: folder of the files; `<release>/preview` by default.
+      only: subset patterns.
+      episodes: of each subset on the sheet.
+      frames: of the video, 20 a second.
+      episode: that the video shows of each subset; the first by default.
+      video: "mp4", "webp" or "gif"; by default mp4 where imageio-ffmpeg is installed, else webp.
+
+    Returns:
+      The files.
+
+    Raises:
+      StoreError: the release has no episodes yet, or the folder cannot be written.
+      UnknownNameError: no such kind of video.
+    """
+    kind = video or ("mp4" if installed("imageio_ffmpeg") else "webp")
+    if kind not in FORMATS:
+        raise UnknownNameError("kind of video", kind, FORMATS)
+    target = local_path(out) if out else None
+    release = open_release(path)
+    names = select(list(release.subsets), list(only)) if release.subsets else []
+    subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
+    if not subsets:
+        raise StoreError(f"{path} has no committed episodes with pictures; run the rollout first, or `dmcvb-gen paint`")
+    folder = target or release.path / "preview"
+    with storage_errors(folder, "write to"):
+        folder.mkdir(parents=True, exist_ok=True)
+        sheet = folder / "contact_sheet.png"
+        Image.fromarray(contact_sheet(subsets, episodes, scale=scale)).save(sheet)
+        moving = folder / f"preview.{kind}"
+        (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames, episode))
+    return [sheet, moving]
+
+
+def _write_animation(path: Path, frames: np.ndarray) -> None:
+    """(frame, height, width, 3) uint8 as a WebP or GIF."""
+    first, *rest = [Image.fromarray(frame) for frame in frames]
+    options: dict[str, Any] = {"quality": 60, "method": 5} if path.suffix == ".webp" else {}
+    first.save(path, save_all=True, append_images=rest, duration=1000 // VIDEO_FPS, loop=0, **options)
+
+
+def _write_mp4(path: Path, frames: np.ndarray) -> None:
+    import imageio_ffmpeg
+
+    even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)))
+    size = even.shape[2], even.shape[1]
+    encoder = imageio_ffmpeg.write_frames(str(path), size, fps=VIDEO_FPS, quality=8, macro_block_size=2)
+    encoder.send(None)
+    for frame in even:
+        encoder.send(np.ascontiguousarray(frame))
+    encoder.close()

@@ -1,0 +1,400 @@
+"""A recipe: checked YAML in, the list of subsets that it asks for out.
+
+::
+
+    name: my-release            # the release's name and version, for its card
+    version: 1.0.0
+    seed: 0
+    size: 64                    # pixels a side
+    subsets:                    # every task x level x setting of each entry
+      - tasks: [walker-walk, cheetah-run]
+        levels: [expert, medium]
+        settings: [none, static, dynamic]
+        episodes: 20
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+
+from dmcvb_gen.dataset.manifest import MAX_EPISODES, MAX_SHARDS
+from dmcvb_gen.errors import RecipeError, UnknownNameError
+from dmcvb_gen.files import read_yaml
+from dmcvb_gen.names import (
+    ANT_MAZE,
+    DISTRACTOR_KINDS,
+    FAMILIES,
+    FIXED,
+    GOAL_MODES,
+    LOCOMOTION,
+    VISIBLE,
+    DistractorSetting,
+    check_level,
+    distractor_of,
+    family_of,
+    normalize_setting,
+    subset_name,
+)
+from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.base import Task
+
+DEFAULT_EPISODES_PER_SHARD = {LOCOMOTION: 50, ANT_MAZE: 10}
+"""Episodes a shard: what a worker holds in memory and what a crash can cost."""
+MAX_STEPS = 5000
+"""Longest episode that a recipe may ask for; a shard is held in memory."""
+
+
+class _Model(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+def _as_tuple(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Names = Annotated[tuple[str, ...], pydantic.BeforeValidator(_as_tuple), pydantic.Field(min_length=1)]
+
+
+class RendererChoice(_Model):
+    """Which renderer paints: backend "native", "warp" or "opengl"; samples a pixel (None: the renderer's default)."""
+
+    backend: str = "native"
+    samples: int | None = pydantic.Field(default=None, ge=1, le=8)
+
+
+class SubsetPattern(_Model):
+    """Subsets that share everything but their names: all tasks x levels x settings.
+
+    Attributes:
+      settings: distractors for locomotion ("none", "static", "dynamic_hard", ...), goal settings for mazes
+        ("visible", "hidden", "fixed").
+      episodes, steps: how much of each subset; give one. Steps are for tasks of fixed length.
+      policies: level -> policy file or run folder, where not the bundled ones.
+      deterministic: take the policies' mean actions, as DMC-VB does; false draws samples. Level random is always drawn.
+      max_steps: steps at which the time limit ends an episode, where not the task's own (500, mazes 600).
+      fixed_goals, episodes_per_goal: for the setting "fixed" (benchmark B3).
+    """
+
+    tasks: Names
+    levels: Names
+    settings: Names
+    episodes: int | None = pydantic.Field(default=None, gt=0)
+    steps: int | None = pydantic.Field(default=None, gt=0)
+    episodes_per_shard: int | None = pydantic.Field(default=None, gt=0, le=1000)
+    policies: dict[str, str] = {}
+    deterministic: bool = True
+    max_steps: int | None = pydantic.Field(default=None, gt=0, le=MAX_STEPS)
+    fixed_goals: int = pydantic.Field(default=5, gt=0)
+    episodes_per_goal: int = pydantic.Field(default=10, gt=0)
+
+
+class Recipe(_Model):
+    """What a release is made from.
+
+    Attributes:
+      seed: of every random stream.
+      size: pixels a side.
+      trajectories: "shared": the settings of a task and level show the same episodes; "independent": each its own.
+      backgrounds: "builtin" or a folder of videos.
+      split: which videos (and maze styles): "train" for data, "val" for evaluation.
+    """
+
+    name: str = pydantic.Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    version: str = pydantic.Field(default="1.0.0", pattern=r"^\d+\.\d+\.\d+$")
+    description: str = ""
+    license: str = "CC-BY-4.0"
+    authors: tuple[str, ...] = ()
+    seed: int = pydantic.Field(default=0, ge=0)
+    size: int = 64
+    renderer: RendererChoice = RendererChoice()
+    trajectories: Literal["shared", "independent"] = "shared"
+    backgrounds: str = "builtin"
+    split: Literal["train", "val"] = "train"
+    subsets: tuple[SubsetPattern, ...] = pydantic.Field(min_length=1)
+
+
+class SubsetRequest(_Model):
+    """One subset of a recipe, names checked.
+
+    Attributes:
+      name: "<task>/<level>/<setting>".
+      policy: where its policy comes from, None for the bundled ones (or random).
+    """
+
+    name: str
+    task: str
+    level: str
+    setting: str
+    episodes: int
+    episodes_per_shard: int
+    max_steps: int
+    policy: str | None = None
+    deterministic: bool = False
+    episodes_per_goal: int | None = None
+
+
+def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
+    """All subsets that a recipe asks for, in its order.
+
+    Raises:
+      RecipeError, UnknownNameError: a name, a size or a count that makes no sense.
+    """
+    check_size(recipe.size)
+    requests: dict[str, SubsetRequest] = {}
+    for pattern in recipe.subsets:
+        for task_id in pattern.tasks:
+            task = get_task(task_id)
+            for level in pattern.levels:
+                check_level(level)
+                for given in pattern.settings:
+                    setting = normalize_setting(task_id, given)
+                    name = subset_name(task_id, level, setting)
+                    if name in requests:
+                        raise RecipeError(f"recipe {recipe.name!r} asks for {name} twice; keep one of the entries")
+                    requests[name] = _request(pattern, task, name, level, setting)
+    unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
+    if unused:
+        raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
+    if (shards := sum(-(-each.episodes // each.episodes_per_shard) for each in requests.values())) > MAX_SHARDS:
+        raise RecipeError(
+            f"recipe {recipe.name!r} comes to {shards:,} shards, and a release may have {MAX_SHARDS:,}; give more "
+            "episodes_per_shard, or fewer episodes"
+        )
+    return tuple(requests.values())
+
+
+def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting: str) -> SubsetRequest:
+    per_goal, max_steps = None, pattern.max_steps or task.max_steps
+    if setting == FIXED:
+        episodes, per_goal = pattern.fixed_goals * pattern.episodes_per_goal, pattern.episodes_per_goal
+    elif pattern.episodes is not None and pattern.steps is not None:
+        raise RecipeError(f"{name}: give episodes or steps, not both")
+    elif pattern.episodes is not None:
+        episodes = pattern.episodes
+    elif pattern.steps is None:
+        raise RecipeError(f"{name}: say how much: episodes: N (or steps: N)")
+    elif task.family == ANT_MAZE:
+        raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
+    else:
+        episodes = -(-pattern.steps // max_steps)
+    if episodes > MAX_EPISODES:
+        raise RecipeError(f"{name}: {episodes:,} episodes are more than the {MAX_EPISODES:,} that a subset may have")
+    shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[task.family]
+    return SubsetRequest(
+        name=name,
+        task=task.id,
+        level=level,
+        setting=setting,
+        episodes=episodes,
+        episodes_per_shard=min(shard, episodes),
+        policy=pattern.policies.get(level),
+        max_steps=max_steps,
+        deterministic=pattern.deterministic and level != "random",
+        episodes_per_goal=per_goal,
+    )
+
+
+def check_size(size: int) -> None:
+    """Raises RecipeError for a picture size that no renderer takes."""
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise RecipeError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)")
+
+
+# -- a recipe made smaller or otherwise -----------------------------------------------------------
+
+
+def narrow(
+    recipe: Recipe, tasks: Sequence[str] = (), levels: Sequence[str] = (), settings: Sequence[str] = ()
+) -> Recipe:
+    """The recipe of the subsets that have one of the tasks, one of the levels and one of the settings.
+
+    Args:
+      tasks, levels, settings: all that the recipe has where nothing is given.
+
+    Raises:
+      UnknownNameError: the recipe has no such task, level or setting.
+      RecipeError: no subset has all of them.
+    """
+    wanted = {"tasks": tasks, "levels": levels, "settings": settings}
+    for field, given in wanted.items():
+        known = {value for pattern in recipe.subsets for value in getattr(pattern, field)}
+        if field == "settings":
+            known |= {DistractorSetting.parse(value).name for value in known - set(GOAL_MODES)}
+        for value in given:
+            if value not in known:
+                raise UnknownNameError(f"{field[:-1]} of recipe {recipe.name}", value, known)
+    patterns = []
+    for pattern in recipe.subsets:
+        kept = {
+            field: tuple(v for v in getattr(pattern, field) if not given or v in given or _canonical(v) in given)
+            for field, given in wanted.items()
+        }
+        if all(kept.values()):
+            policies = {level: path for level, path in pattern.policies.items() if level in kept["levels"]}
+            patterns.append(pattern.model_copy(update=kept | {"policies": policies}))
+    if not patterns:
+        given = ", ".join([*tasks, *levels, *settings])
+        raise RecipeError(f"recipe {recipe.name!r} has no subset that is {given} at once; see them with --dry-run")
+    return recipe.model_copy(update={"subsets": tuple(patterns)})
+
+
+def _canonical(setting: str) -> str:
+    """ "dynamic_medium" -> "dynamic"; what is no distractor stays."""
+    return DistractorSetting.parse(setting).name if setting.split("_")[0] in DISTRACTOR_KINDS else setting
+
+
+SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps")
+GOAL_FIELDS = ("fixed_goals", "episodes_per_goal")
+
+
+def override(recipe: Recipe, **changes: Any) -> Recipe:
+    """The recipe with other values: its own fields, and fields of all its subsets that they mean something for.
+
+    Args:
+      changes: fields of `Recipe` or `SubsetPattern`; `episodes` takes the place of `steps` and the other way round;
+        `behaviour`: the policy of the one task and level that the recipe has.
+
+    Raises:
+      RecipeError: a value that is wrong, or that means nothing for this recipe.
+    """
+    own = {name: value for name, value in changes.items() if name in Recipe.model_fields}
+    each = {name: value for name, value in changes.items() if name in SUBSET_FIELDS}
+    goals = {name: value for name, value in changes.items() if name in GOAL_FIELDS}
+    settings = {setting for pattern in recipe.subsets for setting in pattern.settings}
+    fixed = FIXED in settings
+    if goals and not fixed:
+        raise RecipeError(f"recipe {recipe.name!r} has no fixed goals, so --{_option(goals)} means nothing for it")
+    amount = {"episodes", "steps"} & set(each)
+    if amount and fixed and not (goals and settings - {FIXED}):
+        cure = "give those too" if settings - {FIXED} else "give those"
+        raise RecipeError(
+            f"--{amount.pop()} means nothing for fixed goals, which have --fixed-goals x --episodes-per-goal episodes; "
+            f"{cure}, or leave those subsets out with --goal visible --goal hidden"
+        )
+    if amount:
+        each = {"episodes": None, "steps": None} | each
+    if "behaviour" in changes:
+        each["policies"] = {_one_level(recipe): changes["behaviour"]}
+    data = recipe.model_dump(mode="json") | own
+    for pattern in data["subsets"]:
+        only_fixed = set(pattern["settings"]) == {FIXED}
+        pattern |= {name: value for name, value in each.items() if not (only_fixed and name in ("episodes", "steps"))}
+        pattern |= goals
+    return make_recipe(data, "command line")
+
+
+def _option(changes: dict[str, Any]) -> str:
+    return next(iter(changes)).replace("_", "-")
+
+
+def _one_level(recipe: Recipe) -> str:
+    tasks = {task for pattern in recipe.subsets for task in pattern.tasks}
+    levels = {level for pattern in recipe.subsets for level in pattern.levels}
+    if len(tasks) != 1 or len(levels) != 1 or levels == {"random"}:
+        raise RecipeError("--behaviour needs one task and one --level of expert, medium or mixed")
+    return levels.pop()
+
+
+def single_recipe(
+    tasks: Sequence[str],
+    levels: Sequence[str],
+    settings: Sequence[str] | None,
+    *,
+    name: str,
+    behaviour: str | None = None,
+    goals: dict[str, int] | None = None,
+    subset_fields: dict[str, Any],
+    **fields: Any,
+) -> Recipe:
+    """The recipe of a command line without --recipe: every task x level x setting.
+
+    Args:
+      settings: of the tasks' families; by default "none", and "visible" for mazes.
+      goals: fixed_goals and episodes_per_goal, where they are not the pattern's own.
+      subset_fields: of each `SubsetPattern`.
+      fields: of the `Recipe`.
+
+    Raises:
+      RecipeError: --behaviour with several tasks or levels, or with random.
+    """
+    patterns = []
+    for family in FAMILIES:
+        chosen = [task for task in tasks if family_of(task) == family]
+        if not chosen:
+            continue
+        default = "none" if family == LOCOMOTION else VISIBLE
+        pattern = {"tasks": chosen, "levels": list(levels), "settings": list(settings or (default,)), **subset_fields}
+        patterns.append(pattern | (goals or {}))
+    made = make_recipe({"name": name, "subsets": patterns, **fields}, "command line")
+    return override(made, behaviour=behaviour) if behaviour else made
+
+
+def check_heard(recipe: Recipe, given: Collection[str]) -> None:
+    """Raises RecipeError where an option was given that changes nothing in any subset of a recipe.
+
+    Args:
+      given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".
+    """
+    subsets = [(t, level, s) for p in recipe.subsets for t in p.tasks for level in p.levels for s in p.settings]
+    videos = any(distractor_of(task, setting).kind != "none" for task, _, setting in subsets)
+    families = {family_of(task) for task, _, _ in subsets}
+    cures = {
+        "backgrounds": (videos, "no subset shows videos; ask for --distractor static or dynamic"),
+        "split": (videos or ANT_MAZE in families, "no subset shows videos; ask for --distractor static or dynamic"),
+        "sample": (any(level != "random" for _, level, _ in subsets), "level random is always drawn; ask for another"),
+        "independent": (LOCOMOTION in families, "subsets of mazes always have their own episodes"),
+    }
+    for name, (heard, cure) in cures.items():
+        if name in given and not heard:
+            raise RecipeError(f"--{name} changes nothing here: {cure}, or leave it out")
+
+
+# -- recipes in files -----------------------------------------------------------------------------
+
+
+def shipped_recipes() -> tuple[str, ...]:
+    """Names of the recipes in the package."""
+    folder = resources.files("dmcvb_gen.generate") / "data" / "recipes"
+    return tuple(sorted(path.name.removesuffix(".yaml") for path in folder.iterdir() if path.name.endswith(".yaml")))
+
+
+def load_recipe(source: str | Path) -> Recipe:
+    """A recipe from a YAML file, or a shipped one by its name.
+
+    Raises:
+      RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
+    """
+    path = Path(source)
+    shipped = not path.exists() and str(source) in shipped_recipes()
+    try:
+        data = read_yaml(
+            resources.files("dmcvb_gen.generate") / "data" / "recipes" / f"{source}.yaml" if shipped else path
+        )
+    except (OSError, ValueError) as error:
+        raise RecipeError(
+            f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of the shipped: "
+            + ", ".join(shipped_recipes())
+        ) from None
+    if not isinstance(data, dict):
+        raise RecipeError(f"{source} holds no mapping of recipe fields; see `dmcvb-gen rollout --help`")
+    return make_recipe(data, str(source))
+
+
+def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
+    """A recipe from plain values.
+
+    Raises:
+      RecipeError: a field is unknown or wrong.
+    """
+    try:
+        return Recipe.model_validate(data)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the top"
+        raise RecipeError(f"{where}: {place}: {first['msg']}") from None

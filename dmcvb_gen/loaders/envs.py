@@ -1,0 +1,323 @@
+"""The tasks under distractors as Gymnasium environments: actions in; pixels, states and rewards out.
+
+For evaluation: by default they show the `val` videos and styles, which no released picture shows, and last as long as
+online evaluation does. Many episodes side by side (`gymnasium.make_vec`) share one batch of simulations
+and one call of the renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from dmcvb_gen.dataset.pictures import Pictures
+from dmcvb_gen.distractor_state import DistractorState
+from dmcvb_gen.distractors import DistractorSampler, DistractorSetting, floor_alpha_for, load_backgrounds
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.painting import check_renderer
+from dmcvb_gen.generate.recipe import check_size
+from dmcvb_gen.names import (
+    ANT_MAZE,
+    FIXED,
+    GOAL_PICTURES,
+    HIDDEN,
+    SPLITS,
+    VISIBLE,
+    distractor_of,
+    hides_goal,
+    normalize_setting,
+)
+from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
+from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
+
+PURPOSE = "evaluation"
+"""Names the random streams: no episode here has those of released data."""
+FIXED_GOALS = 5
+"""Pairs of start and goal that "fixed" episodes go round by default (benchmark B3)."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What an environment shows; every field may be given to `DistractedEnv`, `gymnasium.make` and `make_vec`.
+
+    Attributes:
+      task: e.g. "walker-walk".
+      distractor: "none", "static", "dynamic", or with a difficulty ("dynamic_hard"); for mazes whether the goal is
+        "visible", "hidden", or hidden and "fixed" with the start.
+      difficulty: easy, medium or hard; of locomotion.
+      size: pixels a side. renderer: its name; samples: a pixel.
+      split: "val" shows videos and styles that no released data show, "train" those of the data.
+      backgrounds: "builtin" or a folder of videos.
+      views: pictures of a task that has several (mazes), side by side in the channels; all by default.
+      max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
+      fixed_goals: of "fixed": how many pairs of start and goal there are; an episode takes the next one.
+      goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
+      goal_pair: of "fixed": this pair in all episodes.
+      goal_seed: of "fixed": the seed that the pairs are drawn from, as a recipe's seed.
+      threads: of the simulation; the result does not depend on them.
+    """
+
+    task: str
+    distractor: str = "none"
+    difficulty: str | None = None
+    size: int = 64
+    renderer: str = "native"
+    samples: int | None = None
+    split: str = "val"
+    backgrounds: str = "builtin"
+    views: Sequence[str] | None = None
+    max_steps: int | None = None
+    goal: str | None = None
+    fixed_goals: int = FIXED_GOALS
+    goal_pair: int | None = None
+    goal_seed: int = 0
+    threads: int = 1
+
+    def normalized_setting(self) -> str:
+        """The setting's canonical name, e.g. "static_hard" or "fixed".
+
+        Raises:
+          UnknownNameError: the task has no such setting, or there is no such difficulty.
+        """
+        maze = get_task(self.task).family == ANT_MAZE
+        if maze and self.distractor == "none":
+            return VISIBLE  # mazes differ in style, always, and in whether the goal is seen
+        setting = normalize_setting(self.task, self.distractor)
+        if self.difficulty and not maze:
+            return DistractorSetting(DistractorSetting.parse(setting).kind, self.difficulty).name
+        return setting
+
+    def check(self) -> None:
+        """Raises DmcvbError for a field that has no such value, or none for this task."""
+        maze = get_task(self.task).family == ANT_MAZE
+        for field, value, known in (("split", self.split, SPLITS), ("goal", self.goal, (None, *GOAL_PICTURES))):
+            if value not in known:
+                raise UnknownNameError(field, str(value), [name for name in known if name])
+        if maze and self.difficulty:
+            raise DmcvbError(f"{self.task} has no difficulty: mazes differ in style alone; leave difficulty away")
+        if self.goal and not maze:
+            raise DmcvbError(f"{self.task} has no goal in its pictures; leave goal away")
+
+
+class _Stage:
+    """`count` episodes with their distractors and pictures; restarted one by one."""
+
+    def __init__(self, count: int, scene: Scene):
+        if count < 1:
+            raise DmcvbError(f"num_envs is {count}; give at least 1")
+        scene.check()
+        setting = scene.normalized_setting()
+        self.task, self.count, self.size, self.split = get_task(scene.task), count, scene.size, scene.split
+        self.setting = distractor_of(scene.task, setting)
+        hide = scene.goal == HIDDEN if scene.goal else hides_goal(setting)
+        self.pictures = Pictures(self.task.views, hide).select(scene.views)
+        self.max_steps = scene.max_steps or self.task.evaluation_steps
+        self.pairs = _pairs(self.task, scene) if setting == FIXED else None
+        self._first_pair = scene.goal_pair or 0
+        check_size(scene.size)
+        check_renderer(scene.renderer)
+        self.backgrounds = None if self.setting.kind == "none" else load_backgrounds(scene.backgrounds, scene.split)
+        self.renderer = make_renderer(
+            scene.renderer,
+            self.task,
+            scene.size,
+            backgrounds=self.backgrounds,
+            floor_alpha=floor_alpha_for(self.task, self.setting),
+            samples=scene.samples,
+        )
+        if hasattr(self.renderer, "worlds"):
+            self.renderer.worlds = count  # a launch paints all episodes, and not 256 frames for one
+        self.batch = self.task.batch(count, scene.threads)
+        self._episodes = [(0, 0)] * count  # (seed, number) of each place
+        self.frame, self.started = np.zeros(count, int), np.zeros(count, int)
+        self.state = np.zeros((count, self.task.state_size))
+        self.goal_pair = np.full(count, -1)
+
+    def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
+        """Of one place: observations {"pixels", "state"}, and actions."""
+        shape = (self.size, self.size, 3 * len(self.pictures.views))
+        observation: dict[str, spaces.Space] = {
+            "pixels": spaces.Box(0, 255, shape, np.uint8),
+            "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
+        }
+        return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+
+    def start(self, places: Iterable[int], seeds: Sequence[int]) -> None:
+        """Start the next episode of some places, from the streams of their seeds."""
+        places = list(places)
+        for place, seed in zip(places, seeds, strict=True):
+            number = int(self.started[place])
+            self._episodes[place] = seed, number
+            if self.pairs:
+                self.goal_pair[place] = self._first_pair + number % len(self.pairs)
+            self.started[place] += 1
+            self.frame[place] = 0
+        streams = {
+            name: [episode_stream(seed, (self.task.id, PURPOSE), number, name) for seed, number in self._episodes]
+            for name in STREAMS
+        }
+        initial = [streams["initial_state"][place] for place in places]
+        if self.pairs:
+            pairs = [self.pairs[self.goal_pair[place] - self._first_pair] for place in places]
+            self.state = self.batch.reset_fixed(initial, pairs, places)
+        else:
+            self.state = self.batch.reset(initial, places)
+        # Drawn for all places together (the running ones get the walks that they have): labels then take one call.
+        self.walk = DistractorSampler(
+            self.task, self.setting, self.max_steps + 1, streams, self.backgrounds, self.split
+        )
+
+    def labels(self, physics: np.ndarray) -> DistractorState:
+        """Labels of the frame that each place shows now, leading shape (place,)."""
+        found = {int(frame): self.walk.frame(int(frame), physics) for frame in np.unique(self.frame)}
+        parts = [found[int(frame)][place : place + 1] for place, frame in enumerate(self.frame)]
+        return DistractorState(
+            **{name: np.concatenate([getattr(p, name) for p in parts]) for name, _ in parts[0].items()}
+        )
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """ "pixels" (place, size, size, 3 * view) uint8 and "state" (place, state) float32."""
+        physics, shown = self.batch.physics(), self.pictures
+        labels = self.labels(physics)
+        pictures = self.renderer.render(physics, labels, shown.views, shown.hide_goal)  # (place, view, size, size, 3)
+        pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
+        return {"pixels": pixels, "state": self.state.astype(np.float32)}
+
+    def step(self, actions: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rewards, terminated, truncated of one agent step of the active places."""
+        result = self.batch.step(np.clip(actions, -1, 1), active)
+        self.state = result.state
+        self.frame[active] += 1
+        truncated = active & (self.frame >= self.max_steps) & ~result.terminated
+        return result.reward, result.terminated, truncated
+
+
+def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """The (start, goal) cells that "fixed" episodes go round."""
+    if scene.goal_pair is None:
+        return fixed_pairs(as_maze(task).layout, scene.fixed_goals, scene.goal_seed)
+    if scene.goal_pair < 0:
+        raise DmcvbError(f"goal_pair is {scene.goal_pair}; give 0 for the first pair, 1 for the second, ...")
+    return fixed_pairs(as_maze(task).layout, scene.goal_pair + 1, scene.goal_seed)[-1:]
+
+
+class DistractedEnv(gymnasium.Env):
+    """One episode at a time.
+
+    Observations are {"pixels": (size, size, 3 * views) uint8, "state": (state,) float32}; an action (action,) in
+    [-1, 1] is held for two control steps, whose rewards are summed (an episode earns at most 1000). The seed of
+    `reset` decides initial states, distractors and all episodes after it.
+
+    Args:
+      task: its name, see `Scene`.
+      distractor: its setting, see `Scene`.
+      render_mode: None or "rgb_array".
+      **options: those of `Scene`.
+
+    Raises:
+      DmcvbError: what is asked for does not exist; the message lists what does.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(self, task: str, distractor: str = "none", *, render_mode: str | None = None, **options: Any):
+        if render_mode not in (None, "rgb_array"):
+            raise DmcvbError(f"render_mode {render_mode!r} is not offered; give 'rgb_array' or None")
+        self._stage = _Stage(1, Scene(task, distractor, **options))
+        self.task, self.render_mode = self._stage.task, render_mode
+        self.observation_space, self.action_space = self._stage.spaces()
+        self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
+        self._seed: int | None = None
+        self._pixels: np.ndarray | None = None
+
+    def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
+        """Of observations {"pixels", "state"}, and of actions."""
+        return self._stage.spaces()
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        super().reset(seed=seed)
+        if seed is not None or self._seed is None:
+            self._seed, self._stage.started[0] = int(self.np_random.integers(2**63)), 0
+        self._stage.start([0], [self._seed])
+        return self._observation(), self._info()
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict]:
+        if self._seed is None:
+            raise DmcvbError("step before reset; call reset() first")
+        reward, terminated, truncated = self._stage.step(np.asarray(action)[None], np.ones(1, bool))
+        return self._observation(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info()
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        observation = {name: value[0] for name, value in self._stage.observe().items()}
+        self._pixels = observation["pixels"]
+        return observation
+
+    def _info(self) -> dict[str, int]:
+        return {"goal_pair": int(self._stage.goal_pair[0])} if self._stage.pairs else {}
+
+    def render(self) -> np.ndarray | None:
+        """The picture of the current frame (its first view), (size, size, 3) uint8."""
+        if self.render_mode is None or self._pixels is None:
+            return None
+        return self._pixels[..., :3].copy()
+
+    def close(self) -> None:
+        self._stage.renderer.close()
+
+
+class DistractedVectorEnv(VectorEnv):
+    """`num_envs` episodes side by side; an episode that ended restarts at the next step (Gymnasium's NEXT_STEP).
+
+    Place i behaves, to the last bit of state and reward, as a `DistractedEnv` that was reset with that place's seed.
+
+    Args:
+      task, distractor, options: see `Scene`.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 20}
+
+    def __init__(self, num_envs: int, task: str, distractor: str = "none", **options: Any):
+        self._stage = _Stage(num_envs, Scene(task, distractor, **options))
+        self.num_envs, self.task, self.render_mode = num_envs, self._stage.task, None
+        self.single_observation_space, self.single_action_space = self._stage.spaces()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._seeds: list[int] | None = None
+        self._ended = np.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict]:
+        """Start all episodes; an int seeds place i with seed + i, as Gymnasium's own vector environments do."""
+        if seed is not None or self._seeds is None:
+            given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+            given = [None] * self.num_envs if given is None else list(given)
+            draws = [gymnasium.utils.seeding.np_random(value)[0] for value in given]
+            self._seeds = [int(rng.integers(2**63)) for rng in draws]
+            self._stage.started[:] = 0
+        self._stage.start(range(self.num_envs), self._seeds)
+        self._ended[:] = False
+        return self._stage.observe(), {}
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict]:
+        if self._seeds is None:
+            raise DmcvbError("step before reset; call reset() first")
+        restarted = self._ended.copy()
+        if restarted.any():
+            places = np.flatnonzero(restarted)
+            self._stage.start(places, [self._seeds[place] for place in places])
+        reward, terminated, truncated = self._stage.step(np.asarray(actions, np.float64), ~restarted)
+        self._ended = terminated | truncated
+        return self._stage.observe(), reward, terminated, truncated, {}
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self._stage.renderer.close()

@@ -1,0 +1,247 @@
+"""Pictures painted when they are read: a subset without (or with other) pictures in, the same subset with them out.
+
+Nothing is stored: an episode's pictures are painted from its physics states and labels when they are first asked for,
+and kept while there is room. With fresh distractors every epoch sees the same episodes from other cameras, in other
+colors, before other videos, all drawn from named streams: augmentation that keeps states, actions and rewards true.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.dataset import Release, open_release
+from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
+from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.generate.jobs import background_source, stream_names
+from dmcvb_gen.generate.painting import distractor_state_of, paint, renderer_for
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
+from dmcvb_gen.rendering.base import Renderer
+from dmcvb_gen.storage.remote import is_url
+from dmcvb_gen.tasks import get_task
+
+STORED, RESAMPLED = "stored", "resample"
+DISTRACTORS = (STORED, RESAMPLED)
+"""Labels to paint with: those of the data, or fresh ones for every epoch."""
+DEFAULT_CACHE = 1_000_000_000
+"""Bytes of painted episodes that a subset keeps."""
+
+
+@dataclass(frozen=True)
+class Painting:
+    """How pictures are painted on reading.
+
+    Attributes:
+      distractors: "stored" or "resample".
+      size: pixels a side, None for the subset's own.
+      backgrounds: "builtin" or a folder of videos, None for the release's own.
+      cache_bytes: of painted episodes, kept while there is room.
+    """
+
+    distractors: str = STORED
+    size: int | None = None
+    backgrounds: str | None = None
+    cache_bytes: int = DEFAULT_CACHE
+
+    def __post_init__(self) -> None:
+        if self.distractors not in DISTRACTORS:
+            raise DmcvbError(f"distractors={self.distractors!r} is unknown; give one of {', '.join(DISTRACTORS)}")
+
+
+class PaintedArray:
+    """A picture array that is painted as it is indexed; see `store.reader.StoredArray`."""
+
+    def __init__(self, subset: PaintedSubset, name: str):
+        self._subset, self.name = subset, name
+        record = subset.record
+        self.shape = (record.episodes, record.max_steps + 1, record.size, record.size, 3)
+        self.dtype, self.ndim = np.dtype(np.uint8), 5
+        self.dimensions = ("episode", "step", "height", "width", "channel")
+
+    def __getitem__(self, selection: Any) -> np.ndarray:
+        first, *rest = selection if isinstance(selection, tuple) else (selection,)
+        episodes = np.arange(self.shape[0])[first]
+        if np.ndim(episodes) == 0:
+            return self._subset.painted(int(episodes), [self.name])[self.name][tuple(rest)]
+        return self.rows(np.asarray(episodes))[(slice(None), *rest)]
+
+    def rows(self, episodes: np.ndarray) -> np.ndarray:
+        """(episode, row, height, width, 3) uint8, rows past an episode's end zero."""
+        return np.stack([self._subset.painted(int(episode), [self.name])[self.name] for episode in episodes])
+
+
+class PaintedSubset(SubsetReader):
+    """A subset whose pictures are painted when they are read; `set_epoch` draws other distractors, if they are fresh.
+
+    Attributes:
+      epoch: of the distractors; 0 at the start.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        record: SubsetRecord,
+        commits: Mapping[int, CommitRecord],
+        storage_options: dict,
+        manifest: Manifest,
+        painting: Painting,
+    ):
+        # What is stored may be of another size, or without pictures; this subset says what can be read of it.
+        shown = {"size": painting.size or record.size, "pixels": True}
+        super().__init__(root, record.model_copy(update=shown), commits, storage_options)
+        self.painting, self.epoch = painting, 0
+        self._seed = int(manifest.recipe_of(record.name).get("seed", 0))
+        self._names = stream_names(manifest, record)
+        self._start()
+
+    def _start(self) -> None:
+        self._kept: OrderedDict[tuple[int, int, str], np.ndarray] = OrderedDict()
+        self._painter: tuple[Renderer, Any] | None = None
+        self._bytes, self._lock = 0, threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:  # painters and what they painted stay where they are
+        left = ("_kept", "_bytes", "_painter", "_lock")
+        return {name: value for name, value in super().__getstate__().items() if name not in left}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._start()
+
+    def xarray(self, episodes: Iterable[int] | None = None) -> Any:
+        """Refused: xarray shows what is stored.
+
+        Raises:
+          StoreError: always.
+        """
+        raise StoreError(
+            f"xarray shows what is stored of {self.name}, and paints nothing; open the release without paint=True, or "
+            f"paint it first: dmcvb-gen paint {self.root}"
+        )
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw the distractors of another epoch from now on (where they are fresh)."""
+        self.epoch = epoch
+
+    @property
+    def fresh(self) -> bool:
+        """Whether each epoch shows other distractors."""
+        return self.painting.distractors == RESAMPLED
+
+    @property
+    def shown_epoch(self) -> int:
+        """The epoch whose distractors the pictures show; 0 where they are those of the data."""
+        return self.epoch if self.fresh else 0
+
+    @property
+    def picture_names(self) -> tuple[str, ...]:
+        """All arrays that can be painted."""
+        task, views = get_task(self.task), self.record.views
+        return picture_arrays(views) + (picture_arrays(views, hide_goal=True) if task.goal_geoms else ())
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        return tuple(sorted({*super().arrays, *self.picture_names}))
+
+    def array(self, name: str) -> Any:
+        return PaintedArray(self, name) if picture_of(name) is not None else super().array(name)
+
+    def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """See `Subset.episode`; all of its pictures are painted at once."""
+        names = self.arrays if arrays is None else tuple(arrays)
+        pictures = self.painted(int(index), [name for name in names if picture_of(name) is not None])
+        used = int(self.read("length", [index])[0]) + 1
+        values = super().episode(index, [name for name in names if name not in pictures])
+        values |= {name: value[:used] for name, value in pictures.items()}
+        return {name: values[name] for name in names}
+
+    def painted(self, episode: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """Picture arrays of an episode by name, each (row, height, width, 3) uint8.
+
+        Args:
+          arrays: only these, all that can be painted by default.
+
+        Raises:
+          StoreError: there is no such episode here.
+        """
+        if episode not in self.episodes:
+            raise StoreError(f"{self.name} has no episode {episode}; it has {len(self.episodes)} episodes")
+        epoch = self.shown_epoch
+        keys = {name: (episode, epoch, name) for name in (self.picture_names if arrays is None else arrays)}
+        with self._lock:
+            found = {name: self._kept[key] for name, key in keys.items() if key in self._kept}
+            missing = [name for name in keys if name not in found]
+            if missing:
+                found |= self._paint(episode, missing)
+            for name, key in keys.items():
+                self._bytes += 0 if key in self._kept else found[name].nbytes
+                self._kept[key] = found[name]
+                self._kept.move_to_end(key)
+            while self._bytes > self.painting.cache_bytes and len(self._kept) > 1:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+            return found
+
+    def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
+        if self._painter is None:
+            self._painter = renderer_for(self.record, self._videos())
+        renderer, videos = self._painter
+        index = [episode]
+        length = self.read("length", index)
+        used = int(length.max()) + 1
+        physics = self.read("physics", index)[:, :used]
+        if self.fresh:
+            names = (*self._names, f"epoch {self.epoch}")
+            labels = distractor_state_of(self.record, self._seed, names, np.array(index), physics, length, videos)
+        else:
+            labels = DistractorState(
+                **{name: self.read(f"exogenous/{name}", index)[:, :used] for name in DISTRACTOR_STATE_NAMES}
+            )
+        task, rows = get_task(self.task), self.record.max_steps + 1
+        pictures = paint(task, renderer, physics, labels, length, rows, arrays=arrays)
+        return {name: value[0].copy() for name, value in pictures}
+
+    def _videos(self) -> str:
+        given = self.painting.backgrounds
+        if given and self.painting.distractors == RESAMPLED:
+            return given  # fresh distractors may show other videos
+        if is_url(self.root) and not given and (self.record.backgrounds or {}).get("source", "builtin") != "builtin":
+            raise StoreError(f"{self.name} shows videos of its own; fetch the release, or give backgrounds=FOLDER")
+        return background_source(Path(self.root), self.record, given)
+
+
+def open_painted(path: str, storage_options: dict | None = None, **painting: Any) -> ReleaseReader:
+    """A release whose pictures are painted when they are read; see `dmcvb_gen.open` and `Painting`.
+
+    Raises:
+      StoreError: there is no release, it cannot be read, or it was imported.
+    """
+    return painted_release(open_release(path, storage_options), Painting(**painting))
+
+
+def painted_release(release: Release, painting: Painting, missing: bool = False) -> ReleaseReader:
+    """An open release whose pictures are painted when they are read.
+
+    Args:
+      missing: only those of subsets that lack some of them; the others are read as they are stored.
+
+    Raises:
+      StoreError: the release was imported, and not only missing pictures are to be painted.
+    """
+    if release.manifest.imported and not missing:
+        raise StoreError(f"{release.root} was imported and has no physics states to paint from; open it without paint")
+    subsets = {
+        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
+        if subset.record.imported or (missing and subset.record.pixels and not subset.unpainted.any())
+        else PaintedSubset(
+            subset.root, subset.record, subset.commits, subset._storage_options, release.manifest, painting
+        )
+        for name, subset in release.subsets.items()
+    }
+    return ReleaseReader(release.root, release.manifest, subsets)

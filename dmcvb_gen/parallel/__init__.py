@@ -1,0 +1,128 @@
+"""Work done side by side: functions and arguments in, results as they come; in this process or in fresh ones.
+
+::
+
+    with open_pool(workers=4, tick=bar.update) as pool:
+        for job in jobs:
+            pool.submit(job, run_job, job)      # run_job(job, tick=...) in a worker
+        for job, result in pool.results():
+            ...                                 # may submit more
+
+Functions and arguments travel by pickle between processes of one program and user; nothing is unpickled from a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, TypeVar
+
+from dmcvb_gen.parallel.base import (
+    IN_FLIGHT,
+    KEPT,
+    Future,
+    Needs,
+    Pool,
+    ProgressCallback,
+    Ray,
+    SerialPool,
+    Workers,
+    expect,
+    ignore,
+    limit_threads,
+)
+from dmcvb_gen.parallel.processes import ProcessPool
+
+__all__ = [
+    "IN_FLIGHT",
+    "KEPT",
+    "Future",
+    "Needs",
+    "Pool",
+    "ProcessPool",
+    "Ray",
+    "SerialPool",
+    "ProgressCallback",
+    "Workers",
+    "expect",
+    "ignore",
+    "in_order",
+    "limit_threads",
+    "open_pool",
+    "run_all",
+]
+
+Item = TypeVar("Item")
+
+
+def open_pool(
+    workers: Workers = 1,
+    *,
+    threads: int = 1,
+    tick: ProgressCallback = ignore,
+    kept: str = KEPT,
+    needs: Needs | None = None,
+    most: int | None = None,
+) -> Pool:
+    """A pool of `workers`; with one worker, the work is done in this process (on its own threads).
+
+    Args:
+      threads: of a worker process's libraries.
+      tick, kept: see `ProcessPool`.
+      needs: of a piece of work, where it is placed on a cluster.
+      most: how many pieces of work there will be at most; no more processes are of use.
+
+    Raises:
+      DmcvbError: the cluster cannot be reached.
+    """
+    if isinstance(workers, Ray):
+        from dmcvb_gen.parallel.ray_pool import RayPool
+
+        return RayPool(workers.address, needs, tick, threads)
+    workers = workers if most is None else min(workers, most)
+    return SerialPool(tick) if workers <= 1 else ProcessPool(workers, threads, tick, kept)
+
+
+def run_all(
+    function: Callable,
+    items: Iterable[Item],
+    workers: Workers | Pool = 1,
+    *,
+    threads: int = 1,
+    tick: ProgressCallback = ignore,
+) -> Iterator[tuple[Item, Any]]:
+    """(item, `function(item, tick=...)`) of all items, as they come.
+
+    Args:
+      workers: or an open pool, which stays open, with the threads and the tick that it has.
+
+    Raises:
+      StoreError: a worker was killed.
+    """
+    items = list(items)
+    if isinstance(workers, Pool):
+        opened: AbstractContextManager[Pool] = nullcontext(workers)
+    else:
+        opened = open_pool(workers, threads=threads, tick=tick, most=len(items))
+    with opened as pool:
+        for item in items:
+            pool.submit(item, function, item)
+        yield from pool.results()
+
+
+def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> list:
+    """`function(item, tick=...)` of all items, in their order, whoever had them first.
+
+    Args:
+      workers, tick: see `run_all`.
+
+    Raises:
+      StoreError: a worker was killed.
+    """
+    numbers = run_all(_numbered, [(number, function, item) for number, item in enumerate(items)], workers, tick=tick)
+    return [result for _, result in sorted((result for _, result in numbers), key=lambda pair: pair[0])]
+
+
+def _numbered(item: tuple[int, Callable, Any], tick: ProgressCallback) -> tuple[int, Any]:
+    number, function, work = item
+    return number, function(work, tick=tick)

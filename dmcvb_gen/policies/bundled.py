@@ -1,0 +1,95 @@
+"""Which policy files a level means: the package's own by default, a file's or a run's on request."""
+
+from __future__ import annotations
+
+import contextlib
+from importlib import resources
+from pathlib import Path
+
+from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.files import parse_json
+from dmcvb_gen.names import TRAINED_LEVELS
+from dmcvb_gen.policies.policy_file import read_header
+
+
+def bundled_folder() -> Path:
+    """Where the package keeps its policies: <task>/<level>.safetensors, mixed_0 .. mixed_7."""
+    return Path(str(resources.files("dmcvb_gen.policies"))) / "data"
+
+
+def level_files(folder: Path, level: str) -> list[Path]:
+    """The policy files of a level in a folder, in order; empty where there are none."""
+    if level == "mixed":
+        return sorted(folder.glob("mixed_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
+    path = folder / f"{level}.safetensors"
+    return [path] if path.exists() else []
+
+
+def bundled_levels(task_id: str) -> list[str]:
+    """Levels that the package has policies for."""
+    return [level for level in TRAINED_LEVELS if level_files(bundled_folder() / task_id, level)]
+
+
+def bundled_policies(task_id: str, level: str) -> list[Path]:
+    """Bundled policy files of a task and level (eight for mixed).
+
+    Raises:
+      DmcvbError: the package has none; says how to get one.
+    """
+    files = level_files(bundled_folder() / task_id, level)
+    if not files:
+        have = ", ".join([*bundled_levels(task_id), "random"])
+        raise DmcvbError(
+            f"no {level} policy of {task_id} is bundled (there is: {have}); train one with `dmcvb-gen train-behaviour "
+            f"{task_id}` and `dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
+        )
+    return files
+
+
+def levels_of(behaviour: str | Path) -> list[str]:
+    """Levels that a run folder or a folder of level files has policies for; a single policy file's own level.
+
+    Raises:
+      PolicyFileError: there are none.
+    """
+    path = Path(behaviour)
+    if path.is_file():
+        return [read_header(path).level or path.stem]
+    for folder in (path / "selected", path):
+        levels = [level for level in TRAINED_LEVELS if level_files(folder, level)]
+        if levels:
+            return levels
+    raise PolicyFileError(
+        f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {behaviour}` first, "
+        "or give a policy file"
+    )
+
+
+def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = None) -> list[Path]:
+    """Policy files of a level: bundled ones, or those of `behaviour`.
+
+    Args:
+      behaviour: a policy file, a run folder in which checkpoints were selected, or a folder of level files.
+
+    Raises:
+      DmcvbError: there is nothing for that level.
+    """
+    if behaviour is None:
+        return bundled_policies(task_id, level)
+    path = Path(behaviour)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise PolicyFileError(f"{behaviour} is neither a policy file nor a run folder")
+    for folder in (path / "selected", path):
+        files = level_files(folder, level)
+        if files:
+            return files
+    selection = path / "selection.json"
+    why = ""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # what is damaged gives no reason
+        why = parse_json(selection.read_bytes()).get("levels", {}).get(level, {}).get("reason") or ""
+    raise PolicyFileError(
+        f"{behaviour} has no {level} policy selected{f' ({why})' if why else ''}; run `dmcvb-gen select-checkpoints "
+        f"{behaviour}` first"
+    )

@@ -1,0 +1,81 @@
+"""Measuring a policy: policy and task in, returns of fresh episodes out, all episodes in one batch of fixed size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dmcvb_gen import arithmetic
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.header import Evaluation
+from dmcvb_gen.policies.simulate import Simulation, simulate
+from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
+
+
+def evaluate(
+    policy: Policy, task: Task, episodes: int = 100, seed: int = 1, deterministic: bool = True, threads: int = 1
+) -> tuple[Evaluation, Simulation]:
+    """Roll a policy out over fresh episodes (streams of their own, apart from every release's).
+
+    Returns:
+      Return statistics, and the episodes they come from.
+    """
+    out = simulate(
+        task,
+        [policy],
+        range(episodes),
+        seed,
+        (task.id, "evaluation"),
+        deterministic=deterministic,
+        threads=threads,
+    )
+    returns = out.returns
+    lowest, lower, middle, upper, highest = map(float, np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)))
+    success, speed = maze_scores(task, out)
+    return (
+        Evaluation(
+            mean=float(returns.mean()),
+            std=float(returns.std()),
+            episodes=episodes,
+            mode="mean" if deterministic else "sampled",
+            seed=seed,
+            quartiles=(lowest, lower, middle, upper, highest),
+            success=success,
+            speed=speed,
+        ),
+        out,
+    )
+
+
+def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float | None]:
+    """Share of episodes that reached the goal, and their mean speed towards it.
+
+    Speed is the straight distance to the goal at the start over the time it took, in m/s, as in the benchmarks;
+    None where no episode got there, both None for a task without a goal.
+    """
+    part = task.state_slices.get("target_vector")
+    if part is None:
+        return None, None
+    reached = simulation.terminated
+    seconds = simulation.length * ACTION_REPEAT * task.control_timestep
+    speed = arithmetic.norm(simulation.state[:, 0, part]) / seconds
+    return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None
+
+
+def running_speed(task: Task, simulation: Simulation) -> float | None:
+    """Root mean square of the torso's speed over all steps of all episodes, m/s; None for a task without a goal.
+
+    How fast the ants run, however well they know the way; standing still counts.
+    """
+    part = task.state_slices.get("walker_position")
+    if part is None:
+        return None
+    moved = np.diff(simulation.state[..., part].astype(np.float64), axis=1)
+    taken = np.arange(moved.shape[1]) < simulation.length[:, None]
+    return float(np.sqrt((moved[taken] ** 2).sum(axis=1).mean()) / (ACTION_REPEAT * task.control_timestep))
+
+
+def walked_paths(task: Task, simulation: Simulation, count: int = 10) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The first episodes' paths, (point, 2), and goals, (2), of a maze: x and y in meters."""
+    place, goal = task.state_slices["walker_position"], task.state_slices["target_position"]
+    states = zip(simulation.state[:count], simulation.length[:count], strict=True)
+    return [(state[: length + 1, place][:, :2], state[0, goal][:2]) for state, length in states]

@@ -1,0 +1,164 @@
+"""What a policy file says of itself: JSON in; a checked header, and the weights that it asks for, out."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shlex
+from typing import Annotated, Any, Literal
+
+import pydantic
+
+FORMAT_VERSION = 2
+"""2: a network that knows the way may come before the actor (`way`)."""
+WAY_SIZE = 4
+"""What the network that knows the way sees: x and y of the ant, x and y of the goal."""
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Where the log standard deviation of a squashed Gaussian is clipped (Haarnoja et al. 2018)."""
+MAX_LAYERS, MAX_WIDTH = 16, 65_536
+"""Hidden layers, and units of one, that a header may ask for."""
+Mode = Annotated[
+    Literal["mean", "sampled"],
+    pydantic.BeforeValidator(lambda mode: "mean" if mode == "deterministic" else mode),
+]
+"""Which actions were taken; "deterministic" is what version 0.1 wrote for "mean"."""
+ORIGINS = {
+    "sac": "by soft actor-critic (SAC)",
+    "guided": "on a policy of the open maze, by imitation of a guide that knows the way (DAgger)",
+    "sb3-sac": "by Stable-Baselines3's SAC",
+    "td3": "by Stable-Baselines3's TD3",
+    "tqc": "by sb3-contrib's TQC",
+    "ppo": "by Stable-Baselines3's PPO",
+}
+"""Algorithm -> how a policy of it was trained, after "trained ..."."""
+Width = Annotated[int, pydantic.Field(gt=0, le=MAX_WIDTH)]
+_PLACE = re.compile(r"[/\\~]|\.\.[/\\]|[A-Za-z]:[/\\]|file:")
+"""How a path begins that says where somebody keeps their files."""
+
+
+class _Model(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Evaluation(_Model):
+    """Returns of a policy over fresh episodes.
+
+    Attributes:
+      mode: "mean" or "sampled" actions.
+      success: share of episodes that the task ended (mazes), else None.
+    """
+
+    mean: float
+    std: float
+    episodes: int = pydantic.Field(gt=0)
+    mode: Mode
+    seed: int
+    quartiles: tuple[float, float, float, float, float] | None = None
+    success: float | None = None
+    speed: float | None = None
+
+
+class PolicyHeader(_Model):
+    """What a policy file says of itself.
+
+    Attributes:
+      task: the task's id.
+      observation: the name of what it sees, `task.observation`.
+      algorithm: what trained it, e.g. "sac"; `origin` says it in words.
+      agent_step: environment steps (at action repeat 2) it was trained for.
+      hidden: widths of the hidden layers.
+      layer_norm: whether each hidden layer is normalized before its activation.
+      distribution: "squashed_gaussian": tanh(mean + std * noise); "gaussian": clipped to [-1, 1];
+        "deterministic": the mean, with fixed `noise` added when sampling.
+      way: widths of the hidden layers of the network that says where to head in a maze (`policies.way`); None: the
+        policy heads for its goal.
+      clip_observation: normalized observations are clipped to +- this.
+      training: settings, seed, wall time, versions.
+      command: what trains it again.
+    """
+
+    format: Literal["dmcvb-gen policy"] = "dmcvb-gen policy"
+    format_version: int = FORMAT_VERSION
+    task: str
+    observation: str | None = None
+    observation_size: Width
+    action_size: Width
+    algorithm: str
+    agent_step: int = pydantic.Field(ge=0)
+    level: str | None = None
+    hidden: Annotated[tuple[Width, ...], pydantic.Field(max_length=MAX_LAYERS)]
+    way: Annotated[tuple[Width, ...] | None, pydantic.Field(max_length=MAX_LAYERS)] = None
+    activation: Literal["relu", "tanh", "elu", "gelu"] = "relu"
+    layer_norm: bool = False
+    distribution: Literal["squashed_gaussian", "gaussian", "deterministic"] = "squashed_gaussian"
+    noise: float = 0.0
+    clip_observation: float = 10.0
+    evaluation: Evaluation | None = None
+    training: dict[str, Any] = {}
+    command: str = ""
+
+    @property
+    def origin(self) -> str:
+        """How the policy came to be, in a few words for people."""
+        return origin_of(self.algorithm)
+
+    def without_local_paths(self) -> PolicyHeader:
+        """The header with the last names alone of paths that name a place on some machine, fit for manifests.
+
+        Files that older versions wrote say where the policy or run lay that their training started from.
+        """
+        facts = {"training": _without_local_paths(self.training), "command": _command_without_local_paths(self.command)}
+        return self.model_copy(update=facts)
+
+
+def origin_of(algorithm: str) -> str:
+    """How policies of an algorithm come to be, in a few words for people, after "trained ..."."""
+    return ORIGINS.get(algorithm, f"by {algorithm}")
+
+
+def _without_local_paths(value: Any) -> Any:
+    """Plain values, with the last names alone of the paths among them."""
+    if isinstance(value, dict):
+        return {name: _without_local_paths(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_local_paths(inner) for inner in value]
+    if isinstance(value, str) and _PLACE.match(value):
+        return re.split(r"[/\\]", value.rstrip("/\\"))[-1]
+    return value
+
+
+def _command_without_local_paths(command: str) -> str:
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        words = command.split()  # no command that a shell would take
+    bare = ["=".join(map(_without_local_paths, word.split("="))) for word in words]
+    return command if bare == words else shlex.join(bare)
+
+
+def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
+    """name -> shape of the weights of a header's actor, an MLP from observations to parameters of the distribution.
+
+    `body.<i>` are hidden layers (numbered with their norms and activations), `mean` and `log_std` the heads (for
+    "gaussian" a free vector `log_std_vector`); `observation_mean` and `observation_std` normalize what comes in.
+    `way.<i>` are the layers of the network that knows the way, where there is one.
+    """
+    shapes: dict[str, tuple[int, ...]] = {}
+    if header.way is not None:
+        widths = (WAY_SIZE, *header.way, 2)
+        for index, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
+            shapes |= {f"way.{2 * index}.weight": (fan_out, fan_in), f"way.{2 * index}.bias": (fan_out,)}
+    width, place = header.observation_size, 0
+    for hidden in header.hidden:
+        shapes |= {f"body.{place}.weight": (hidden, width), f"body.{place}.bias": (hidden,)}
+        if header.layer_norm:
+            place += 1
+            shapes |= {f"body.{place}.weight": (hidden,), f"body.{place}.bias": (hidden,)}
+        width, place = hidden, place + 2
+    heads = ("mean", "log_std") if header.distribution == "squashed_gaussian" else ("mean",)
+    for head in heads:
+        shapes |= {f"{head}.weight": (header.action_size, width), f"{head}.bias": (header.action_size,)}
+    if header.distribution == "gaussian":
+        shapes["log_std_vector"] = (header.action_size,)
+    observation = (header.observation_size,)
+    return shapes | {"observation_mean": observation, "observation_std": observation}

@@ -1,0 +1,47 @@
+"""The paper's table of episode returns: task and level in, its row out."""
+
+from __future__ import annotations
+
+import csv
+import functools
+from importlib import resources
+
+from dmcvb_gen.names import REWARDS, MazeName
+
+MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "medium": "ant-maze/multi-obstacle"}
+"""Layout's difficulty -> the paper's row, which pools the layouts of a difficulty."""
+
+
+@functools.cache
+def _table() -> dict[tuple[str, str], dict[str, float]]:
+    path = resources.files("dmcvb_gen.policies") / "data" / "paper_episode_returns.csv"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return {
+        (row.pop("task"), row.pop("level")): {name: float(value) for name, value in row.items()}
+        for row in csv.DictReader(lines)
+    }
+
+
+def paper_task(task_id: str) -> str:
+    """The name of a task's row: the paper's mazes, with its reward, are pooled by difficulty."""
+    maze = MazeName.parse(task_id)
+    if not maze or maze.rows or maze.reward not in (None, REWARDS[0]):
+        return task_id
+    return next((row for difficulty, row in MAZE_GROUPS.items() if maze.layout.startswith(difficulty)), task_id)
+
+
+def paper_returns(task_id: str, level: str) -> dict[str, float] | None:
+    """Steps, mean, std, min, p25, median, p75, max of the paper's episode returns; None where it has no row."""
+    row = _table().get((paper_task(task_id), level))
+    return dict(row) if row else None
+
+
+def medium_return(task_id: str) -> float | None:
+    """The mean return that a maze's medium policy is to have; None where medium is half of the way to convergence.
+
+    The paper says of medium that it has half of the expert's return, which negative returns leave without a meaning;
+    its table of the data's episode rewards (appendix "Reward Distribution"; our data/paper_episode_returns.csv) has a
+    row a group of layouts: -172.2 empty, -131.1 single-obstacle, -176.0 multi-obstacle, over episodes of 600 steps.
+    """
+    row = paper_returns(task_id, "medium") if paper_task(task_id) in MAZE_GROUPS.values() else None
+    return row["mean"] if row else None

@@ -1,0 +1,108 @@
+"""Files of behaviour policies: safetensors weights with a JSON header in, policies out, and back.
+
+Loading one runs no code from the file, allocates no more than the file holds, and refuses what does not fit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pydantic
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_safetensors
+from safetensors.numpy import save as dump_safetensors
+
+from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.files import parse_json, write_bytes
+from dmcvb_gen.names import ANT_MAZE, family_of
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.base import Task
+
+
+def save_policy(path: str | Path, header: PolicyHeader, weights: Mapping[str, np.ndarray]) -> None:
+    """Write a policy file atomically.
+
+    Args:
+      weights: as `weight_shapes` of the header says, kept as float32.
+    """
+    tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
+    data = dump_safetensors(tensors, metadata={"header": header.model_dump_json()})
+    write_bytes(path, data)
+
+
+def read_header(path: str | Path) -> PolicyHeader:
+    """The header of a policy file, see `load_policy` for what is refused."""
+    return _read(Path(path))[0]
+
+
+def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PolicyFileError(f"cannot read policy file {path}: {error.strerror}; give the path of one") from None
+    try:
+        size = int.from_bytes(data[:8], "little")
+        metadata = parse_json(data[8 : 8 + size]).get("__metadata__", {})
+        header = PolicyHeader.model_validate_json(metadata["header"])
+        weights = load_safetensors(data)
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error, pydantic.ValidationError):
+            first = error.errors()[0]
+            reason = f"header field {'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise PolicyFileError(
+            f"{path} is not a whole policy file ({reason}); copy it again or export it with select-checkpoints"
+        ) from None
+    if header.format_version > FORMAT_VERSION:
+        raise PolicyFileError(f"{path} has format version {header.format_version}; install a newer dmcvb-gen")
+    return header, weights, hashlib.sha256(data).hexdigest()
+
+
+def load_policy(path: str | Path, task: Task | None = None) -> Policy:
+    """Load a policy file.
+
+    Args:
+      task: the task it must be for; the header's own by default.
+
+    Raises:
+      PolicyFileError: the file is not whole, is for another task, or its shapes or values do not fit.
+    """
+    path = Path(path)
+    header, weights, digest = _read(path)
+    if task is not None and header.task != task.id and not _same_family(header.task, task.id):
+        raise PolicyFileError(f"{path} is a policy for {header.task}, not for {task.id}; give one trained on {task.id}")
+    task = task or get_task(header.task)
+    asked = (task.behaviour_size, task.action_size)
+    if (header.observation_size, header.action_size) != asked:
+        raise PolicyFileError(
+            f"{path} maps {header.observation_size} observations to {header.action_size} actions, "
+            f"{task.id} has {asked[0]} and {asked[1]}; train it again for this task"
+        )
+    if header.observation not in (None, task.observation):
+        raise PolicyFileError(
+            f"{path} sees {header.observation!r}, {task.id} shows {task.observation!r}; train it again for this task"
+        )
+    wanted = weight_shapes(header)
+    found = {name: value.shape for name, value in weights.items()}
+    if wanted != found:
+        name = next(name for name in sorted(wanted | found) if wanted.get(name) != found.get(name))
+        raise PolicyFileError(
+            f"{path}: weight {name!r} has shape {found.get(name)}, its header asks for {wanted.get(name)}; "
+            "the file was tampered with or written by another program"
+        )
+    for name, value in weights.items():
+        if value.dtype != np.float32 or not np.isfinite(value).all():
+            raise PolicyFileError(f"{path}: weight {name!r} holds values that are not finite float32; export it again")
+    if not (weights["observation_std"] > 0).all():
+        raise PolicyFileError(f"{path}: observation_std is not positive; export it again")
+    return Policy(header, weights, digest)
+
+
+def _same_family(first: str, second: str) -> bool:
+    """Ant-maze policies never see the layout, so one may be used (and warm-started) in another maze."""
+    return family_of(first) == family_of(second) == ANT_MAZE

@@ -1,0 +1,180 @@
+"""Simulating episodes: task, policies and streams in; actions, rewards, states and physics out. No pixels here.
+
+An episode depends on its index alone, never on which episodes are simulated beside it: physics does not
+mix simulations, every random number comes from the episode's own streams, and a policy adds up in a fixed order,
+whatever rows lie beside it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.seeding import episode_seed, episode_stream
+from dmcvb_gen.tasks.base import EpisodeBatch, Task
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Episodes without their pictures; rows past an episode's end are zero.
+
+    Attributes:
+      episodes: (episode,) indices in the subset.
+      state: (episode, row, state) float32; one row more than the longest episode may have steps.
+      action: (episode, row, action) float32, zero in the last row.
+      reward, discount: (episode, row) float32, likewise.
+      physics: (episode, row, physics) float64.
+      length: (episode,) int32, transitions.
+      terminated: (episode,) bool, ended by the task.
+      seed: (episode,) uint64, label of the episode's streams.
+      behaviour: (episode,) int16, index of the policy.
+      goal_pair: (episode,) int16, index of the fixed start and goal, -1 where they are random.
+      seconds: time spent, by part.
+    """
+
+    episodes: np.ndarray
+    state: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    discount: np.ndarray
+    physics: np.ndarray
+    length: np.ndarray
+    terminated: np.ndarray
+    seed: np.ndarray
+    behaviour: np.ndarray
+    goal_pair: np.ndarray
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """(episode,) float64: sum of the stored rewards."""
+        return self.reward.astype(np.float64).sum(axis=1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """By the store's names."""
+        names = ("state", "action", "reward", "discount", "physics", "length", "terminated", "seed", "behaviour")
+        return {name: getattr(self, name) for name in names} | {"return": self.returns, "goal_pair": self.goal_pair}
+
+
+def _actions(
+    policies: Sequence[Policy],
+    assigned: np.ndarray,
+    generators: Sequence[np.random.Generator],
+    observations: np.ndarray,
+    active: np.ndarray,
+    action_size: int,
+    deterministic: bool,
+) -> np.ndarray:
+    """Actions of a batch of episodes, each from its own policy; zeros where an episode is over.
+
+    Returns:
+      (size, action) float32.
+    """
+    actions = np.zeros((len(observations), action_size), np.float32)
+    for index in np.unique(assigned).tolist():
+        rows = np.flatnonzero(active & (assigned == index))
+        if len(rows):
+            streams = [generators[int(row)] for row in rows]
+            actions[rows] = policies[index].act(observations[rows], streams, deterministic)
+    return actions
+
+
+def _empty(task: Task, episodes: np.ndarray, limit: int) -> Simulation:
+    """Episodes of `limit` steps that have not begun, all zeros."""
+    size, rows = len(episodes), limit + 1
+    return Simulation(
+        episodes=episodes,
+        state=np.zeros((size, rows, task.state_size), np.float32),
+        action=np.zeros((size, rows, task.action_size), np.float32),
+        reward=np.zeros((size, rows), np.float32),
+        discount=np.zeros((size, rows), np.float32),
+        physics=np.zeros((size, rows, task.physics_size)),
+        length=np.full(size, limit, np.int32),
+        terminated=np.zeros(size, bool),
+        seed=np.zeros(size, np.uint64),
+        behaviour=np.zeros(size, np.int16),
+        goal_pair=np.full(size, -1, np.int16),
+        seconds={"physics": 0.0, "policy": 0.0},
+    )
+
+
+def simulate(
+    task: Task,
+    policies: Sequence[Policy],
+    episodes: Sequence[int],
+    seed: int,
+    names: tuple[str, ...],
+    *,
+    deterministic: bool = True,
+    goal_pairs: Sequence[tuple] | None = None,
+    episodes_per_goal: int | None = None,
+    threads: int = 1,
+    max_steps: int | None = None,
+) -> Simulation:
+    """Simulate episodes of a subset.
+
+    Args:
+      policies: behaviour policies; episode i takes number i modulo their count.
+      episodes: indices of the episodes.
+      seed, names: the recipe's seed and the names of the streams (see `seeding`).
+      deterministic: mean actions; False draws samples (uniform random actions are always drawn).
+      goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
+      max_steps: agent steps at which an episode ends, if not the task's time limit.
+    """
+    chosen, limit = np.asarray(episodes, int), max_steps or task.max_steps
+    starts, noise = (
+        [episode_stream(seed, names, int(i), name) for i in chosen] for name in ("initial_state", "policy")
+    )
+    out = _empty(task, chosen, limit)
+    out.behaviour[:] = chosen % len(policies)
+    out.seed[:] = [episode_seed(seed, names, int(i)) for i in chosen]
+    if goal_pairs is not None:
+        out.goal_pair[:] = chosen // (episodes_per_goal or 1)
+    started = time.perf_counter()
+    batch = task.batch(len(chosen), threads)
+    pairs = None if goal_pairs is None else [goal_pairs[k] for k in out.goal_pair.tolist()]
+    state = batch.reset(starts) if pairs is None else batch.reset_fixed(starts, pairs)
+    out.seconds["physics"] += time.perf_counter() - started
+    _step_to_the_end(batch, state, policies, noise, deterministic, out)
+    return out
+
+
+def _step_to_the_end(
+    batch: EpisodeBatch,
+    state: np.ndarray,
+    policies: Sequence[Policy],
+    noise: Sequence[np.random.Generator],
+    deterministic: bool,
+    out: Simulation,
+) -> None:
+    """Step episodes that have just started until all have ended, and put what happens into `out`.
+
+    Args:
+      state: (size, state) of the first observations.
+      noise: one generator an episode, of its drawn actions.
+    """
+    limit, action_size = out.state.shape[1] - 1, batch.task.action_size
+    active = np.ones(len(state), bool)
+    for step in range(limit + 1):
+        out.state[active, step] = state[active]
+        out.physics[active, step] = batch.physics()[active]
+        active &= ~out.terminated
+        if step == limit or not active.any():
+            break
+        started = time.perf_counter()
+        seen = batch.behaviour_observation()
+        actions = _actions(policies, out.behaviour, noise, seen, active, action_size, deterministic)
+        acted = time.perf_counter()
+        result = batch.step(actions, active)
+        out.seconds["policy"] += acted - started
+        out.seconds["physics"] += time.perf_counter() - acted
+        state, ended = result.state, result.terminated
+        out.action[active, step] = actions[active]
+        out.reward[active, step] = result.reward[active]
+        out.discount[active, step] = np.where(ended[active], 0.0, 1.0)
+        out.terminated[ended] = True
+        out.length[ended] = step + 1

@@ -1,0 +1,24 @@
+"""What a check found: which check, where, and what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Issue:
+    """Something wrong: which check, where, and what."""
+
+    check: str
+    subset: str
+    message: str
+    episode: int | None = None
+    step: int | None = None
+
+    def __str__(self) -> str:
+        place = self.subset
+        if self.episode is not None:
+            place += f", episode {self.episode}"
+        if self.step is not None:
+            place += f", step {self.step}"
+        return f"{self.check}: {place}: {self.message}"

@@ -1,0 +1,1 @@
+"""Where releases lie: local folders, object stores, the Hugging Face Hub."""

@@ -1,0 +1,364 @@
+"""Run folders: what every training run has, whatever trains it.
+
+A run folder holds
+
+    run.json                              what is trained, never changed
+    checkpoints/<agent step>.safetensors  a policy file an evaluation, thinned where there are many
+    progress.csv, tensorboard/            a row, a point an evaluation
+    resume/                               learner, replay buffer, simulations, random states: a killed run goes on
+    selected/, selection.json, curve.png  written by the selection
+
+The saved state is written aside and renamed, so that a process that dies, or a disk that fills up, leaves the
+previous one. All that was logged after the saved state is dropped when a run goes on from it, and made again: with
+the same versions of torch and numpy, the same processor and one thread, a run that was killed and resumed gives the
+same bits as one that never was, as long as its replay buffer did not wrap around between save and kill (the rows
+written over by then are newer ones of the same run).
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import dataclasses
+import json
+import os
+import shlex
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import filelock
+import numpy as np
+import torch
+
+from dmcvb_gen.dataset.manifest import environment
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import write_bytes
+from dmcvb_gen.names import ANT_MAZE, LOCOMOTION
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.evaluation import evaluate
+from dmcvb_gen.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.policies.policy_file import save_policy
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training.networks import as_arrays
+from dmcvb_gen.training.pruning import prunable_checkpoints
+from dmcvb_gen.training.run_log import RunLog
+from dmcvb_gen.training.settings import check_settings
+from dmcvb_gen.training.state_file import STATE, pack_state, read_state
+
+EVALUATION_EPISODES = 20
+"""Episodes of an evaluation along the way, at most; selection evaluates its picks again on 100."""
+EVALUATION_STEPS = {LOCOMOTION: 8.0, ANT_MAZE: 4.0}
+"""Agent steps simulated in evaluations for each one trained, at most: about a fifth of a run's time. Counted in steps,
+not in seconds, so that a run gives the same bits however busy its machine is."""
+DENSE_SHARE = 0.2
+"""Share of the way from the paper's medium return to its expert's below which evaluations are dense: medium and mixed
+are picked from there."""
+RISEN = 5
+"""Evaluations whose median must be above that."""
+SAVE_SECONDS = 240
+"""Seconds after which the next evaluation also saves the state to resume from."""
+
+FREE = ("steps", "settings", "init_sha256")
+"""Fields of a run's configuration in which one that goes on need not be written as it was."""
+
+Report = Callable[["Progress"], None]
+ProgressCallback = Callable[[int], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """What a run trains; written once to run.json, a resumed run must have the same.
+
+    Attributes:
+      steps: agent steps (at action repeat 2) to train; a resumed run may have more.
+      evaluate_every: agent steps between evaluations (and policy files) while the return is low, where medium and
+        mixed checkpoints are picked from.
+      evaluate_sparse: the same once a fifth of the way from the paper's medium return to its expert's is behind.
+      init_from: policy file or run whose actor, critics and normalization it starts from.
+      init_sha256: of that file as it was when the run began, where it is a file.
+    """
+
+    task: str
+    algorithm: str
+    steps: int
+    seed: int
+    settings: dict[str, Any]
+    evaluate_every: int = 2_000
+    evaluate_sparse: int = 10_000
+    init_from: str | None = None
+    init_sha256: str | None = None
+
+    @property
+    def init_name(self) -> str | None:
+        """What a policy file says that it started from: the path's last name, for the rest is nobody's business."""
+        return self.init_from and Path(os.path.abspath(self.init_from)).name
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """One evaluation along the way; seconds are of training, evaluations left out."""
+
+    step: int
+    evaluation: Evaluation
+    seconds: float
+    steps_per_second: float
+
+
+def command_of(config: RunConfig) -> str:
+    """The command line that trains this run again."""
+    parts = [f"dmcvb-gen train-behaviour {config.task} --algo {config.algorithm} --steps {config.steps}"]
+    parts.append(f"--seed {config.seed}")
+    parts.append(f"--evaluate-every {config.evaluate_every}")
+    if config.init_from:
+        parts.append(f"--init-from {shlex.quote(config.init_from)}")
+    pairs = (f"{name}={json.dumps(value)}" for name, value in sorted(config.settings.items()))
+    parts += [f"--set {shlex.quote(pair)}" for pair in pairs]
+    return " ".join(parts)
+
+
+def read_config(folder: str | Path) -> RunConfig | None:
+    """What the run in a folder trains; None where there is no run.
+
+    Raises:
+      DmcvbError: run.json is damaged.
+    """
+    path = Path(folder) / "run.json"
+    if not path.exists():
+        return None
+    try:
+        return RunConfig(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise DmcvbError(f"{path} is not a run's configuration ({error}); choose another --out") from None
+
+
+def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:
+    """Refuse to mix two configurations in one folder; only `steps` may differ.
+
+    What the run started from is as it was then, whatever lies there by now. Settings are compared with their defaults
+    filled in, so that naming a default is no difference.
+    """
+    was, now = (
+        {name: value for name, value in vars(config).items() if name not in FREE}
+        | dataclasses.asdict(check_settings(config.algorithm, config.settings))
+        for config in (found, asked)
+    )
+    for name in was | now:
+        if was.get(name) != now.get(name):
+            raise DmcvbError(
+                f"{folder} holds a run with {name} {was.get(name)!r}, asked for {now.get(name)!r}; "
+                "choose another --out, or repeat its settings"
+            )
+
+
+class Run(abc.ABC):
+    """A run in a folder; `train` starts it or goes on.
+
+    Attributes:
+      settings: the algorithm's checked settings.
+      header: of its policy files, without evaluation and agent step.
+      step: agent steps so far.
+      seconds: of training so far, evaluations left out.
+      warmup_setting: the setting that says how long nothing is learned.
+    """
+
+    warmup_setting = "warmup_steps"
+
+    def __init__(self, folder: Path, config: RunConfig):
+        self.folder, self.config = Path(folder), config
+        self.task = get_task(config.task)
+        self.settings = check_settings(config.algorithm, config.settings)
+        self.header = PolicyHeader(
+            task=self.task.id,
+            observation=self.task.observation,
+            observation_size=self.task.behaviour_size,
+            action_size=self.task.action_size,
+            algorithm=config.algorithm,
+            agent_step=0,
+            training={
+                "settings": dataclasses.asdict(self.settings),
+                "seed": config.seed,
+                "init_from": config.init_name,
+                "environment": environment(),
+            }
+            | ({"init_sha256": config.init_sha256} if config.init_sha256 else {})
+            | self.describe(),
+            command=command_of(dataclasses.replace(config, init_from=config.init_name)),
+            **self.network(),
+        )
+        self.step, self.seconds = 0, 0.0
+        self._started = time.time()
+
+    # -- what an algorithm must say ---------------------------------------------------------
+
+    @abc.abstractmethod
+    def network(self) -> dict[str, Any]:
+        """The header's fields that say how the actor is built."""
+
+    def describe(self) -> dict[str, Any]:
+        """What else the header's `training` should say."""
+        return {}
+
+    @abc.abstractmethod
+    def warmup(self) -> int:
+        """Agent steps before anything is learned."""
+
+    def evaluation_steps(self) -> float:
+        """Agent steps simulated in evaluations for each one trained, at most."""
+        return EVALUATION_STEPS[self.task.family]
+
+    def most_evaluation_episodes(self) -> int:
+        """Episodes of an evaluation along the way, at most."""
+        return EVALUATION_EPISODES
+
+    def problem(self) -> str | None:
+        """Why a run with these settings would come to nothing, and the cure; None where nothing is wrong."""
+        return None
+
+    def too_few_updates(self, warmup: int, needed: int = 1) -> str | None:
+        """A problem where the updates of all steps come to less than the policy needs to change once.
+
+        Args:
+          warmup: agent steps before the first update; `updates_per_step` come for every one after.
+          needed: updates until the policy changes.
+        """
+        together, rate = self.settings.simulations, self.settings.updates_per_step
+        rounds = -(-self.config.steps // together) - max(-(-warmup // together), 1) + 1
+        if rounds * together * rate >= needed:
+            return None
+        return (
+            f"{self.config.steps} steps come to {rounds * together * rate:.3g} updates and the policy changes after "
+            f"{needed}, so nothing would be learned; give more --steps, or a higher --set updates_per_step"
+        )
+
+    @abc.abstractmethod
+    def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
+        """Train until `config.steps`, from a saved state where there is one."""
+
+    # -- what callers use -------------------------------------------------------------------
+
+    def train(self, report: Report = lambda progress: None, tick: ProgressCallback = lambda steps: None) -> None:
+        """Train until `config.steps` agent steps; told of every evaluation and of every few steps.
+
+        Raises:
+          DmcvbError: another process trains in the folder, or its disk is full (the last saved state is whole).
+        """
+        with self._writing():
+            for name in ("checkpoints", "resume"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+            with self._alone():
+                saved = self.saved()
+                self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
+                self._drop_later_checkpoints()
+                self._log = RunLog(self.folder, self.step)
+                self._started = time.time()
+                try:
+                    self._train(saved, report, tick)
+                finally:
+                    self._log.close()
+
+    def saved(self) -> dict[str, Any] | None:
+        """The state to resume from (tensors, numbers and texts only), None where nothing is saved yet."""
+        return read_state(self.folder)
+
+    # -- what algorithms use ----------------------------------------------------------------
+
+    def record(
+        self, weights: Mapping[str, torch.Tensor], updates: int, metrics: Mapping[str, float], report: Report
+    ) -> Progress:
+        """Evaluate the actor's `weights`, export them as a policy file, log; evaluations are not training time."""
+        self.seconds += time.time() - self._started
+        header = self.header.model_copy(update={"agent_step": self.step})
+        arrays = as_arrays(weights)
+        evaluation, _ = evaluate(Policy(header, arrays, ""), self.task, self.evaluation_episodes(), seed=self.step)
+        trained = header.training | {"seconds": round(self.seconds, 1)}
+        header = header.model_copy(update={"evaluation": evaluation, "training": trained})
+        save_policy(self._checkpoint(self.step), header, arrays)
+        self._log.add(self.step, evaluation, self.seconds, updates, metrics)
+        self._thin()
+        progress = Progress(self.step, evaluation, self.seconds, self.step / max(self.seconds, 1e-9))
+        report(progress)
+        self._started = time.time()
+        return progress
+
+    def evaluation_episodes(self) -> int:
+        """Episodes of the evaluation after the steps trained since the one before, so that all keep to their share."""
+        since = self.step - max((step for step in self._log.curve if step < self.step), default=0)
+        affordable = self.evaluation_steps() * since / self.task.max_steps
+        return int(np.clip(affordable, 1, self.most_evaluation_episodes()))
+
+    def next_evaluation(self, evaluation: Evaluation, planned: int) -> int:
+        """The agent step of the evaluation after this one: the planned one, where the run ended before it."""
+        if self.step < planned:
+            return planned
+        config = self.config
+        expert, medium = (paper_returns(self.task.id, level) for level in ("expert", "medium"))
+        dense = True
+        if expert and medium:
+            # One lucky evaluation must not end it: a maze's twenty episodes have a standard error of half its medium.
+            latest = [*list(self._log.curve.values())[-RISEN:-1], evaluation.mean]
+            dense = np.median(latest) < medium["mean"] + DENSE_SHARE * (expert["mean"] - medium["mean"])
+        return self.step + (config.evaluate_every if dense else config.evaluate_sparse)
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Put the state to resume from in place of the previous one, whole or not at all."""
+        data = pack_state(state | {"step": self.step, "seconds": self.seconds})
+        write_bytes(self.folder / "resume" / STATE, data)
+
+    # -- the folder -------------------------------------------------------------------------
+
+    def _checkpoint(self, step: int) -> Path:
+        return self.folder / "checkpoints" / f"{step:010d}.safetensors"
+
+    def _checkpoints(self) -> dict[int, Path]:
+        files = (self.folder / "checkpoints").glob("[0-9]*.safetensors")
+        return {int(path.stem): path for path in files if path.stem.isdigit()}
+
+    def _drop_later_checkpoints(self) -> None:
+        for step, path in self._checkpoints().items():
+            if step > self.step:
+                path.unlink()
+        for folder in ("checkpoints", "resume"):
+            for path in (self.folder / folder).glob("*.partial"):
+                path.unlink()
+
+    def _thin(self) -> None:
+        files = self._checkpoints()
+        curve = {step: self._log.curve[step] for step in files if step in self._log.curve}
+        picked = self._picked()
+        for step in prunable_checkpoints(curve, self.task.return_range):
+            if files[step].name not in picked:
+                files[step].unlink()
+
+    def _picked(self) -> set[str]:
+        """Names of the checkpoints that the last selection picked."""
+        try:
+            levels = json.loads((self.folder / "selection.json").read_text())["levels"]
+            return {Path(pick["path"]).name for level in levels.values() for pick in level["picks"]}
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            return set()
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """One process a folder; the lock ends with the process, however that ends."""
+        lock = filelock.FileLock(self.folder / "resume" / "lock", timeout=0)
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            raise DmcvbError(f"another process trains in {self.folder}; wait for it, or choose another --out") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DmcvbError(
+                f"cannot write the run in {self.folder}: {error.strerror or error}; the previous saved state is whole, "
+                "make room and go on with --resume"
+            ) from None

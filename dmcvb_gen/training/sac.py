@@ -1,0 +1,371 @@
+"""Soft actor-critic on batched simulations: transitions in, a squashed Gaussian actor out.
+
+SAC (Haarnoja et al. 2018) with what makes humanoids learnable and CPUs fast: running observation
+normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products where the
+processor has them, compiled updates. scripts/bench_training.py sets it beside Stable-Baselines3's SAC.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
+from dmcvb_gen.training.networks import Actor
+from dmcvb_gen.training.row_files import map_rows, rows_in
+from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, Share
+
+
+@dataclass(frozen=True)
+class SacSettings:
+    """Settings of `Sac`; the defaults of a task are in data/defaults.yaml.
+
+    Attributes:
+      simulations: episodes stepped side by side.
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
+      warmup_steps: agent steps of uniform random actions before the first update.
+      actor_every: an actor update every so many critic updates.
+      target_entropy_scale: the target entropy is minus this times the action size.
+      sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` and the learning rate
+        `sharp_learning_rate` (0: never). A policy that explores loses return to its own noise, one that learns fast
+        swings from checkpoint to checkpoint; the end of a run can do without both.
+      sharp_entropy_scale: see `sharpen_after`.
+      sharp_learning_rate: see `sharpen_after`; 0: as before.
+      reward_scale: multiplies rewards before learning.
+      shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
+      progress: mazes: weight of the meters of shortest path covered in a step, added to the training reward (never to
+        an evaluation). DMC-VB's own reward is flat in the whole goal cell.
+      standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
+        instead of the task's initial states; evaluations always start as the task does.
+      sunken_starts: mazes: share of training episodes that start deep in the floor, which flings an ant up; what it
+        does in the air decides whether it comes down on its feet.
+      mean_share: share of the simulations that act by the mean, as data are made: a policy that only ever collects
+        with noise never sees the places where its mean stands still.
+      train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
+      critics: how many critics.
+      clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
+        tasks want).
+      weight_decay: of AdamW, on actor and critics.
+      bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
+      compile: compile the updates (needs a C++ compiler on the CPU).
+    """
+
+    simulations: Count = 8
+    batch_size: Count = 256
+    actor_hidden: tuple[Count, ...] = (256, 256)
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    learning_rate: Positive = 1e-3
+    discount: Decay = 0.99
+    target_decay: Decay = 0.995
+    updates_per_step: Positive = 1.0
+    warmup_steps: Natural = 5000
+    actor_every: Count = 2
+    target_entropy_scale: float = 0.5
+    sharpen_after: Natural = 0
+    sharp_entropy_scale: float = 1.5
+    sharp_learning_rate: NonNegative = 0.0
+    initial_temperature: Positive = 0.1
+    reward_scale: Positive = 0.5
+    shaping: NonNegative = 0.0
+    progress: NonNegative = 0.0
+    standing_starts: Share = 0.0
+    sunken_starts: Share = 0.0
+    mean_share: Share = 0.0
+    train_episode_steps: Natural = 0
+    buffer_size: Count = 1_000_000
+    critics: Count = 2
+    clipped: bool = True
+    weight_decay: NonNegative = 0.0
+    bfloat16: bool = True
+    compile: bool = True
+
+
+class CriticEnsemble(nn.Module):
+    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer."""
+
+    def __init__(
+        self, observation_size: int, action_size: int, hidden: tuple[int, ...], bfloat16: bool, critics: int = 2
+    ):
+        super().__init__()
+        self.bfloat16 = bfloat16
+        sizes = (observation_size + action_size, *hidden)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
+        for i, o in zip(sizes[:-1], sizes[1:], strict=True):
+            self.weights.append(nn.Parameter(torch.stack([_init(i, o) for _ in range(critics)])))
+            self.biases.append(nn.Parameter(torch.zeros(critics, 1, o)))
+            self.scales.append(nn.Parameter(torch.ones(critics, 1, o)))
+            self.shifts.append(nn.Parameter(torch.zeros(critics, 1, o)))
+        self.head = nn.Parameter(torch.stack([_init(sizes[-1], 1) for _ in range(critics)]) * 0.1)
+        self.head_bias = nn.Parameter(torch.zeros(critics, 1, 1))
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(n, observation), (n, action) -> (critic, n)."""
+        x = torch.cat([observation, action], dim=1).expand(len(self.head), -1, -1)
+        for weight, bias, scale, shift in zip(self.weights, self.biases, self.scales, self.shifts, strict=True):
+            if self.bfloat16:
+                x = torch.bmm(x.bfloat16(), weight.bfloat16()).float() + bias
+            else:
+                x = torch.baddbmm(bias, x, weight)
+            x = nn.functional.layer_norm(x, x.shape[-1:]) * scale + shift
+            x = nn.functional.relu(x)
+        return (torch.bmm(x, self.head) + self.head_bias).squeeze(-1)
+
+
+def _init(inputs: int, outputs: int) -> torch.Tensor:
+    bound = math.sqrt(3.0 / inputs)
+    return torch.empty(inputs, outputs).uniform_(-bound, bound)
+
+
+class RowBuffer:
+    """The latest rows of named float32 fields, in memory-mapped files, so that a killed run finds them again.
+
+    Args:
+      size: rows kept.
+      shapes: name -> shape of one row of the field.
+      folder: where the files are; None keeps them in memory.
+    """
+
+    def __init__(self, size: int, shapes: Mapping[str, tuple[int, ...]], folder: Path | None = None):
+        self.position, self.full = 0, False
+        self.found = 0
+        """Rows that the files held before they were opened."""
+        if folder is None:
+            self.arrays = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
+        else:
+            paths = {name: folder / f"{name}.f32" for name in shapes}
+            self.found = min(rows_in(paths[name], shape) for name, shape in shapes.items())
+            size = max(size, self.found)
+            self.arrays = {name: map_rows(paths[name], size, shape)[:size] for name, shape in shapes.items()}
+        self.size = size
+
+    def restore(self, position: int, full: bool, rows: int | None = None) -> None:
+        """Go on where a run was saved, whose buffer had `rows` rows (as many as the files held, if not known)."""
+        rows = rows or self.found
+        # A full buffer that has grown since is not full any more: what is new lies behind the old rows.
+        self.position, self.full = (rows, False) if full and self.size > rows else (position, full)
+
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        for array in self.arrays.values():
+            if isinstance(array, np.memmap):
+                array.flush()
+
+    def __len__(self) -> int:
+        return self.size if self.full else self.position
+
+    def add(self, **values: np.ndarray) -> None:
+        """Append one row of each simulation, (n, ...) a field."""
+        count = len(next(iter(values.values())))
+        rows = (self.position + np.arange(count)) % self.size
+        for name, value in values.items():
+            self.arrays[name][rows] = value
+        self.full |= self.position + count >= self.size
+        self.position = (self.position + count) % self.size
+
+    def sample(self, rng: np.random.Generator, count: int) -> dict[str, torch.Tensor]:
+        """`count` rows drawn uniformly, float32 tensors."""
+        rows = rng.integers(0, len(self), count)
+        return {name: torch.from_numpy(np.asarray(array[rows])) for name, array in self.arrays.items()}
+
+
+class ReplayBuffer(RowBuffer):
+    """Transitions."""
+
+    def __init__(self, size: int, observation_size: int, action_size: int, folder: Path | None = None):
+        shapes = {
+            "observation": (observation_size,),
+            "next_observation": (observation_size,),
+            "action": (action_size,),
+            "reward": (),
+            "terminated": (),
+        }
+        super().__init__(size, shapes, folder)
+
+
+class RunningNorm:
+    """Mean and variance of all observations seen (Welford, batched)."""
+
+    def __init__(self, size: int):
+        self.count, self.mean, self.m2 = 1e-4, np.zeros(size), np.ones(size) * 1e-4
+
+    def update(self, values: np.ndarray) -> None:
+        count, mean = len(values), values.mean(axis=0)
+        delta, total = mean - self.mean, self.count + count
+        self.m2 += values.var(axis=0) * count + delta**2 * self.count * count / total
+        self.mean += delta * count / total
+        self.count = total
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(self.m2 / self.count).clip(1e-2)
+
+
+class Sac:
+    """The learner: networks, optimizers, temperature; `update` does one step of all of them."""
+
+    def __init__(self, header: PolicyHeader, settings: SacSettings, seed: int):
+        torch.manual_seed(seed)
+        self.settings = settings
+        observation, action = header.observation_size, header.action_size
+        self.actor = Actor(header)
+        sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics)
+        self.critic, self.target = CriticEnsemble(*sizes), CriticEnsemble(*sizes)
+        self.target.load_state_dict(self.critic.state_dict())
+        self.target.requires_grad_(False)
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
+        self.target_entropy = -settings.target_entropy_scale * action
+        self._sharp_entropy = -settings.sharp_entropy_scale * action
+        rate = settings.learning_rate
+        decay = {"weight_decay": settings.weight_decay, "fused": True}
+        self.actor_optimizer = torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay)
+        self.critic_optimizer = torch.optim.AdamW(self.critic.parameters(), lr=rate, **decay)
+        self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
+        self.norm = RunningNorm(observation)
+        self.updates = 0
+        self._losses: dict[str, torch.Tensor] = {}
+        self._critic_loss, self._actor_loss = self.critic_loss, self.actor_loss
+        if settings.compile:
+            self._critic_loss = torch.compile(self.critic_loss)
+            self._actor_loss = torch.compile(self.actor_loss)
+
+    def sharpen(self, step: int) -> None:
+        """Aim at the lower entropy, by smaller steps, from the agent step on that the settings name."""
+        settings = self.settings
+        if not settings.sharpen_after or step < settings.sharpen_after:
+            return
+        self.target_entropy = self._sharp_entropy
+        for optimizer in (self.actor_optimizer, self.critic_optimizer, self.alpha_optimizer):
+            for group in optimizer.param_groups:
+                group["lr"] = settings.sharp_learning_rate or group["lr"]
+
+    def sync_norm(self) -> None:
+        """Put the running statistics into the actor, where every network reads them."""
+        self.actor.observation_mean.copy_(torch.from_numpy(self.norm.mean))
+        self.actor.observation_std.copy_(torch.from_numpy(self.norm.std))
+
+    def sample_action(self, normalized: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Reparametrized action and its log probability, (n, action), (n,)."""
+        x = normalized
+        for layer in self.actor.body:
+            if self.settings.bfloat16 and isinstance(layer, nn.Linear):
+                x = nn.functional.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
+            else:
+                x = layer(x)
+        mean, log_std = self.actor.mean(x), self.actor.log_std(x).clamp(*LOG_STD_RANGE)
+        noise = torch.randn_like(mean)
+        before = mean + log_std.exp() * noise
+        action = torch.tanh(before)
+        log_prob = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
+        log_prob = log_prob - 2 * (math.log(2) - before - nn.functional.softplus(-2 * before))
+        return action, log_prob.sum(dim=1)
+
+    def reduce(self, values: torch.Tensor) -> torch.Tensor:
+        """(critic, n) -> (n,): the value that targets and the actor believe."""
+        return values.min(dim=0).values if self.settings.clipped else values.mean(dim=0)
+
+    def critic_loss(self, observation, action, reward, terminated, next_observation):
+        """Mean squared Bellman error of the critics, (1)."""
+        with torch.no_grad():
+            next_observation = self.actor.normalize(next_observation)
+            next_action, log_prob = self.sample_action(next_observation)
+            next_value = self.reduce(self.target(next_observation, next_action))
+            next_value = next_value - self.log_alpha.exp() * log_prob
+            target = reward + (1 - terminated) * self.settings.discount * next_value
+        values = self.critic(self.actor.normalize(observation), action)
+        return ((values - target) ** 2).mean(dim=1).sum()
+
+    def actor_loss(self, observation):
+        """E[alpha log pi - min Q] and the mean log probability."""
+        observation = self.actor.normalize(observation)
+        action, log_prob = self.sample_action(observation)
+        value = self.reduce(self.critic(observation, action))
+        return (self.log_alpha.exp().detach() * log_prob - value).mean(), log_prob.mean()
+
+    def update(self, batch: dict[str, torch.Tensor]) -> None:
+        """One gradient step."""
+        settings = self.settings
+        loss = self._critic_loss(
+            batch["observation"],
+            batch["action"],
+            batch["reward"] * settings.reward_scale,
+            batch["terminated"],
+            batch["next_observation"],
+        )
+        self.critic_optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.critic_optimizer.step()
+        self._losses["critic_loss"] = loss.detach()
+        self.updates += 1
+        if self.updates % settings.actor_every == 0:
+            self.critic.requires_grad_(False)
+            loss, log_prob = self._actor_loss(batch["observation"])
+            self.actor_optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            self.actor_optimizer.step()
+            self.critic.requires_grad_(True)
+            self._losses |= {"actor_loss": loss.detach(), "entropy": -log_prob.detach()}
+            self.alpha_optimizer.zero_grad(set_to_none=True)
+            (-self.log_alpha.exp() * (log_prob.detach() + self.target_entropy)).backward()
+            self.alpha_optimizer.step()
+        torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Actions for collecting, (n, observation) -> (n, action) float32: means in the first rows, samples below."""
+        with torch.no_grad():
+            mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
+            noise = torch.randn_like(mean)
+            noise[: round(self.settings.mean_share * len(noise))] = 0
+            return torch.tanh(mean + std * noise).numpy()
+
+    def metrics(self) -> dict[str, float]:
+        """Losses, policy entropy (nats) and temperature of the last update."""
+        return {name: float(value) for name, value in self._losses.items()} | {
+            "temperature": float(self.log_alpha.detach().exp())
+        }
+
+    def state(self) -> dict:
+        """Everything that learning continues from (tensors and plain numbers)."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "target": self.target.state_dict(),
+            "log_alpha": self.log_alpha.detach(),
+            "actor_optimizer": self.actor_optimizer.state_dict(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "alpha_optimizer": self.alpha_optimizer.state_dict(),
+            "norm": {
+                "count": self.norm.count,
+                "mean": torch.from_numpy(self.norm.mean),
+                "m2": torch.from_numpy(self.norm.m2),
+            },
+            "updates": self.updates,
+            "torch_rng": torch.get_rng_state(),
+        }
+
+    def load_state(self, state: dict) -> None:
+        """Continue from `state()`."""
+        self.load_networks(state)
+        for name in ("actor_optimizer", "critic_optimizer", "alpha_optimizer"):
+            getattr(self, name).load_state_dict(state[name])
+        self.updates = int(state["updates"])
+        torch.set_rng_state(state["torch_rng"])
+
+    def load_networks(self, state: dict) -> None:
+        """Take networks, temperature and normalization of `state()`, but no optimizer or random state.
+
+        Raises:
+          RuntimeError: they have other shapes.
+        """
+        for name in ("actor", "critic", "target"):
+            getattr(self, name).load_state_dict(state[name])
+        with torch.no_grad():
+            self.log_alpha.copy_(state["log_alpha"])
+        self.norm.count = float(state["norm"]["count"])
+        self.norm.mean, self.norm.m2 = state["norm"]["mean"].numpy().copy(), state["norm"]["m2"].numpy().copy()

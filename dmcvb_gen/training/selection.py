@@ -1,0 +1,363 @@
+"""Picking behaviour policies from a run, as the paper does: a learning curve in; expert, medium and mixed out.
+
+Paper, section 3.1: expert is the first checkpoint with 95 % of the return at convergence, medium the one with 50 %,
+mixed eight checkpoints evenly spaced, in training steps, from the start to medium. Mean actions are judged, as the data
+are made of them. Returns of mazes are negative, so an expert costs at most 1 / 0.95 of what the return at convergence
+does, and medium is the checkpoint whose mean return is nearest to the paper's row of its group; the paper has no mixed
+data of mazes.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dmcvb_gen.dataset.manifest import write_json_atomically
+from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.names import ANT_MAZE, MAZE_TRAINED_LEVELS, TRAINED_LEVELS
+from dmcvb_gen.policies.actor import Policy, random_policy
+from dmcvb_gen.policies.evaluation import evaluate
+from dmcvb_gen.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.policies.paper import medium_return
+from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training.run_log import read_rows
+
+EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
+MEDIUM_TOLERANCE = 0.1
+"""How far (as a share of the way) an accepted medium checkpoint may be from 50 %."""
+PAPER_TOLERANCE = 0.2
+"""How far (as a share of it) a maze's medium may be from the paper's return."""
+CANDIDATES = 8
+"""Checkpoints near a medium's return that are measured on fresh episodes."""
+BASE_EPISODES = 20
+"""Episodes of random actions in a maze, of which none finds its goal but by chance."""
+COST_SLACK = 0.3
+"""How much more (as a share) than an expert a maze's checkpoint may have cost on the way to be measured afresh: one
+stuck ant of twenty doubles what they cost."""
+CLOSE_ENOUGH = 0.2
+"""Share of the tolerance within which no nearer checkpoint is looked for."""
+SMOOTHING = 5
+"""Evaluations in the moving median of the curve."""
+MIN_POINTS = 8
+"""Evaluations below which no convergence is claimed."""
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Where a curve ends.
+
+    Attributes:
+      value: return at convergence, the mean of the last quarter of the smoothed curve.
+      error: its standard error.
+      converged: whether the last quarter lies within 5 % of the way of the quarter before.
+      reason: why not.
+    """
+
+    value: float
+    error: float
+    converged: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """One picked checkpoint: what was aimed at, its place in the curve, and its returns over fresh episodes."""
+
+    name: str
+    target: str
+    step: int
+    estimate: float
+    path: str
+    evaluation: Evaluation
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What could be picked, and why the rest could not.
+
+    Attributes:
+      base: return at 0 % of the way.
+      picks: level -> checkpoints (mixed: eight).
+      reasons: level -> why it cannot be picked yet.
+    """
+
+    task: str
+    base: float
+    convergence: Convergence
+    picks: dict[str, tuple[Pick, ...]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+
+def smooth(values: Sequence[float], window: int = SMOOTHING) -> np.ndarray:
+    """Moving median, shorter at the ends."""
+    values, half = np.asarray(values, float), window // 2
+    return np.array([np.median(values[max(0, i - half) : i + half + 1]) for i in range(len(values))])
+
+
+def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) -> Convergence:
+    """Estimate the return at convergence from the end of a learning curve.
+
+    The curve is taken over training steps, not evaluations, so that dense evaluations do not weigh more. A
+    run that collapsed after its peak converges to its best stretch of a quarter of the run: a policy that
+    was reached once can be picked.
+    """
+    steps, curve = np.asarray(steps, float), smooth(returns)
+    if len(curve) < MIN_POINTS:
+        return Convergence(
+            float(curve[-1]) if len(curve) else float("nan"),
+            float("nan"),
+            False,
+            f"{len(curve)} evaluations, at least {MIN_POINTS} are needed",
+        )
+    grid = np.linspace(steps[0], steps[-1], 64)
+    even = np.interp(grid, steps, curve)
+    means = np.convolve(even, np.ones(16) / 16, mode="valid")  # every stretch of a quarter
+    best = int(means.argmax())
+    value = float(means[best])
+    stretch = even[best : best + 16]
+    error = float(stretch.std() / np.sqrt(len(stretch) / SMOOTHING))
+    way = value - base
+    if way <= 0:
+        return Convergence(
+            value, error, False, f"the return ({value:.1f}) never rose above where it started ({base:.1f})"
+        )
+    if best == len(means) - 1:
+        before = float(even[max(0, best - 16) : best].mean())
+        if value - before > 0.05 * way:
+            return Convergence(
+                value, error, False, f"the return still rises (from {before:.1f} to {value:.1f} in the last quarter)"
+            )
+    return Convergence(value, error, True)
+
+
+Point = tuple[int, float, Path | None]
+"""Agent step, return, policy file; None where the file was thinned away."""
+
+
+def read_curve(folder: Path) -> list[Point]:
+    """Every evaluation of a run, in order of steps: those of progress.csv and of the checkpoints' own headers.
+
+    A checkpoint that is being written while we look is left out.
+    """
+    curve: dict[int, Point] = {
+        int(row["step"]): (int(row["step"]), float(row["return_mean"]), None) for row in read_rows(folder)
+    }
+    for path in (Path(folder) / "checkpoints").glob("*.safetensors"):
+        try:
+            header = read_header(path)
+        except PolicyFileError:
+            continue
+        if header.evaluation is not None:
+            curve[header.agent_step] = (header.agent_step, header.evaluation.mean, path)
+    return [curve[step] for step in sorted(curve)]
+
+
+def pick_checkpoints(
+    curve: Sequence[Point],
+    base: float,
+    convergence: Convergence,
+    measure: Callable[[Path], Evaluation],
+    task: str = "",
+    levels: Sequence[str] = TRAINED_LEVELS,
+    medium: float | None = None,
+) -> Selection:
+    """Pick levels from a curve; every pick is measured on fresh episodes before it is accepted.
+
+    Args:
+      curve: (agent step, return, policy file), in order of steps.
+      base: return at 0 % of the way.
+      measure: evaluates a policy file on fresh episodes.
+      levels: what to pick, of `TRAINED_LEVELS`.
+      medium: return that medium is to have; None: half of the way.
+    """
+    way, check = convergence.value - base, functools.cache(measure)
+    curve = [point for point in curve if point[2] is not None]
+    if not curve or not way > 0:
+        reason = convergence.reason or "the run has no evaluated checkpoint yet"
+        return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
+    found: dict[str, tuple[Pick, ...] | str] = {}
+    if medium is None:
+        found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check, errors=2)
+    else:
+        # Returns of mazes are costs: 95 % of the way from the random policy's would be half again as much as the end's.
+        goal = convergence.value / EXPERT_SHARE
+        found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check, errors=0)
+    if not convergence.converged:
+        found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
+    last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
+    before = [point for point in curve if point[0] <= last]
+    if medium is None:
+        found["medium"] = _medium(before, base + MEDIUM_SHARE * way, MEDIUM_TOLERANCE * way, check)
+    else:
+        found["medium"] = _medium(before, medium, PAPER_TOLERANCE * abs(medium), check)
+    if "mixed" in levels:
+        found["mixed"] = found["medium"]
+        if not isinstance(found["medium"], str):
+            found["mixed"] = _mixed(before, found["medium"][0].step, check)
+    picks = {level: picked for level, picked in found.items() if not isinstance(picked, str)}
+    return Selection(task, base, convergence, picks, {level: why for level, why in found.items() if level not in picks})
+
+
+def _expert(
+    curve: Sequence[Point], goal: float, slack: float, check: Callable, errors: float
+) -> tuple[Pick, ...] | str:
+    """The first checkpoint that returns `goal` or more, by so many standard errors, or why there is none."""
+    # Returns of the curve's few episodes are noisy: start a little below the line, fresh episodes decide.
+    candidates = [point for point in curve if point[1] >= goal - slack]
+    for step, value, path in candidates:
+        evaluation = check(path)
+        # Beyond sampling error: a policy that falls now and then has a wide spread and is not an expert yet.
+        error = evaluation.std / np.sqrt(evaluation.episodes)
+        if evaluation.mean - errors * error >= goal:
+            return (Pick("expert", f"return {goal:.1f}", step, value, str(path), evaluation),)
+    return f"none of {len(candidates)} candidates held {goal:.1f} over fresh episodes; train longer (--resume)"
+
+
+def _medium(curve: Sequence[Point], goal: float, tolerance: float, check: Callable) -> tuple[Pick, ...] | str:
+    """The checkpoint whose return is nearest to `goal`, or why there is none within the tolerance."""
+    # A few episodes may lie about a checkpoint, its neighbors about a steep curve: either may name it.
+    smoothed = smooth([value for _, value, _ in curve])
+    away = [min(abs(value - goal), abs(even - goal)) for (_, value, _), even in zip(curve, smoothed, strict=True)]
+    order = sorted(range(len(curve)), key=away.__getitem__)[:CANDIDATES]
+    near = [curve[index] for index in order if away[index] <= 1.5 * tolerance]
+    best, off = None, tolerance
+    for step, value, path in near:
+        evaluation = check(path)
+        if abs(evaluation.mean - goal) <= off:
+            best = Pick("medium", f"return {goal:.1f}", step, value, str(path), evaluation)
+            off = abs(evaluation.mean - goal)
+        if off <= CLOSE_ENOUGH * tolerance:
+            break
+    if best:
+        return (best,)
+    closest = min((value for _, value, _ in curve), key=lambda value: abs(value - goal))
+    return f"no checkpoint held {goal:.1f} +- {tolerance:.1f} (nearest {closest:.1f}); evaluate more often"
+
+
+def _mixed(curve: Sequence[Point], last: int, check: Callable) -> tuple[Pick, ...] | str:
+    """Eight checkpoints evenly spaced in training steps from the start to `last`, or which is missing."""
+    picks = []
+    for index, goal in enumerate(np.linspace(0, last, MIXED_COUNT)):
+        step, value, path = min(curve, key=lambda point: abs(point[0] - goal))
+        if abs(step - goal) > last / (MIXED_COUNT - 1) / 2:
+            return f"no checkpoint near step {goal:.0f} (number {index + 1} of {MIXED_COUNT}); evaluate more often"
+        picks.append(Pick(f"mixed_{index}", f"step {goal:.0f}", step, value, str(path), check(path)))
+    return tuple(picks)
+
+
+def select_checkpoints(
+    folder: str | Path,
+    episodes: int = 100,
+    seed: int = 20_000,
+    deterministic: bool = True,
+    converged: float | None = None,
+) -> Selection:
+    """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
+
+    Also writes selection.json and curve.png. Works on a running run too; what cannot be picked yet is said
+    in `reasons`, and earlier picks of that level are left alone.
+
+    Args:
+      converged: return at convergence, of a longer run, where this one ends before it; None: from the curve.
+
+    Raises:
+      DmcvbError: the folder holds no run.
+    """
+    folder = Path(folder)
+    curve = read_curve(folder)
+    files = [path for _, _, path in curve if path]
+    if not files:
+        raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
+    task = get_task(read_header(files[0]).task)
+    mazes = task.family == ANT_MAZE
+    base = evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed)[0].mean if mazes else 0.0
+    measured: dict[Path, tuple[Policy, Evaluation]] = {}
+
+    def measure(path: Path) -> Evaluation:
+        if path not in measured:
+            policy = load_policy(path, task)
+            measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic)[0]
+        return measured[path][1]
+
+    def pick() -> Selection:
+        end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
+        if converged is not None:
+            end = Convergence(converged, 0.0, True)
+        levels = MAZE_TRAINED_LEVELS if mazes else TRAINED_LEVELS
+        return pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id))
+
+    for attempt in range(5):
+        try:
+            selection = pick()
+            break
+        except PolicyFileError:
+            curve, before = read_curve(folder), files
+            files = [path for _, _, path in curve if path]
+            # The run may have thinned a checkpoint away since the curve was read; a damaged one is a real error.
+            if attempt == 4 or set(before) <= set(files):
+                raise
+    _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})
+    return selection
+
+
+def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:
+    """Write the picks, selection.json and curve.png into a run's folder."""
+    for level, picks in selection.picks.items():
+        for pick in picks:
+            policy = policies[pick.path]
+            facts = {"level": level, "evaluation": pick.evaluation}
+            header: PolicyHeader = policy.header.without_local_paths().model_copy(update=facts)
+            save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
+    write_json_atomically(folder / "selection.json", selection_json(selection))
+    plot_selection(curve, selection, folder / "curve.png")
+
+
+def selection_json(selection: Selection) -> dict:
+    """A selection as plain values."""
+    levels = {}
+    for level in TRAINED_LEVELS:
+        picks = [asdict(pick) | {"evaluation": pick.evaluation.model_dump()} for pick in selection.picks.get(level, ())]
+        levels[level] = {"picks": picks, "reason": selection.reasons.get(level)}
+    return {
+        "task": selection.task,
+        "base": selection.base,
+        "convergence": asdict(selection.convergence),
+        "levels": levels,
+    }
+
+
+def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> None:
+    """The learning curve with the picks marked, a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    steps = [step for step, _, _ in curve]
+    returns = [value for _, value, _ in curve]
+    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    axes.plot(steps, returns, color="0.75", linewidth=1, label="evaluations along the way")
+    axes.plot(steps, smooth(returns), color="tab:blue", label="smoothed")
+    axes.axhline(selection.convergence.value, color="tab:blue", linestyle=":", linewidth=1)
+    axes.text(steps[0], selection.convergence.value, f" convergence {selection.convergence.value:.0f}", va="bottom")
+    colors = {"expert": "tab:green", "medium": "tab:orange", "mixed": "tab:red"}
+    for level, picks in selection.picks.items():
+        axes.errorbar(
+            [pick.step for pick in picks],
+            [pick.evaluation.mean for pick in picks],
+            [pick.evaluation.std for pick in picks],
+            fmt="o",
+            color=colors[level],
+            capsize=2,
+            label=f"{level} (fresh episodes)",
+        )
+    axes.set(xlabel="agent steps", ylabel="episode return", title=selection.task)
+    axes.legend(loc="lower right")
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

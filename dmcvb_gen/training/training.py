@@ -1,0 +1,240 @@
+"""Training a behaviour policy online on states: task and settings in, a run folder of checkpoints out.
+
+The package's own SAC is trained here, Stable-Baselines3's algorithms in `sb3`; `open_run` gives the one that is
+asked for. What a run folder holds is said in `runs`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.dataset.manifest import write_json_atomically
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training.episodes import Episodes, shaping_of
+from dmcvb_gen.training.networks import as_tensors
+from dmcvb_gen.training.runs import (
+    SAVE_SECONDS,
+    Progress,
+    ProgressCallback,
+    Report,
+    Run,
+    RunConfig,
+    check_same,
+    command_of,
+    read_config,
+)
+from dmcvb_gen.training.sac import ReplayBuffer, Sac
+from dmcvb_gen.training.settings import check_settings
+from dmcvb_gen.training.state_file import read_state
+
+__all__ = ["Progress", "Run", "RunConfig", "SacRun", "command_of", "open_run", "read_config"]
+
+
+class SacRun(Run):
+    """A run of the package's own SAC."""
+
+    def network(self) -> dict[str, Any]:
+        return {"hidden": tuple(self.settings.actor_hidden)}
+
+    def warmup(self) -> int:
+        return self.settings.warmup_steps  # also from --init-from: then the policy's own steps fill the buffer
+
+    def problem(self) -> str | None:
+        settings = self.settings
+        if settings.buffer_size < settings.warmup_steps:
+            return (
+                f"buffer_size {settings.buffer_size} holds fewer steps than warmup_steps {settings.warmup_steps}, so "
+                "nothing would ever be learned; give --set buffer_size of at least that"
+            )
+        return self.too_few_updates(settings.warmup_steps, settings.actor_every)
+
+    def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
+        loop, next_evaluation = SacLoop(self, saved), self.config.evaluate_every
+        if saved:
+            next_evaluation = (self.step // self.config.evaluate_every + 1) * self.config.evaluate_every
+            next_evaluation = saved.get("next_evaluation", next_evaluation)
+        last_saved = self._started
+        while self.step < self.config.steps:
+            loop.collect()
+            loop.learn()
+            tick(self.settings.simulations)
+            if self.step >= min(next_evaluation, self.config.steps):
+                learner = loop.learner
+                progress = self.record(learner.actor.state_dict(), learner.updates, learner.metrics(), report)
+                next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
+                if self._started - last_saved > SAVE_SECONDS:
+                    self.save(loop.state() | {"next_evaluation": next_evaluation})
+                    last_saved = self._started
+        self.save(loop.state() | {"next_evaluation": next_evaluation})
+
+
+class SacLoop:
+    """What a run of SAC goes round: episodes fill the buffer, the learner learns from it; its state can be saved.
+
+    Args:
+      saved: `state()` to go on from; None at the start.
+    """
+
+    def __init__(self, run: SacRun, saved: dict[str, Any] | None):
+        settings, task, config = run.settings, run.task, run.config
+        self.run, self.learner = run, Sac(run.header, settings, config.seed)
+        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
+        self.buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, run.folder / "resume")
+        self.rng = np.random.default_rng([config.seed, 0xB0FF])
+        self._owed = 0.0  # updates
+        if saved:
+            place = saved["buffer"]
+            _fit(f"{run.folder} cannot be resumed", self.learner.load_state, saved["learner"])
+            self.buffer.restore(place["position"], place["full"], place.get("size"))
+            self.rng.bit_generator.state = json.loads(saved["rng"])
+            self._owed = saved.get("owed", 0.0)
+        elif config.init_from:
+            _start_from(self.learner, config.init_from)
+        self.episodes, self._shaping = Episodes(run, self.rng), shaping_of(task)
+        if saved and "episodes" in saved:
+            self.observation = self.episodes.restore(saved["episodes"])
+        else:
+            self.observation = self.episodes.start(np.arange(settings.simulations))
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the run goes on from."""
+        buffer = self.buffer
+        buffer.flush()
+        return {
+            "learner": self.learner.state(),
+            "buffer": {"position": buffer.position, "full": buffer.full, "size": buffer.size},
+            "rng": json.dumps(self.rng.bit_generator.state),
+            "episodes": self.episodes.saved(self.observation),
+            "owed": self._owed,
+        }
+
+    def _action(self) -> np.ndarray:
+        settings = self.run.settings
+        if len(self.buffer) < settings.warmup_steps and not self.run.config.init_from:
+            return self.rng.uniform(-1, 1, (settings.simulations, self.run.task.action_size)).astype(np.float32)
+        return self.learner.act(self.observation)
+
+    def collect(self) -> None:
+        """One agent step of every simulation, into the buffer."""
+        settings, batch, observation = self.run.settings, self.episodes.batch, self.observation
+        self.learner.norm.update(observation)
+        action = self._action()
+        before = batch.path_length() if settings.progress else 0.0
+        result = batch.step(action)
+        reward = result.reward
+        if settings.progress:
+            reward = reward + settings.progress * (before - batch.path_length())
+        if settings.shaping:
+            reward = reward + settings.shaping * self._shaping(result.state)
+        reached = batch.behaviour_observation()
+        self.buffer.add(
+            observation=observation,
+            next_observation=reached,
+            action=action,
+            reward=reward,
+            terminated=result.terminated,
+        )
+        self.run.step += settings.simulations
+        self.observation = self.episodes.restart_ended(reached, result.terminated)
+
+    def learn(self) -> None:
+        """The updates that the steps so far are owed."""
+        settings = self.run.settings
+        self.learner.sync_norm()
+        self.learner.sharpen(self.run.step)
+        if len(self.buffer) < settings.warmup_steps:
+            return
+        self._owed += settings.updates_per_step * settings.simulations
+        while self._owed >= 1:
+            self.learner.update(self.buffer.sample(self.rng, settings.batch_size))
+            self._owed -= 1
+
+
+def _fit(what: str, load: Callable[[Any], None], state: Any) -> None:
+    """Load networks of another run, or say that their shapes differ."""
+    try:
+        load(state)
+    except (RuntimeError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DmcvbError(f"{what}: its networks do not fit these settings and task ({reason})") from None
+
+
+def _start_from(learner: Sac, source: str) -> None:
+    """Take networks and normalization from another run, or the actor alone from a policy file."""
+    path = Path(source)
+    if path.is_dir():
+        config = read_config(path)
+        saved = read_state(path) if config and config.algorithm == "sac" else None
+        if not saved:
+            raise DmcvbError(f"--init-from {source}: no run of sac is saved there; give its folder or a policy file")
+        _fit(f"--init-from {source}", learner.load_networks, saved["learner"])
+        return
+    _fit(f"--init-from {source}", learner.actor.load_state_dict, as_tensors(load_policy(path).weights))
+    learner.norm.mean = learner.actor.observation_mean.numpy().astype(float)
+    learner.norm.count = 1e5
+    learner.norm.m2 = learner.actor.observation_std.numpy().astype(float) ** 2 * learner.norm.count
+
+
+def run_class(algorithm: str) -> type[Run]:
+    """The kind of run that trains an algorithm."""
+    if algorithm == "sac":
+        return SacRun
+    if algorithm == "guided":
+        from dmcvb_gen.training.guided import GuidedRun
+
+        return GuidedRun
+    from dmcvb_gen.training.sb3 import Sb3Run
+
+    return Sb3Run
+
+
+def _digest(path: str | None) -> str | None:
+    """Of the policy file that a run starts from, None where it starts from none."""
+    return sha256_file(path) if path and Path(path).is_file() else None
+
+
+def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
+    """A run in a folder: a new one, or the one that is there with `resume`.
+
+    Raises:
+      DmcvbError: the folder holds another configuration, or a run and `resume` was not asked for; settings are
+        unknown or wrong; there is too little room on the disk.
+    """
+    folder = local_path(folder)
+    check_settings(config.algorithm, config.settings)
+    get_task(config.task)
+    found = read_config(folder)
+    if found:
+        if not resume:
+            raise DmcvbError(f"{folder} holds a run already; go on with --resume, or choose another --out")
+        check_same(folder, found, config)
+    elif folder.is_file() or (folder.exists() and any(folder.iterdir())):
+        raise DmcvbError(f"{folder} is not empty and holds no run; choose another --out")
+    if config.init_from and not Path(config.init_from).is_file() and not read_config(config.init_from):
+        raise DmcvbError(f"--init-from {config.init_from} is neither a run folder nor a policy file")
+    config = dataclasses.replace(config, init_sha256=found.init_sha256 if found else _digest(config.init_from))
+    run = run_class(config.algorithm)(folder, config)
+    if config.steps <= run.warmup():
+        raise DmcvbError(
+            f"{config.steps} steps are all warm-up ({run.warmup()} steps), nothing would be learned; give more "
+            f"--steps, or less warm-up: --set {run.warmup_setting}=N"
+        )
+    if problem := run.problem():
+        raise DmcvbError(problem)
+    with storage_errors(folder, "write to"):
+        folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < 1e9:
+            raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")
+        write_json_atomically(folder / "run.json", json.loads(json.dumps(dataclasses.asdict(config))))
+    return run
