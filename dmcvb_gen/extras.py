@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 EXTRAS = {
-    "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "jinja2"),
+    "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
     "pictures": ("imageio_ffmpeg", "matplotlib"),
     "xarray": ("xarray",),
     "gpu": ("mujoco_warp", "warp"),

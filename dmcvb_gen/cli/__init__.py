@@ -19,6 +19,7 @@ COMMANDS = {
     "status": ("cluster:status", "Show how far a release is that is being made, here or on many machines."),
     "info": ("rollout:info", "Show what a release holds, returns beside the paper's."),
     "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
+    "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
     "show-maze": ("maze:show_maze", "Picture a maze, its distances to a goal and the path there."),
     "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
     "verify": ("release:verify", "Check that a release is what it says."),

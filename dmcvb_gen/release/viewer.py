@@ -1,0 +1,248 @@
+"""The viewer: one HTML file that plays the episodes of a release in any browser, without a network.
+
+The file holds everything: pictures as WebP sheets, curves as 16-bit integers, and the script that shows them. Pictures
+that the release does not store are painted while the file is written.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import math
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import write_bytes
+from dmcvb_gen.loaders.painted import Painting, painted_release
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
+from dmcvb_gen.names import select
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.storage.remote import is_url, local_path, public, storage_errors
+
+EPISODES = 12
+"""Episodes in a file by default, shared out among the subsets."""
+MAX_BYTES = 20_000_000
+"""Largest file. If all pictures do not fit, the viewer shows every second one, or every third, and says so."""
+SHEET_SIDE = 4096
+"""Largest width and height of a sheet of pictures, in pixels."""
+WEBP_QUALITY = 85
+LEVELS = 65535
+"""Steps of a number's range that the file distinguishes."""
+CAMERA_AXES = {"camera_position": "xyz", "camera_quaternion": "wxyz", "material_rgb": "rgb"}
+
+
+@dataclass(frozen=True)
+class Written:
+    """A viewer file.
+
+    Attributes:
+      path, bytes: the file and its size.
+      episodes: how many episodes it shows, of how many subsets.
+      stride: every how many-th picture it has; 1 if all are there.
+    """
+
+    path: Path
+    bytes: int
+    episodes: int
+    subsets: int
+    stride: int
+
+
+def view(
+    path: str,
+    out: str | Path | None = None,
+    *,
+    only: Sequence[str] = (),
+    episodes: int | None = None,
+    size: int | None = None,
+    max_bytes: int = MAX_BYTES,
+    storage_options: dict | None = None,
+    progress: ProgressCallback = ignore,
+) -> Written:
+    """Write one HTML file that plays episodes of a release: pictures, rewards, actions, states and labels.
+
+    Args:
+      path: the release, a folder or a URL.
+      out: the file; `<release>/preview/viewer.html` by default.
+      only: subset patterns.
+      episodes: the first so many of each subset; by default 12 are shared out, at least one a subset.
+      size: paint the pictures at so many pixels a side, instead of taking the stored ones.
+      max_bytes: largest file; pictures are left out evenly until it is small enough.
+      storage_options: passed to fsspec for a URL.
+      progress: told 1 for each episode.
+
+    Raises:
+      StoreError: the release has no episodes yet, its pictures cannot be painted, or the file cannot be written.
+      UnknownNameError: no such subset.
+    """
+    if not out and is_url(path):
+        raise StoreError(f"{public(path)} is a URL: say with --out where to write the file")
+    target = local_path(out) if out else None
+    release = _with_pictures(open_for_reading(path, storage_options), size)
+    names = select(list(release.subsets), list(only)) if release.subsets else []
+    if not names:
+        raise StoreError(f"{public(path)} has no finished episodes; run the rollout first")
+    target = target or release.path / "preview" / "viewer.html"
+    each = episodes or max(1, EPISODES // len(names))
+    chosen = [(release[name], int(index)) for name in names for index in release[name].episodes[:each]]
+    expect(progress, len(chosen))
+    parts = []
+    for subset, index in chosen:
+        parts.append(_episode(subset, index, _command(release, path, subset, index)))
+        progress(1)
+    page, stride = _fitted(release, parts, max_bytes)
+    with storage_errors(target, "write to"):
+        write_bytes(target, page)
+    return Written(target, len(page), len(parts), len(names), stride)
+
+
+def _with_pictures(release: ReleaseReader, size: int | None) -> ReleaseReader:
+    """The release with all pictures readable: stored, or painted on reading."""
+    whole = all(subset.record.pixels and not subset.unpainted.any() for subset in release.subsets.values())
+    return release if whole and not size else painted_release(release, Painting(size=size), missing=not size)
+
+
+def _fitted(release: Release, parts: list[dict[str, Any]], max_bytes: int) -> tuple[bytes, int]:
+    """The page with as many pictures as fit, and every how many-th picture that is."""
+    stride = 1
+    while True:
+        page = _page(release, [_with_sheets(part, stride) for part in parts])
+        longest = max(part["length"] for part in parts)
+        if len(page) <= max_bytes or stride > longest:
+            break
+        stride = max(stride + 1, math.ceil(stride * len(page) / max_bytes))
+    if len(page) > max_bytes:
+        raise StoreError(
+            f"{len(parts)} episodes do not fit into {max_bytes / 1e6:.1f} MB; take fewer with --only or --episodes"
+        )
+    return page, stride
+
+
+def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
+    from jinja2 import Environment
+
+    manifest = release.manifest
+    facts = dict(name=manifest.name, version=manifest.version, digest=manifest.digest or "", episodes=parts)
+    # In a script, "<" could end it, so the data have none.
+    data = json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    template = files("dmcvb_gen.release").joinpath("data/viewer.html").read_text("utf-8")
+    return Environment(autoescape=True).from_string(template).render(title=manifest.name, data=data).encode()
+
+
+def _command(release: Release, path: str, subset: SubsetReader, index: int) -> str:
+    """The command that makes an episode again from the release's manifest; "" if the release was imported."""
+    if release.manifest.imported or subset.record.imported:
+        return ""
+    place = public(path) if is_url(path) else Path(path).resolve().name
+    what = f"--only {shlex.quote(subset.name)} --episodes {index}:{index + 1}"
+    return f"dmcvb-gen regenerate {shlex.quote(place)} {what} --out again"
+
+
+# -- one episode ----------------------------------------------------------------------------------
+
+
+def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
+    """What the page shows of an episode: facts, views with their raw frames, and groups of curves."""
+    pictures = shown(subset)
+    labels = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in subset.arrays]
+    numbers = ["state", "action", "reward", "seed", "terminated"]
+    values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])
+    return {
+        "subset": subset.name,
+        "index": index,
+        "length": len(values["reward"]),
+        "return": float(values["reward"].astype(np.float64).sum()),
+        "seed": str(int(values["seed"])),
+        "terminated": bool(values["terminated"]),
+        "seconds": float(subset.attrs.get("seconds_per_step") or 0.05),
+        "trajectory": hashlib.sha256(values["state"].tobytes() + values["action"].tobytes()).hexdigest()[:16],
+        "command": command,
+        "frames": {view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
+        "curves": {
+            "reward": [_curve("reward", values["reward"]), _curve("return so far", np.cumsum(values["reward"]))],
+            "action": [_curve(f"action {i}", column) for i, column in enumerate(values["action"].T)],
+            "state": [_curve(name, column) for name, column in _state_columns(subset, values["state"])],
+            "distractor": [
+                _curve(name, column)
+                for label in labels
+                for name, column in _label_columns(label, values[f"exogenous/{label}"], pictures.views)
+            ],
+        },
+    }
+
+
+def _state_columns(subset: SubsetReader, state: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    fields = subset.group[subset.paths["state"]].attrs.get("fields") or {"state": [0, state.shape[1]]}
+    for name, (first, last) in fields.items():
+        for column in range(first, last):
+            yield (name if last - first == 1 else f"{name} {column - first}"), state[:, column]
+
+
+def _label_columns(label: str, values: np.ndarray, views: Sequence[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Named columns of a label: "camera_position top x", "material_rgb 3 g", "style"."""
+    if values.ndim == 1:
+        yield label, values
+        return
+    for row in range(values.shape[1]):
+        name = (views[row] if row < len(views) else str(row)) if label.startswith("camera") else str(row)
+        name = "" if values.shape[1] == 1 else f"{name} "
+        for axis, letter in enumerate(CAMERA_AXES[label]):
+            yield f"{label} {name}{letter}", values[:, row, axis]
+
+
+def _curve(name: str, values: np.ndarray) -> dict[str, Any]:
+    """A curve as its range and 16-bit places in it; numbers that are not finite are taken for zero."""
+    values = np.nan_to_num(values.astype(np.float64), posinf=0.0, neginf=0.0)
+    low, high = float(values.min()), float(values.max())
+    curve: dict[str, Any] = {"name": name, "low": low, "high": high}
+    if high > low:
+        places = np.round((values - low) / (high - low) * LEVELS).astype("<u2")
+        curve["places"] = base64.b64encode(places.tobytes()).decode()
+    return curve
+
+
+def _with_sheets(part: dict[str, Any], stride: int) -> dict[str, Any]:
+    """An episode with its frames as sheets of WebP instead of arrays."""
+    views = [_sheets(view, frames[::stride]) for view, frames in part["frames"].items()]
+    return {name: value for name, value in part.items() if name != "frames"} | {"views": views, "stride": stride}
+
+
+def _sheets(view: str, frames: np.ndarray) -> dict[str, Any]:
+    """Frames (frame, height, width, 3) in rows on as few sheets as they need."""
+    _, height, width, _ = frames.shape
+    columns, rows = max(1, SHEET_SIDE // width), max(1, SHEET_SIDE // height)
+    columns = min(columns, math.ceil(math.sqrt(len(frames))))
+    sheets = [
+        _webp(_tiled(frames[first : first + columns * rows], columns))
+        for first in range(0, len(frames), columns * rows)
+    ]
+    return {"name": view, "width": width, "height": height, "columns": columns, "rows": rows, "sheets": sheets}
+
+
+def _tiled(frames: np.ndarray, columns: int) -> np.ndarray:
+    """(frame, h, w, 3) -> one picture with so many frames in a row; the last row is filled with black."""
+    rows = math.ceil(len(frames) / columns)
+    padded = np.pad(frames, ((0, rows * columns - len(frames)), (0, 0), (0, 0), (0, 0)))
+    height, width = frames.shape[1:3]
+    tiles = padded.reshape(rows, columns, height, width, 3).swapaxes(1, 2)
+    return tiles.reshape(rows * height, columns * width, 3)
+
+
+def _webp(picture: np.ndarray) -> str:
+    """A picture as a data URL."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "WEBP", quality=WEBP_QUALITY, method=4)
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,172 @@
+"""The viewer's page, driven in headless Chromium: it plays, scrubs, changes subset, and compares two distractors."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+import threading
+import urllib.error
+import urllib.request
+from http.server import ThreadingHTTPServer
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.release.paint import without_pictures
+from dmcvb_gen.release.viewer import view
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+WATCH = """<script>
+const problems = [];
+addEventListener("error", event => problems.push(String(event.message)));
+addEventListener("unhandledrejection", event => problems.push(String(event.reason)));
+document.addEventListener("securitypolicyviolation", event => problems.push("network: " + event.blockedURI));
+for (const kind of ["error", "warn"]) console[kind] = (...words) => problems.push(words.join(" "));
+</script>"""
+DRIVE = """<script>
+const wait = ms => new Promise(done => setTimeout(done, ms));
+const press = (key, options = {}) => document.dispatchEvent(new KeyboardEvent("keydown", {key, cancelable: true, ...options}));
+const at = () => Number(get("scrub").value);
+const titles = () => [...document.querySelectorAll(".pane h2")].map(node => node.textContent);
+const middle = number => {  // the mean color of a picture
+  const canvas = document.querySelectorAll(".views canvas")[number];
+  const bytes = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  return [0, 1, 2].map(c => bytes.filter((_, i) => i % 4 === c).reduce((a, b) => a + b, 0) / bytes.length * 4);
+};
+(async () => {
+  const seen = {};
+  await wait(200);
+  seen.titles = titles();
+  seen.subsets = [...get("subset").options].map(option => option.value);
+  seen.beside = [...get("beside").options].map(option => option.textContent);
+  seen.views = [...document.querySelector(".views").querySelectorAll("figcaption")].map(node => node.textContent);
+  seen.charts = [...document.querySelector(".pane").querySelectorAll(".chart b")].map(node => node.textContent);
+  seen.command = document.querySelector("code").textContent;
+  seen.first = middle(0);
+  press("ArrowRight"); seen.right = at();
+  press("ArrowRight", {shiftKey: true}); seen.ten = at();
+  press("ArrowLeft"); seen.left = at();
+  press("End"); seen.end = at(); seen.last = middle(0);
+  press("Home"); seen.home = at();
+  get("speed").value = "4";
+  press(" ");
+  for (let i = 0; i < 40 && !at(); i++) await wait(50);
+  press(" ");
+  seen.played = at(); await wait(100); seen.paused = at();
+  get("scrub").value = 2; get("scrub").dispatchEvent(new Event("input")); seen.scrubbed = get("step").textContent;
+  const before = document.querySelectorAll(".chart")[2].querySelectorAll(".key").length;
+  const boxes = document.querySelectorAll(".chart")[2].querySelectorAll("input");
+  const box = [...boxes].find(one => !one.checked); box.checked = true; box.dispatchEvent(new Event("change"));
+  seen.added = document.querySelectorAll(".chart")[2].querySelectorAll(".key").length - before;
+  get("subset").value = seen.subsets[1]; get("subset").dispatchEvent(new Event("change"));
+  await wait(100);
+  seen.changed = titles();
+  press("]"); seen.next = titles();
+  press("ArrowDown"); seen.episode = titles();
+  press("b"); seen.twins = titles();
+  seen.problems = problems;
+  document.body.dataset.seen = JSON.stringify(seen);
+})();
+</script>"""
+
+
+def drive(page):
+    """What the page shows while its controls are used, as the driver writes it down."""
+    test = page.with_name("driven.html")
+    test.write_text(page.read_text().replace("<head>", "<head>" + WATCH).replace("</body>", DRIVE + "</body>"))
+    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=5000", "--dump-dom"]
+    profile = f"--user-data-dir={page.parent / 'profile'}"
+    done = subprocess.run([*command, profile, test.as_uri()], capture_output=True, text=True, timeout=120)
+    found = re.search(r'data-seen="([^"]*)"', done.stdout)
+    assert found, done.stdout[-2000:] + done.stderr[-2000:]
+    return json.loads(html.unescape(found[1]))
+
+
+@needs_browser
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [False, True], ids=["painted", "light"])
+@pytest.mark.parametrize("family", ["small_release", "small_mazes"])
+def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_path):
+    source = folder = request.getfixturevalue(family)
+    if light:
+        folder = tmp_path / source.name
+        without_pictures(source, folder)
+    written = view(str(folder), tmp_path / "viewer.html", episodes=2)
+    release = dmcvb_gen.open(str(source))
+    names = list(release.subsets)
+    assert written.episodes == 2 * len(names) and written.bytes == written.path.stat().st_size < 20_000_000
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", written.path.read_text())
+    seen, first = drive(written.path), release[names[0]]
+    assert seen["problems"] == []
+    assert seen["subsets"] == names and seen["titles"][0] == f"{names[0]}, episode 0"
+    assert tuple(seen["views"]) == first.record.views
+    assert seen["charts"] == ["Reward", "Action", "State", "Distractor"]
+    name = folder.name
+    assert seen["command"] == f"dmcvb-gen regenerate {name} --only {names[0]} --episodes 0:1 --out again"
+    length = int(first.lengths[0])
+    assert (seen["right"], seen["ten"], seen["left"]) == (1, min(11, length), min(11, length) - 1)
+    assert seen["end"] == length and seen["home"] == 0
+    assert 0 < seen["played"] == seen["paused"] and seen["scrubbed"].startswith(f"step 2 of {length}")
+    assert seen["added"] == 1
+    array = "pixels" if "pixels" in first.arrays else "pixels/top"
+    frames = first.episode(0, [array])[array].astype(float)  # the stored pictures are the oracle, WebP loses a little
+    np.testing.assert_allclose(seen["first"], frames[0].mean((0, 1)), atol=4)
+    np.testing.assert_allclose(seen["last"], frames[-1].mean((0, 1)), atol=4)
+    assert seen["changed"] == [f"{names[1]}, episode 0"] and seen["next"] == [f"{names[2]}, episode 0"]
+    assert seen["episode"] == [f"{names[2]}, episode 1"]
+    if family == "small_release":  # the three distractors share their trajectories
+        assert seen["titles"][1] == f"{names[1]}, episode 0" and len(seen["twins"]) == 2
+        assert [text for text in seen["beside"] if text.startswith("same trajectory")] == [
+            f"same trajectory: {other}, episode 0" for other in names[1:]
+        ]
+
+
+def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maze_release, tmp_path):
+    for folder in (small_release, maze_release):
+        whole = view(str(folder), tmp_path / "whole.html", episodes=1, size=16)
+        small = view(str(folder), tmp_path / "small.html", episodes=1, max_bytes=whole.bytes * 3 // 4)
+        assert whole.stride == 1 and small.stride > 1 and small.bytes <= whole.bytes * 3 // 4
+        with pytest.raises(StoreError, match="do not fit"):
+            view(str(folder), tmp_path / "none.html", max_bytes=1000)
+
+
+def test_the_command_writes_and_refuses(small_release, tmp_path):
+    command = ["view", str(small_release), "--no-open", "--only", "*/none", "--episodes", "1", "--size", "24"]
+    result = CliRunner().invoke(main, [*command, "--out", str(tmp_path / "v.html")])
+    assert result.exit_code == 0 and "1 episode of 1 subset" in result.output
+    data = re.search(r'id="data">(.*?)</script>', (tmp_path / "v.html").read_text())[1]
+    [episode] = json.loads(data)["episodes"]
+    assert episode["views"][0]["width"] == 24 and str(tmp_path) not in data
+    with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
+        view(str(small_release), only=["cheetah-run"])
+    with pytest.raises(StoreError, match="--out"):
+        view("s3://bucket/release")
+
+
+def test_serving_gives_the_file_and_nothing_else(tmp_path):
+    import functools
+
+    from dmcvb_gen.cli.view import HOST, OneFile
+
+    page = tmp_path / "viewer.html"
+    page.write_text("<p>here")
+    (tmp_path / "secret.txt").write_text("secret")
+    Image.new("RGB", (1, 1)).save(tmp_path / "x.png")
+    assert HOST == "127.0.0.1"
+    with ThreadingHTTPServer((HOST, 0), functools.partial(OneFile, file=page)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://{HOST}:{server.server_port}"
+        assert urllib.request.urlopen(f"{address}/").read() == b"<p>here"
+        for other in ("secret.txt", "x.png", "..%2f", "viewer.html/../secret.txt"):
+            with pytest.raises(urllib.error.HTTPError):
+                urllib.request.urlopen(f"{address}/{other}")
+        server.shutdown()
