@@ -34,7 +34,8 @@ for (const kind of ["error", "warn"]) console[kind] = (...words) => problems.pus
 </script>"""
 DRIVE = """<script>
 const wait = ms => new Promise(done => setTimeout(done, ms));
-const press = (key, options = {}) => document.dispatchEvent(new KeyboardEvent("keydown", {key, cancelable: true, ...options}));
+const press = (key, options = {}) =>
+  document.dispatchEvent(new KeyboardEvent("keydown", {key, cancelable: true, ...options}));
 const at = () => Number(get("scrub").value);
 const titles = () => [...document.querySelectorAll(".pane h2")].map(node => node.textContent);
 const middle = number => {  // the mean color of a picture

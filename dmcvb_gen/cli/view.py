@@ -21,9 +21,7 @@ HOST = "127.0.0.1"
 @click.option("--episodes", type=click.IntRange(1), help="Episodes of each subset.  [default: 12 in all]")
 @click.option("--size", type=click.IntRange(8, 1024), help="Paint the images at this size instead of the stored one.")
 @click.option("--max-mb", type=click.FloatRange(0.1), default=20.0, show_default=True, help="Largest file.")
-@click.option(
-    "--open/--no-open", "open_it", default=None, help="Open the file in a browser.  [default: if there is one]"
-)
+@click.option("--open/--no-open", "open_it", default=None, help="Open the file.  [default: if there is a browser]")
 @click.option("--serve", is_flag=True, help=f"Serve the file on {HOST}, for example through an SSH tunnel.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="Port for --serve.")
 @click.option("--out", metavar="FILE", type=OutPath(), help="The file.  [default: RELEASE/preview/viewer.html]")

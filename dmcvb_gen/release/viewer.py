@@ -225,10 +225,9 @@ def _sheets(view: str, frames: np.ndarray) -> dict[str, Any]:
     _, height, width, _ = frames.shape
     columns, rows = max(1, SHEET_SIDE // width), max(1, SHEET_SIDE // height)
     columns = min(columns, math.ceil(math.sqrt(len(frames))))
-    sheets = [
-        _webp(_tiled(frames[first : first + columns * rows], columns))
-        for first in range(0, len(frames), columns * rows)
-    ]
+    count = columns * rows
+    parts = [frames[first : first + count] for first in range(0, len(frames), count)]
+    sheets = [_webp(_tiled(part, columns)) for part in parts]
     return {"name": view, "width": width, "height": height, "columns": columns, "rows": rows, "sheets": sheets}
 
 
