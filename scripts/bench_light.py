@@ -23,13 +23,13 @@ from pathlib import Path
 from dmcvb_gen.dataset import Subset, open_release
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.paint import RenderConfig, without_pictures
 from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.loaders.painted import open_painted
 from dmcvb_gen.loaders.release import open_for_reading
 from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.release.fetch import fetch, fetch_and_paint
-from dmcvb_gen.release.paint import RenderConfig, without_pictures
 
 PIECE = 64 * 1024
 """Bytes that the slow server sends between two looks at the clock."""

@@ -18,9 +18,9 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.dataset.schema import create_arrays, picture_spec
+from dmcvb_gen.generate.engine import painted_arrays, simulate_job
 from dmcvb_gen.generate.plan import make_plan
 from dmcvb_gen.generate.recipe import make_recipe
-from dmcvb_gen.generate.worker import painted_arrays, simulate_job
 from dmcvb_gen.parallel import ignore
 
 LAYOUTS = (

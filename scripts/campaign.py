@@ -542,7 +542,7 @@ def warm() -> None:
 
     for module in {place.split(":")[0] for place, _ in COMMANDS.values()}:
         importlib.import_module(f"dmcvb_gen.cli.{module}")
-    for name in ("release.publish", "release.repaint", "release.verify", "release.regenerate", "release.export"):
+    for name in ("release.publish", "generate.repaint", "release.verify", "generate.regenerate", "release.export"):
         importlib.import_module(f"dmcvb_gen.{name}")
     for name in ("export.vd4rl", "export.replay_buffer"):
         importlib.import_module(f"dmcvb_gen.release.{name}")

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
+from dmcvb_gen.generate.engine import paint
 from dmcvb_gen.generate.recipe import make_recipe
-from dmcvb_gen.generate.worker import paint
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate

@@ -20,9 +20,9 @@ from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.writer import sha256_file
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL
+from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.card import check_card, write_card
-from dmcvb_gen.release.paint import without_pictures
 
 
 @pytest.fixture(scope="module")

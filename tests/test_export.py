@@ -21,11 +21,11 @@ from dmcvb_gen.benchmarks.goals import GoalPairs, goal_pairs
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.export import FORMATS, STAMP, export, format_table
 from dmcvb_gen.release.import_tfds import import_tfds
-from dmcvb_gen.release.regenerate import Regeneration
-from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.statistics import level_statistics
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify

@@ -17,12 +17,12 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import copy_file
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.plan import finish, finish_site, make_plan, prepare
+from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.generate.site import site_of
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
-from dmcvb_gen.release.regenerate import Regeneration
-from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 

@@ -18,9 +18,9 @@ from dmcvb_gen.dataset.index import write_release
 from dmcvb_gen.dataset.manifest import commit_path
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
-from dmcvb_gen.release import paint
+from dmcvb_gen.generate import paint
+from dmcvb_gen.generate.paint import paint_release, without_pictures
 from dmcvb_gen.release.fetch import fetch
-from dmcvb_gen.release.paint import paint_release, without_pictures
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 
@@ -105,12 +105,12 @@ def test_the_last_painter_keeps_how_others_painted_meanwhile(made, tmp_path, mon
     def meanwhile(*arguments, **options):
         monkeypatch.setattr(paint, "paint_shard", work)
         (making := tmp_path / "copy" / f"{mine}.zarr/x.foreign.partial").touch()
-        paint_release(tmp_path / "copy", [other], painter=paint.RenderConfig(look=paint.Look(size=40)))
+        paint_release(tmp_path / "copy", [other], painter=paint.RenderConfig(look=paint.RenderOverrides(size=40)))
         assert making.exists()  # somebody is still at work
         return work(*arguments, **options)
 
     monkeypatch.setattr(paint, "paint_shard", meanwhile)
-    paint_release(tmp_path / "copy", [mine], painter=paint.RenderConfig(look=paint.Look(size=48)))
+    paint_release(tmp_path / "copy", [mine], painter=paint.RenderConfig(look=paint.RenderOverrides(size=48)))
     release = open_release(tmp_path / "copy")
     assert {name: subset.record.size for name, subset in release.subsets.items()} == {mine: 48, other: 40}
     assert verify(tmp_path / "copy").sound and release.manifest.complete
@@ -476,8 +476,8 @@ def test_what_was_painted_stays_when_more_is_fetched(made, published, tmp_path):
 
 
 def test_shards_are_painted_while_others_come_and_a_cut_loses_nothing(made, published, tmp_path, monkeypatch):
+    from dmcvb_gen.generate import paint as painting
     from dmcvb_gen.release import fetch as fetching
-    from dmcvb_gen.release import paint as painting
 
     painted, real = [], fetching.download
     plain = painting.paint_shard

@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import common, main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import single_recipe
-from dmcvb_gen.release.paint import without_pictures
 
 LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
 TASKS = ("walker-walk", "ant-maze-empty7x7")

@@ -29,10 +29,10 @@ from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
 from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.recipe import expand, load_recipe
+from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import CLAIM, publish
-from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.storage.remote import public, reason
 from dmcvb_gen.tasks import get_task

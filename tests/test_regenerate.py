@@ -19,7 +19,7 @@ from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.generate.jobs import make_jobs, release_inputs
 from dmcvb_gen.generate.plan import make_plan
-from dmcvb_gen.release.regenerate import Regeneration
+from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from tests.conftest import roll_out, small_recipe
 

@@ -18,9 +18,9 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import PARTIAL
+from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.policies import simulate
-from dmcvb_gen.release.regenerate import Regeneration
-from dmcvb_gen.release.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
@@ -34,7 +34,7 @@ def no_simulation(monkeypatch):
         raise AssertionError("repainting simulated")
 
     monkeypatch.setattr(simulate, "simulate", refuse)
-    monkeypatch.setattr("dmcvb_gen.generate.worker.simulate", refuse)
+    monkeypatch.setattr("dmcvb_gen.generate.engine.simulate", refuse)
 
 
 @pytest.fixture(scope="module")

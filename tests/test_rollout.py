@@ -26,12 +26,12 @@ from dmcvb_gen.generate import estimate as estimating
 from dmcvb_gen.generate.estimate import estimate, measurements
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
+from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.names import LOCOMOTION, family_of
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.policies.simulate import simulate
-from dmcvb_gen.release.regenerate import Regeneration
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import get_task

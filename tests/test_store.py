@@ -79,7 +79,7 @@ def test_a_release_reads_back_with_its_shapes_and_alignment(small_release):
 
 def test_repainting_a_stored_frame_gives_the_stored_pixels(small_release):
     from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
-    from dmcvb_gen.generate.painting import renderer_for
+    from dmcvb_gen.generate.render import renderer_for
 
     subset = open_release(small_release)[NAME]
     episode = subset.episode(2)

@@ -17,11 +17,11 @@ from dmcvb_gen.dataset import open_release, transfer
 from dmcvb_gen.dataset.index import INDEX
 from dmcvb_gen.dataset.manifest import MANIFEST, commit_path
 from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.dataset.shards import damage
 from dmcvb_gen.errors import DmcvbError, PolicyFileError, StoreError
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
-from dmcvb_gen.release.shards import damage
 from dmcvb_gen.release.verify import check_files
 from dmcvb_gen.training.runs import RunConfig
 from dmcvb_gen.training.training import open_run

@@ -54,13 +54,13 @@ def _plan(root):
 
 
 def _repaint(root):
-    from dmcvb_gen.release.repaint import Repainting, repaint
+    from dmcvb_gen.generate.repaint import Repainting, repaint
 
     repaint(Repainting(root, Path(URL), size=8))
 
 
 def _remake(root):
-    from dmcvb_gen.release.regenerate import Regeneration
+    from dmcvb_gen.generate.regenerate import Regeneration
 
     Regeneration(root).remake(URL)
 
@@ -90,7 +90,7 @@ def _export(root):
 
 
 def _light(root):
-    from dmcvb_gen.release.paint import without_pictures
+    from dmcvb_gen.generate.paint import without_pictures
 
     without_pictures(root, URL)
 

@@ -20,7 +20,7 @@ from PIL import Image
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.release.paint import without_pictures
+from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.release.viewer import view
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

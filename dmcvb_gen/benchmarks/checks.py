@@ -19,12 +19,12 @@ import numpy as np
 from dmcvb_gen.dataset import Release, Subset, open_release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.generate.paint import drift
 from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.release.paint import drift
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
 

@@ -21,8 +21,8 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.distractors import DistractorSampler, load_backgrounds
 from dmcvb_gen.generate.jobs import video_source
-from dmcvb_gen.generate.painting import renderer_for
 from dmcvb_gen.generate.recipe import RendererChoice
+from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.names import distractor_of
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task

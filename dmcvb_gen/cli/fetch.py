@@ -52,8 +52,8 @@ def fetch(context, url, only, episodes, painting, size, views, goal, out, option
 
 
 def _fetch_painted(url, out, only, episodes, look, given, as_json):
+    from dmcvb_gen.generate.paint import RenderConfig
     from dmcvb_gen.release.fetch import fetch_and_paint
-    from dmcvb_gen.release.paint import RenderConfig
 
     with (
         ProgressBar(as_json, unit="B", unit_scale=True, desc="fetched") as bytes_bar,

@@ -35,7 +35,7 @@ def paint(
     dmcvb-gen rollout walker-walk --level expert --episodes 20 --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
-    from dmcvb_gen.release.paint import RenderConfig, paint_release
+    from dmcvb_gen.generate.paint import RenderConfig, paint_release
 
     videos = background_source(backgrounds) if backgrounds else None
     executor = make_executor(workers, executor, ray_address)

@@ -142,7 +142,7 @@ def regenerate(
     dmcvb-gen regenerate releases/mini
     dmcvb-gen regenerate --manifest dataset_cards/dmcvb-mini/manifest.json --only 'cheetah-run/*/none' --out part
     """
-    from dmcvb_gen.release.regenerate import Regeneration
+    from dmcvb_gen.generate.regenerate import Regeneration
 
     if (path is None) == (manifest is None):
         raise click.UsageError("Give a RELEASE, or the file of a manifest with --manifest.")
@@ -203,8 +203,8 @@ def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **o
     dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\
         --out releases/mini84
     """
-    from dmcvb_gen.release.repaint import Repainting
-    from dmcvb_gen.release.repaint import repaint as run
+    from dmcvb_gen.generate.repaint import Repainting
+    from dmcvb_gen.generate.repaint import repaint as run
 
     request = Repainting(path, out, backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
@@ -262,8 +262,8 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
 def _left_behind(path):
     """A copy (of links) of a release without its pictures, beside it."""
     from dmcvb_gen.dataset.index import CARD_FILES
+    from dmcvb_gen.generate.paint import without_pictures
     from dmcvb_gen.release.card import README, write_card
-    from dmcvb_gen.release.paint import without_pictures
     from dmcvb_gen.storage.remote import storage_errors
 
     folder = Path(path)

@@ -21,10 +21,10 @@ def look_options(command):
 
 
 def look_of(size, views, goal):
-    """The `Look` that the options ask for."""
-    from dmcvb_gen.release.paint import Look
+    """The `RenderOverrides` that the options ask for."""
+    from dmcvb_gen.generate.paint import RenderOverrides
 
-    return Look(size, tuple(name.strip() for name in views.split(",")) if views else None, goal)
+    return RenderOverrides(size, tuple(name.strip() for name in views.split(",")) if views else None, goal)
 
 
 def tell(text):

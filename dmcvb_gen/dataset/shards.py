@@ -1,11 +1,22 @@
-"""Which shards of a release are meant: a manifest and what was asked for in, shards out."""
+"""Shards of a release: choose them by subset and episode, read their commit records, and check their files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from dmcvb_gen.dataset.manifest import Manifest, SubsetRecord, shard_count, shard_episodes
+from dmcvb_gen.dataset.manifest import (
+    CommitRecord,
+    FileRecord,
+    Manifest,
+    SubsetRecord,
+    commit_path,
+    parse_commit,
+    shard_count,
+    shard_episodes,
+)
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import sha256_bytes, sha256_file
 from dmcvb_gen.names import select
 
 ShardKey = tuple[str, int]
@@ -37,3 +48,50 @@ def chosen_shards(
         first, last = episodes or (0, most)
         raise StoreError(f"no subset has episodes {first}:{last}; the longest has 0:{most}")
     return chosen
+
+
+NOTHING: Mapping[str, str] = {}
+
+
+def read_commit(
+    root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str] = NOTHING
+) -> CommitRecord | None:
+    """The shard's commit record, None where it is missing, unreadable or another shard's.
+
+    Args:
+      known: path in the release -> SHA-256 of files that are known; a record with another is as good as none.
+    """
+    name = commit_path(record.name, shard)
+    try:
+        data = (root / name).read_bytes()
+        commit = parse_commit(data, str(root / name))
+    except (OSError, StoreError):
+        return None
+    if name in known and sha256_bytes(data) != known[name]:
+        return None
+    mine = (commit.subset, commit.shard, commit.episodes) == (record.name, shard, shard_episodes(record, shard))
+    return commit if mine else None
+
+
+def damage(root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str] = NOTHING) -> str | None:
+    """What is wrong with a shard's files, in words; None where every byte is as committed (`known`: see there)."""
+    commit = read_commit(root, record, shard, known)
+    if commit is None:
+        return "has no commit record"
+    for file in commit.files:
+        if wrong := wrong_bytes(root, file):
+            return f"{file.path} {wrong}"
+    return None
+
+
+def wrong_bytes(root: Path, file: FileRecord) -> str | None:
+    """What is wrong with a file of a release, in words that follow its name; None where every byte is as recorded."""
+    path = root / file.path
+    try:
+        if not path.is_file():
+            return "is missing"
+        if path.stat().st_size != file.bytes:
+            return f"has {path.stat().st_size} bytes instead of {file.bytes}"
+        return None if sha256_file(path) == file.sha256 else "does not have its digest"
+    except OSError as error:
+        return f"cannot be read: {error.strerror or error}"

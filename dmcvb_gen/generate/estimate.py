@@ -24,10 +24,10 @@ from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.pictures import stored_pictures
 from dmcvb_gen.dataset.schema import PIXEL_CHUNK_STEPS, EpisodeShape, create_arrays, picture_layout_for, subset_specs
 from dmcvb_gen.dataset.writer import find_array
+from dmcvb_gen.generate.engine import inputs_of, simulate_job
 from dmcvb_gen.generate.jobs import Job
-from dmcvb_gen.generate.painting import distractor_state_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.generate.plan import Plan
-from dmcvb_gen.generate.worker import inputs_of, simulate_job
+from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.names import ANT_MAZE, LOCOMOTION, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, ignore, in_order
 from dmcvb_gen.policies.simulate import Simulation

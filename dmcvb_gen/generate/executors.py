@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
+from dmcvb_gen.generate.engine import JobResult, run_job
 from dmcvb_gen.generate.jobs import Job
-from dmcvb_gen.generate.painting import frame_count
+from dmcvb_gen.generate.render import frame_count
 from dmcvb_gen.generate.site import leave
-from dmcvb_gen.generate.worker import JobResult, run_job
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.tasks import get_task
 

@@ -38,8 +38,8 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.files import copy_file, json_bytes, sha256_bytes, sha256_file, write_bytes
 from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs, part_of
-from dmcvb_gen.generate.painting import check_renderer, renderer_for
 from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
+from dmcvb_gen.generate.render import check_renderer, renderer_for
 from dmcvb_gen.generate.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
 from dmcvb_gen.parallel import ignore
@@ -96,7 +96,7 @@ def make_plan(
       device: where pictures are painted; by default where the release that is there was begun, or on the CPU.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
       part: (K, N): of all jobs, done or not, every N-th from the K-th on.
-      pixels: paint pictures; without, `release.paint` can do it later.
+      pixels: paint pictures; without, `generate.paint` can do it later.
 
     Raises:
       DmcvbError: anything that would fail later, found before any work.

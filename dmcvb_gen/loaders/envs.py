@@ -21,8 +21,8 @@ from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import DistractorSampler, DistractorSetting, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.generate.painting import check_renderer
 from dmcvb_gen.generate.recipe import check_size
+from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.names import (
     ANT_MAZE,
     FIXED,

@@ -22,7 +22,7 @@ from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.jobs import background_source, stream_names
-from dmcvb_gen.generate.painting import distractor_state_of, paint, renderer_for
+from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.storage.remote import is_url

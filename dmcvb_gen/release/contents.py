@@ -16,7 +16,7 @@ from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.jobs import video_source
-from dmcvb_gen.generate.painting import renderer_for
+from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.release.import_tfds import imported_specs
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.tasks import get_task

@@ -23,7 +23,7 @@ from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import background_source
-from dmcvb_gen.generate.painting import renderer_for
+from dmcvb_gen.generate.render import renderer_for
 
 TABLE = f"{CARD_FOLDER}/episodes.parquet"
 CONFIG = "episodes"

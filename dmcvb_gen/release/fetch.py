@@ -98,15 +98,15 @@ def fetch_and_paint(
     """`fetch`, and paint the pictures that travelled without; a shard is painted while the next ones come.
 
     Args:
-      painter: a `release.paint.RenderConfig`.
+      painter: a `generate.paint.RenderConfig`.
 
     Returns:
-      What was moved, and a `release.paint.RenderResult`.
+      What was moved, and a `generate.paint.RenderResult`.
 
     Raises:
-      DmcvbError: as `fetch` and `release.paint.paint_release` do; what has come and was painted stays.
+      DmcvbError: as `fetch` and `generate.paint.paint_release` do; what has come and was painted stays.
     """
-    from dmcvb_gen.release.paint import RenderSession  # who only fetches has no simulator
+    from dmcvb_gen.generate.paint import RenderSession  # who only fetches has no simulator
 
     folder, source = local_path(out), Source.find(url, options)
     with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:

@@ -33,6 +33,7 @@ from dmcvb_gen.dataset.manifest import (
     shard_count,
 )
 from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.dataset.shards import wrong_bytes
 from dmcvb_gen.dataset.transfer import (
     create_object,
     in_parallel,
@@ -45,7 +46,6 @@ from dmcvb_gen.dataset.writer import read_commits
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.storage.remote import file_system, public, storage_errors
 
 CLAIM = "publishing.json"

@@ -25,12 +25,12 @@ from dmcvb_gen.dataset.manifest import (
     shard_count,
     subset_path,
 )
+from dmcvb_gen.dataset.shards import wrong_bytes
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.release.shards import wrong_bytes
 from dmcvb_gen.storage.remote import storage_errors
 
 SHARDS = 8

@@ -20,12 +20,16 @@ from dmcvb_gen.dataset.manifest import MANIFEST, CommitRecord, Manifest, SubsetR
 from dmcvb_gen.dataset.pictures import stored_pictures, view_arrays
 from dmcvb_gen.dataset.reader import Subset, load_manifest
 from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, subset_specs
+from dmcvb_gen.dataset.shards import damage
 from dmcvb_gen.dataset.writer import create_subset, finish_together, read_commits, start_release
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
+from dmcvb_gen.generate.engine import make_shard
 from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
-from dmcvb_gen.generate.painting import (
+from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
+from dmcvb_gen.generate.recipe import Recipe, check_size, make_recipe
+from dmcvb_gen.generate.render import (
     check_renderer,
     distractor_state_of,
     frame_count,
@@ -34,13 +38,9 @@ from dmcvb_gen.generate.painting import (
     paint,
     renderers,
 )
-from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
-from dmcvb_gen.generate.recipe import Recipe, check_size, make_recipe
 from dmcvb_gen.generate.site import FolderSite, leave
-from dmcvb_gen.generate.worker import make_shard
 from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, distractor_of, family_of, select
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, run_all
-from dmcvb_gen.release.shards import damage
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task

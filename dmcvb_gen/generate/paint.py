@@ -1,11 +1,11 @@
-"""Pictures for a release that travelled without: its physics states and labels in, the pictures that belong to it out.
+"""Render the images of a release that was stored without pixels.
 
-A picture is a function of the stored physics state, the labels, the renderer, the size and the view. So a release
-may leave its pictures behind (`without_pictures`), or be made without any, and be painted where it arrives. Where the
-digests of its pictures are known they are compared: painting gave the same bytes, or it says which shards differ.
+An image is a function of the stored physics state, the labels, the renderer, the size and the view. So a release can
+be copied without its images (`without_pictures`), or be made without any, and be painted where it is used. If the
+digests of its images are known, painting compares them and reports the shards that differ.
 
-Painted otherwise than the manifest says (`Look`: another size, some views, one kind of goal), it becomes another
-release, and says so: its manifest has the new facts, another name, and the old manifest's digest in its lineage.
+`RenderOverrides` ask for another size, some of the views or one kind of goal. The release then becomes another one:
+its manifest has the new facts, another name, and the old manifest's digest in its provenance.
 """
 
 from __future__ import annotations
@@ -33,19 +33,18 @@ from dmcvb_gen.dataset.manifest import (
 from dmcvb_gen.dataset.pictures import Pictures, picture_of, stored_pictures
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
-from dmcvb_gen.dataset.shards import ShardKey, chosen_shards
+from dmcvb_gen.dataset.shards import ShardKey, chosen_shards, damage, read_commit
 from dmcvb_gen.dataset.writer import add_arrays, finish_release, finish_together, write_lock, write_pictures
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import copy_file, sha256_file, write_json
 from dmcvb_gen.generate.jobs import background_source
-from dmcvb_gen.generate.painting import frame_count, paint, renderers
 from dmcvb_gen.generate.plan import painting_facts, subset_attributes
 from dmcvb_gen.generate.recipe import check_size
+from dmcvb_gen.generate.regenerate import environment_diff
+from dmcvb_gen.generate.render import frame_count, paint, renderers
 from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
-from dmcvb_gen.release.regenerate import environment_diff
-from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 
@@ -56,7 +55,7 @@ REPAINTED = "-repainted"
 
 
 @dataclass(frozen=True)
-class Look:
+class RenderOverrides:
     """How pictures are to be, where not as the manifest says.
 
     Attributes:
@@ -103,7 +102,7 @@ class RenderConfig:
       tell: told what is other here than where the release was made, before anything is painted.
     """
 
-    look: Look = Look()
+    look: RenderOverrides = RenderOverrides()
     workers: Workers = 1
     device: str = "cpu"
     backgrounds: str | None = None
@@ -330,7 +329,7 @@ def drift(
 
 
 def _make_room(
-    root: Path, manifest: Manifest, new: Mapping[str, SubsetRecord], changed: set[str], look: Look
+    root: Path, manifest: Manifest, new: Mapping[str, SubsetRecord], changed: set[str], look: RenderOverrides
 ) -> Manifest:
     """Say that subsets have pictures, and which, and give them the (empty) arrays for them."""
     subsets = tuple(
@@ -353,7 +352,7 @@ def _make_room(
 
 
 def _derived(
-    root: Path, old: Manifest, subsets: Sequence[SubsetRecord], changed: set[str], look: Look
+    root: Path, old: Manifest, subsets: Sequence[SubsetRecord], changed: set[str], look: RenderOverrides
 ) -> dict[str, Any]:
     """Name and lineage of a release that is painted otherwise than it was."""
     sizes = {record.name: record.size for record in old.subsets}

@@ -21,7 +21,7 @@ from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, env
 from dmcvb_gen.dataset.pictures import SHOWN
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
-from dmcvb_gen.dataset.shards import chosen_shards
+from dmcvb_gen.dataset.shards import chosen_shards, damage, read_commit
 from dmcvb_gen.dataset.writer import (
     CREATED,
     commit_path,
@@ -51,7 +51,6 @@ from dmcvb_gen.generate.jobs import make_jobs, release_inputs
 from dmcvb_gen.generate.plan import copy_inputs, create_groups
 from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
-from dmcvb_gen.release.shards import damage, read_commit
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 

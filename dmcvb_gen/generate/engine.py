@@ -12,7 +12,7 @@ from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, commit_path, 
 from dmcvb_gen.dataset.pictures import stored_pictures
 from dmcvb_gen.dataset.writer import write_shard
 from dmcvb_gen.generate.jobs import Inputs, Job
-from dmcvb_gen.generate.painting import distractor_state_of, label_arrays, len_rows, paint, renderers
+from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, renderers
 from dmcvb_gen.generate.site import Site, staging_folder_of
 from dmcvb_gen.parallel import Future, ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
