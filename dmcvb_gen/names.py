@@ -83,6 +83,8 @@ def family_of(task_id: str) -> str:
 
 def task_folder(task_id: str) -> str:
     """A task id as a folder name: without a maze's rows, if it carries its own."""
+    if family_of(task_id) != ANT_MAZE:
+        return re.sub(r"[^A-Za-z0-9_.-]", "-", task_id)
     head, _, reward = task_id.partition("@")
     return re.sub(r"[^A-Za-z0-9_.-]", "-", head.split(":")[0] + (f"-{reward}" if reward else ""))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ from dm_control import suite
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, get_task
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, REGISTRY, get_task, register_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
+from dmcvb_gen.tasks.own import ALLOWED, allow
+from dmcvb_gen.tasks.suite import SuiteTask
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
 """Largest difference of an observation; physics states are always equal. Humanoid's limb positions are one matrix
@@ -19,6 +23,13 @@ product for the batch here and a vector product a limb in dm_control: the order 
 REWARD_TOLERANCE = 1e-15
 """Rewards are the same formula, in which a square or a root of an array may round its last bit differently."""
 SIMULATIONS = 2
+SUITE = (
+    "acrobot-swingup", "ball_in_cup-catch", "cartpole-balance", "cartpole-swingup", "cheetah-run", "dog-walk",
+    "finger-spin", "finger-turn_hard", "fish-swim", "hopper-hop", "hopper-stand", "humanoid-stand", "humanoid-walk",
+    "humanoid-run", "pendulum-swingup", "point_mass-easy", "quadruped-walk", "reacher-easy", "reacher-hard",
+    "swimmer-swimmer6", "walker-stand", "walker-walk", "walker-run", "manipulator-bring_ball", "lqr-lqr_2_1",
+)  # fmt: skip
+"""Tasks of dm_control's suite: all domains but humanoid_CMU and stacker, whose physics costs more than it shows."""
 
 
 def dm_control_observation(task_id, observation):
@@ -40,6 +51,7 @@ def actions_of(kind, rng, size):
     return rng.uniform(-1, 1, size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["random", "extreme", "zero"])
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_a_whole_episode_agrees_with_dm_control(task_id, kind):
@@ -69,6 +81,121 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind):
             np.testing.assert_allclose(result.state[i], theirs, rtol=0, atol=TOLERANCE[task_id])
             assert abs(result.reward[i] - reward) <= REWARD_TOLERANCE
     assert all(environment.step(action[0]).first() for environment in environments)  # their episode ended with ours
+
+
+@pytest.mark.parametrize(
+    "task_id",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "dog-walk" else ())
+        for name in SUITE
+        if name not in LOCOMOTION_TASKS
+    ],
+)
+def test_a_task_of_the_suite_agrees_with_dm_control_step_by_step(task_id):
+    task = get_task(task_id)
+    batch = task.batch(SIMULATIONS)
+    state = batch.reset([np.random.default_rng(seed) for seed in range(SIMULATIONS)])
+    names, rows = task_id.split("-", 1), batch.physics()
+    environments = [suite.load(*names, task_kwargs={"random": 0}) for _ in range(SIMULATIONS)]
+    for i, environment in enumerate(environments):
+        environment.reset()
+        physics = environment.physics
+        for name, columns, values in task.split_entries(rows):
+            getattr(physics.model.ptr, name).reshape(-1)[columns] = values[i]
+        size = mujoco.mj_stateSize(task.model, PHYSICS_SPEC)
+        mujoco.mj_setState(physics.model.ptr, physics.data.ptr, rows[i, :size], PHYSICS_SPEC)
+        physics.after_reset()
+        theirs = environment.task.get_observation(physics)
+        assert {name: np.size(part) for name, part in theirs.items()} == task.state_fields
+        np.testing.assert_allclose(state[i], np.concatenate([np.ravel(part) for part in theirs.values()]), atol=1e-6)
+    rng = np.random.default_rng(7)
+    for _ in range(15):
+        action = rng.uniform(-1, 1, (SIMULATIONS, task.action_size)).astype(np.float32)
+        result = batch.step(action)
+        for i, environment in enumerate(environments):
+            steps = [environment.step(action[i]) for _ in range(ACTION_REPEAT)]
+            theirs = np.concatenate([np.ravel(part) for part in steps[-1].observation.values()])
+            np.testing.assert_allclose(result.state[i], theirs, rtol=0, atol=1e-6)
+            assert abs(result.reward[i] - sum(step.reward for step in steps)) <= 1e-6
+    other = task.batch(SIMULATIONS)
+    known = np.ones(task.state_size, bool)
+    for name in task.unstored_fields:
+        known[task.state_slices[name]] = False
+    np.testing.assert_array_equal(other.set_physics(batch.physics())[:, known], result.state[:, known])
+    action = rng.uniform(-1, 1, action.shape)
+    one, two = batch.step(action), other.step(action)
+    np.testing.assert_array_equal(one.state, two.state)
+    np.testing.assert_array_equal(one.reward, two.reward)
+
+
+def test_episodes_of_a_suite_task_depend_on_their_own_streams_alone():
+    task = get_task("reacher-hard")
+    actions = np.random.default_rng(0).uniform(-1, 1, (5, 3, task.action_size))
+
+    def run(seeds, threads):
+        batch = task.batch(len(seeds), threads)
+        batch.reset([np.random.default_rng(seed) for seed in seeds])
+        for action in actions:
+            batch.step(action[: len(seeds)])
+        return batch.physics()
+
+    np.testing.assert_array_equal(run([0, 1, 2], 2)[:1], run([0], 1))
+    assert len(np.unique(run([0, 1, 2], 1)[:, -1])) == 3  # each has its own target
+
+
+def test_the_suite_is_known_without_importing_it():
+    assert {f"{domain}-{name}" for domain, name in suite.ALL_TASKS} == set(suite_ids())
+
+
+def ten_lines(tmp_path, monkeypatch, code):
+    """A module of one's own, `arm_tasks`, in the working directory."""
+    (tmp_path / "arm_tasks.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.delitem(sys.modules, "arm_tasks", raising=False)
+    monkeypatch.delenv(ALLOWED, raising=False)
+
+
+GROWING = """
+from dm_control import suite
+def reach():
+    environment = suite.load("reacher", "easy")
+    environment.task.get_observation = lambda physics: {"contacts": physics.data.qpos[: 1 + (physics.time() > 0.03)]}
+    return environment
+def number():
+    return 7
+def broken():
+    return 1 / 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("reach", "observes 'contacts' in different shapes"),
+        ("number", "gives a int; give a function that returns"),
+        ("broken", "cannot start task arm_tasks:broken .division by zero"),
+        ("missing", "cannot find task arm_tasks:missing"),
+    ],
+)
+def test_a_task_of_ones_own_that_cannot_be_used_is_refused(tmp_path, monkeypatch, name, message):
+    ten_lines(tmp_path, monkeypatch, GROWING)
+    with pytest.raises(DmcvbError, match="set DMCVB_GEN_TASKS"):
+        get_task(f"arm_tasks:{name}")
+    allow([f"arm_tasks:{name}"])
+    with pytest.raises(DmcvbError, match=message):
+        get_task(f"arm_tasks:{name}")
+
+
+def test_a_third_party_registers_a_task():
+    register_task("cartpole-mine", lambda: SuiteTask("cartpole-mine", lambda: suite.load("cartpole", "balance")))
+    try:
+        assert get_task("cartpole-mine").state_size == 5
+        with pytest.raises(DmcvbError, match="there is a task 'cartpole-mine' already"):
+            register_task("cartpole-mine", lambda: None)
+    finally:
+        REGISTRY.pop("cartpole-mine")
+        get_task.cache_clear()
 
 
 @pytest.mark.parametrize("task_id, sizes", [("walker-walk", 24), ("cheetah-run", 17), ("humanoid-walk", 67)])

@@ -13,8 +13,6 @@ __all__ = ["KINDS", "SCALES", "DistractorSetting", "floor_alpha_for"]
 def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
     """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
 
-    1.0 for walker and cheetah, 0.3 otherwise (Distracting Control Suite); untouched without distractors.
+    Walker and cheetah 1.0, reacher 0.0, otherwise 0.3 (Distracting Control Suite); untouched without distractors.
     """
-    if setting.kind == "none" or task.id in ("walker-walk", "cheetah-run"):
-        return 1.0
-    return 0.3
+    return 1.0 if setting.kind == "none" else task.floor_alpha

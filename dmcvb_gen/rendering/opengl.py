@@ -27,6 +27,7 @@ from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_l
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
+RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 SKY_WIDTH = 800
 """Texels a side of a background on the sky (the skybox's own width)."""
 _PROBE = "from mujoco.egl import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
@@ -81,7 +82,7 @@ class OpenglRenderer(Renderer):
         self._floors = np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         for geom in self._floors:
             material = self._model.geom_matid[geom]
-            if self.floor_alpha < 1 and material >= 0:
+            if self.floor_alpha < 1 and material >= 0 and self._model.mat_texid[material, RGB_ROLE] >= 0:
                 self._model.mat_rgba[material, 3] = self.floor_alpha
         self._data = mujoco.MjData(self._model)
         self._gl = GLContext(size, size)
@@ -160,10 +161,14 @@ class OpenglRenderer(Renderer):
 
     def _pose(self, physics, exogenous, frame, hide_goal):
         model, data = self._model, self._data
-        mujoco.mj_setState(model, data, np.asarray(physics, np.float64), PHYSICS_SPEC)
+        rows = np.asarray(physics, np.float64)[None]
+        mujoco.mj_setState(model, data, rows[0, : mujoco.mj_stateSize(model, PHYSICS_SPEC)], PHYSICS_SPEC)
+        for name, columns, values in self.task.split_entries(rows):
+            getattr(model, name).reshape(-1)[columns] = values[0]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
+        mujoco.mj_tendon(model, data)
         model.mat_rgba[:, :3] = exogenous.material_rgb[frame]
         model.geom_matid[:] = geom_materials(self.task, int(exogenous.style[frame]))
         model.geom_rgba[:] = self.task.model.geom_rgba

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -86,6 +86,13 @@ class Task(abc.ABC):
     unstored_fields: tuple[str, ...] = ()
     """Fields of the state that a physics state alone does not give."""
 
+    batched: bool = True
+    """Whether rewards and observations are computed for all episodes at once; else dm_control's task runs for each."""
+    floor_alpha: float = 0.3
+    """Opacity of the ground plane under distractors (Distracting Control Suite)."""
+    model_entries: Mapping[str, np.ndarray] = {}
+    """Model field -> flat indices of the entries that an episode sets; `physics` rows end with their values."""
+
     @property
     def picture_model(self) -> mujoco.MjModel:
         """What painters need: `model` with its textures, where that goes without them."""
@@ -127,8 +134,15 @@ class Task(abc.ABC):
 
     @property
     def physics_size(self) -> int:
-        """Length of a stored physics state (float64), see `PHYSICS_SPEC`."""
-        return mujoco.mj_stateSize(self.model, PHYSICS_SPEC)
+        """Length of a stored physics state (float64): `PHYSICS_SPEC`, then the values of `model_entries`."""
+        return mujoco.mj_stateSize(self.model, PHYSICS_SPEC) + sum(map(len, self.model_entries.values()))
+
+    def split_entries(self, physics: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        """Fields of `model_entries`, their flat indices, and their values (frame, index) in (frame, physics) rows."""
+        first = mujoco.mj_stateSize(self.model, PHYSICS_SPEC)
+        for name, columns in self.model_entries.items():
+            yield name, columns, physics[:, first : first + len(columns)]
+            first += len(columns)
 
     @property
     def control_timestep(self) -> float:

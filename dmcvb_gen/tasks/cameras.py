@@ -24,7 +24,7 @@ class _KeptBatch:
     """A task's simulations for kinematics: made once, as many as the largest call needs (up to `CHUNK`)."""
 
     def __init__(self, task: Task):
-        self._model, self._columns = task.model, physics_columns(task.model)
+        self._task, self._columns = task, physics_columns(task.model)
         self._lock = threading.Lock()  # the simulations are one caller's until it has copied its poses
         self._size = 0
         self._batch: Any = None
@@ -37,7 +37,10 @@ class _KeptBatch:
             for first in range(0, len(physics), self._size):
                 count = min(self._size, len(physics) - first)
                 ids = np.arange(count)
-                self._batch.state[np.ix_(ids, self._columns)] = physics[first : first + count]
+                rows = physics[first : first + count]
+                self._batch.state[np.ix_(ids, self._columns)] = rows[:, : len(self._columns)]
+                for name, columns, values in self._task.split_entries(rows):
+                    self._entries[name].reshape(self._size, -1)[np.ix_(ids, columns)] = values
                 self._batch.forward(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_POS))
                 for name in fields:
                     out[name][first : first + count] = self._bound[name][:count]
@@ -46,7 +49,8 @@ class _KeptBatch:
     def _make(self, size: int, fields: Sequence[str]) -> None:
         if size > self._size or self._batch is None:
             self._size = 1 << max(size - 1, 0).bit_length()
-            self._batch, self._bound = Batch(self._model, self._size, nthread=1), dict.fromkeys(self._bound)
+            self._batch, self._bound = Batch(self._task.model, self._size, nthread=1), dict.fromkeys(self._bound)
+            self._entries = {name: self._batch.expand(name) for name in self._task.model_entries}
         for name in {*self._bound, *fields}:
             if self._bound.get(name) is None:
                 self._bound[name] = self._batch.bind(name)
@@ -113,6 +117,12 @@ def nominal_cameras(task: Task, physics: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def centers_of_mass(task: Task, physics: np.ndarray) -> np.ndarray:
-    """(frame, physics) -> (frame, 3) float64: centre of mass of the body that the first camera tracks, meters."""
-    body = int(task.model.cam_bodyid[camera_ids(task)[0]])
+    """(frame, physics) -> (frame, 3) float64: centre of mass of the body that the first camera tracks, meters.
+
+    A camera of the world tracks nothing: it stays by the centre of mass of the model's own pose.
+    """
+    camera = camera_ids(task)[0]
+    body = int(task.model.cam_bodyid[camera])
+    if body == 0:
+        return np.tile(task.model.cam_pos0[camera] - task.model.cam_poscom0[camera], (len(physics), 1))
     return Kinematics(task, ("subtree_com",))(physics)["subtree_com"][:, body]

@@ -121,6 +121,8 @@ class WalkerBatch(EpisodeBatch):
 class WalkerWalk(LocomotionTask):
     """A planar walker that walks at 1 m/s."""
 
+    floor_alpha = 1.0
+
     id, domain, batch_class = "walker-walk", "walker", WalkerBatch
     substeps = 10  # 2.5 ms physics, 25 ms control
     state_fields = {"orientations": 14, "height": 1, "velocity": 9}
@@ -163,6 +165,8 @@ class CheetahBatch(EpisodeBatch):
 
 class CheetahRun(LocomotionTask):
     """A planar cheetah that runs at 10 m/s."""
+
+    floor_alpha = 1.0
 
     id, domain, batch_class = "cheetah-run", "cheetah", CheetahBatch
     substeps = 1  # 10 ms physics and control
