@@ -112,7 +112,7 @@ def check_labels(subset: Subset) -> Iterator[Issue]:
         return
     task, kind = get_task(subset.task), distractor_of(subset.task, subset.setting).kind
     looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]
-    own = task.model.mat_rgba[:, :3].astype(np.float32)
+    own = task.material_colors.astype(np.float32)
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
     for episode in map(int, subset.episodes):
         video, frame, color, style = subset.episode(episode, names).values()

@@ -104,7 +104,7 @@ class EpisodeShape:
             action_size=task.action_size,
             state_size=task.state_size,
             physics_size=task.physics_size,
-            materials=task.model.nmat,
+            materials=len(task.material_colors),
             max_steps=task.max_steps,
         )
 

@@ -16,7 +16,7 @@ from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, floor_a
 from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at, nominal_target
 from dmcvb_gen.distractors.color import color_walk
 from dmcvb_gen.tasks.base import Task
-from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
+from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions, seen_materials
 
 
 class DistractorSampler:
@@ -41,7 +41,7 @@ class DistractorSampler:
     ):
         self.task, self.setting, self.frames = task, setting, frames
         episodes = len(generators["style"])
-        own = np.asarray(task.model.mat_rgba[:, :3], np.float64)
+        own = task.material_colors
         self._video = np.full((episodes, frames), -1, np.int16)
         self._index = np.full((episodes, frames), -1, np.int16)
         self._style = np.full((episodes, frames), -1, np.int16)
@@ -55,7 +55,7 @@ class DistractorSampler:
         if backgrounds is None:
             raise ValueError(f"distractor {setting.name!r} needs backgrounds")
         self._colors = color_walk(own, setting, frames, generators["color"])
-        unseen = np.setdiff1d(np.arange(len(own)), task.model.geom_matid)
+        unseen = np.setdiff1d(np.arange(len(own)), seen_materials(task.model))
         self._colors[:, :, unseen] = own[unseen]  # a label of what nobody sees would only cost bytes
         offset = np.asarray(task.model.cam_poscom0[camera_ids(task)[0]])
         self._offset, roll = camera_walk(camera_range(offset, setting), setting, frames, generators["camera"])

@@ -1,8 +1,8 @@
 """Tasks: `get_task("walker-walk")` gives the task of that name.
 
-One table, `REGISTRY`, has the tasks that this package writes for a batch; third parties add theirs under the
-entry point group `dmcvb_gen.tasks`. Mazes are named by their layout, every other task of dm_control's suite by "<domain>-<task>",
-and tasks of your own by "<module>:<function>" (see `own`).
+One table, `REGISTRY`, has the tasks that this package writes for a batch; third parties add theirs under the entry
+point group `dmcvb_gen.tasks`. Mazes are named by their layout, every other task of dm_control's suite by
+"<domain>-<task>", and tasks of your own by "<module>:<function>" (see `own`).
 """
 
 from __future__ import annotations

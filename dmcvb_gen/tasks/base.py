@@ -111,6 +111,11 @@ class Task(abc.ABC):
         return None
 
     @property
+    def material_colors(self) -> np.ndarray:
+        """(material, 3) float64: the model's own colors in [0, 1]; one row of ones if it has no material."""
+        return np.asarray(self.model.mat_rgba[:, :3], np.float64) if self.model.nmat else np.ones((1, 3))
+
+    @property
     def action_size(self) -> int:
         """Actions are float32 (action_size,) in [-1, 1]."""
         return self.model.nu

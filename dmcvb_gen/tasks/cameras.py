@@ -88,6 +88,12 @@ def camera_ids(task: Task) -> list[int]:
     return [camera if isinstance(camera, int) else task.model.camera(camera).id for camera in task.cameras]
 
 
+def seen_materials(model: mujoco.MjModel) -> np.ndarray:
+    """Indices of the materials of what MuJoCo draws: geoms, and the sites and tendons of the groups 0, 1 and 2."""
+    shown = [model.geom_matid, model.site_matid[model.site_group < 3], model.tendon_matid[model.tendon_group < 3]]
+    return np.unique(np.concatenate(shown))
+
+
 def quaternions(matrices: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) as quaternions (..., 4), w x y z with w >= 0."""
     rotation = Rotation.from_matrix(matrices.reshape(-1, 3, 3))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.tasks.suite import SuiteTask
+from dmcvb_gen.tasks.suite import SuiteTask, import_suite
 
 ALLOWED = "DMCVB_GEN_TASKS"
 """Environment variable with the task ids whose code may run, joined by commas; worker processes inherit it."""
@@ -47,6 +47,7 @@ def own_task(task_id: str) -> SuiteTask:
     module, _, name = task_id.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
+    import_suite()
     try:
         make = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import importlib
 import importlib.util
 import math
 import re
@@ -47,14 +48,18 @@ def suite_ids() -> tuple[str, ...]:
     return tuple(names)
 
 
+def import_suite() -> Any:
+    """`dm_control.suite`; its first import warns of a display that nobody needs."""
+    with warnings.catch_warnings(action="ignore"):
+        return importlib.import_module("dm_control.suite")
+
+
 def suite_task(task_id: str) -> SuiteTask:
     """The task of dm_control's suite with this id, one of `suite_ids`."""
     domain, _, name = task_id.partition("-")
 
     def make():
-        with warnings.catch_warnings(action="ignore"):  # of a display that nobody needs
-            from dm_control import suite
-        return suite.load(domain, name, task_kwargs={"random": 0})
+        return import_suite().load(domain, name, task_kwargs={"random": 0})
 
     return SuiteTask(task_id, make, domain)
 
