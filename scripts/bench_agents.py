@@ -1,6 +1,6 @@
 """Adam steps a second of every agent's learners: float32, bfloat16, and compiled.
 
-python scripts/bench_agents.py --steps 10 --agents bc,id+bc,state-bc --batch-size 64 --network narrow --threads 1
+python scripts/bench_agents.py --steps 10 --agents bc,id+bc,state-bc --batch-size 64 --network patches --threads 1
 python scripts/bench_agents.py --device cuda --compile --memory
 
 Data are random, of walker's sizes (9 channels, 64 x 64, 24 states, 6 actions); drawing the batches is in the time.
@@ -17,7 +17,7 @@ import torch
 
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, make_pretrainer, parse_agent
 from dmcvb_gen.agents.data import HeldFrames, TrainingData
-from dmcvb_gen.agents.networks import NARROW, PAPER
+from dmcvb_gen.agents.networks import NETWORKS
 from dmcvb_gen.agents.trainer import TrainSettings, train
 
 AGENTS = "state-bc,state-td3-bc,bc,td3-bc,id+bc,lfd+bc,ae+bc,state+bc"
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--batch-size", type=int, default=256)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--network", default="paper", choices=["paper", "narrow"])
+    parser.add_argument("--network", default="paper", choices=list(NETWORKS))
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--workers", type=int, default=0, help="Threads that draw batches ahead.")
     parser.add_argument("--compile", action="store_true", help="Measure torch.compile too (takes minutes on a CPU).")
@@ -73,7 +73,7 @@ def main() -> None:
         agent = parse_agent(name)
         seen = data.states_only() if agent.sees_state else data
         parts = [("pre-training", make_pretrainer)] if agent.pretrain else []
-        network = {"paper": PAPER, "narrow": NARROW}[options.network]
+        network = NETWORKS[options.network]
         for part, make in [*parts, ("policy", make_policy)]:
             rates = []
             for half, compiled in [(False, False), (True, False)] + [(not agent.sees_state, True)] * options.compile:

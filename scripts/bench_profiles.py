@@ -18,7 +18,7 @@ import torch
 
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
 from dmcvb_gen.agents.data import Source, load_data
-from dmcvb_gen.agents.networks import NARROW, PAPER, Architecture
+from dmcvb_gen.agents.networks import NARROW, PAPER, PATCHES, Architecture
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.dataset import open_release
@@ -31,11 +31,11 @@ WARM, TIMED = 20, 100
 class Variant:
     """What is otherwise than in the profile quick."""
 
-    network: Architecture = NARROW
+    network: Architecture = PATCHES
     batch: int = 64
     rate: float = 1.0
     shift: bool = True
-    half: bool = True
+    half: bool = False
     compiled: bool = False
 
 
@@ -45,15 +45,15 @@ VARIANTS = {
     "batch 128": Variant(batch=128),
     "half the rate": Variant(rate=0.5),
     "twice the rate": Variant(rate=2.0),
-    "brief": Variant(rate=2.0, shift=False),
-    "half as wide": Variant(Architecture((8, 16, 16, 32), (2, 2, 2, 1), "relu")),
-    "twice as wide": Variant(Architecture((32, 64, 64, 128), (2, 2, 2, 1), "relu")),
-    "four strides": Variant(Architecture((16, 32, 64, 64), (2, 2, 2, 2), "relu")),
-    "GELU": Variant(replace(NARROW, activation="gelu")),
-    "float32": Variant(half=False),
+    "brief": Variant(shift=False),
+    "narrow": Variant(NARROW),
+    "narrow, unshifted": Variant(NARROW, rate=2.0, shift=False),
+    "half as wide": Variant(replace(PATCHES, channels=(32, 32, 32))),
+    "frames": Variant(replace(PATCHES, differences=False)),
+    "64-d latent": Variant(replace(PATCHES, latent=64)),
+    "GELU": Variant(replace(PATCHES, activation="gelu")),
+    "bfloat16": Variant(half=True),
     "compiled": Variant(compiled=True),
-    "brief, four strides": Variant(Architecture((16, 32, 64, 64), (2, 2, 2, 2), "relu"), rate=2.0, shift=False),
-    "brief, compiled": Variant(rate=2.0, shift=False, compiled=True),
     "paper": Variant(PAPER),
 }
 

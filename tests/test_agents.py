@@ -25,14 +25,19 @@ from dmcvb_gen.agents.learners import (
 from dmcvb_gen.agents.networks import (
     MLP,
     PAPER,
+    PATCHES,
     Architecture,
     Convolutions,
+    FrameDifferences,
     ObservationDecoder,
     observation_encoder,
     state_decoder,
     state_encoder,
 )
+from dmcvb_gen.agents.trainer import TrainSettings, train
+from dmcvb_gen.benchmarks.profiles import PROFILES
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.tasks import ACTION_REPEAT
 
 SIZE, CHANNELS, ACTIONS, STATES = 16, 9, 6, 24
 
@@ -96,12 +101,13 @@ def test_the_decoder_is_the_encoder_in_reverse():
 
 
 @pytest.mark.parametrize("size", [16, 47, 50, 64])
-@pytest.mark.parametrize("architecture", [PAPER, Architecture((4, 8, 8, 16), (2, 2, 2, 1))])
+@pytest.mark.parametrize("architecture", [PAPER, PATCHES, Architecture((4, 8, 8, 16), (2, 2, 2, 1))])
 def test_pictures_of_any_size_are_encoded_and_decoded_to_that_size(size, architecture):
     encoder = observation_encoder(9, size, architecture)
-    pictures = torch.zeros(1, 9, size, size)
-    assert encoder.body(pictures).shape == (1, encoder.body.features)
-    assert ObservationDecoder(9, size, architecture=architecture)(encoder(pictures)).shape == pictures.shape
+    pictures = torch.zeros(2, 9, size, size)
+    assert encoder.body(pictures).shape == (2, encoder.body.features)
+    decoder = ObservationDecoder(9, size, encoder.features, architecture)
+    assert decoder(encoder(pictures)).shape == pictures.shape
 
 
 def test_state_networks_and_heads_have_the_papers_sizes():
@@ -127,17 +133,21 @@ def test_inverse_dynamics_embeds_k_only_where_it_is_sampled(sample):
     assert same is not sample
 
 
-def test_td3_critics_are_not_bounded():
-    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
-    last = learner.net.critic1[-1]
-    torch.nn.init.constant_(last.bias, 150.0)
-    value, _ = learner.net.values(torch.zeros(3, STATES), torch.zeros(3, ACTIONS))
-    assert value.shape == (3,) and value.min() > 100
+def test_td3s_critics_are_bounded_as_the_papers_unless_it_is_asked_otherwise():
+    """The hyperparameter table: "Actor, Critic 1 and Critic 2", "Last layer activation", "tanh"."""
+    values = {}
+    for bounded in (True, False):
+        learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS, bounded=bounded)
+        for critic in (learner.net.critic1, learner.net.critic2):
+            torch.nn.init.constant_(last_linear(critic).bias, 150.0)
+        values[bounded] = torch.stack(learner.net.values(torch.zeros(3, STATES), torch.zeros(3, ACTIONS)))
+    assert values[True].shape == (2, 3) and values[True].abs().max() <= 1
+    assert values[False].min() > 100
 
 
 def test_td3s_values_are_finer_than_half_precision():
     """Between 128 and 256 bfloat16 has whole numbers alone, and a step's reward is 2 at most."""
-    learner, batch = td3(), make_batch()
+    learner, batch = td3(bounded=False), make_batch()
     for critic in (learner.net.critic1, learner.target.critic1, learner.target.critic2):
         torch.nn.init.constant_(critic[-1].bias, 150.25)
     noise = torch.zeros_like(batch.action)
@@ -156,13 +166,159 @@ def test_td3s_values_are_finer_than_half_precision():
         assert (half - half.bfloat16()).abs().max() > 0.1
 
 
+# -- the paper's table of hyperparameters, row by row -----------------------------------------------
+
+
+def convolutions(module):
+    return [layer for layer in module.modules() if isinstance(layer, torch.nn.Conv2d | torch.nn.ConvTranspose2d)]
+
+
+def last_linear(module):
+    return [layer for layer in module.modules() if isinstance(layer, torch.nn.Linear)][-1]
+
+
+def hidden(module):
+    return tuple(layer.out_features for layer in module.modules() if isinstance(layer, torch.nn.Linear))[:-1]
+
+
+def activations(module):
+    """Of the hidden layers and of the output: "relu", "relu", "tanh"; "" if the output has none."""
+    kinds = (torch.nn.ReLU, torch.nn.GELU, torch.nn.Tanh)
+    layers = [layer for layer in module.modules() if not list(layer.children())]
+    found = [type(layer).__name__.lower() for layer in layers if isinstance(layer, kinds)]
+    return tuple(found) if isinstance(layers[-1], kinds) else (*found, "")
+
+
+def papers_table():
+    """Module, hyperparameter -> (the paper's value, ours), appendix "Architecture and hyperparameters".
+
+    Left out is "Actor, Critic 1 and Critic 2: output dimension 64": an actor gives an action, a critic one value.
+    """
+    encoder, by_state = observation_encoder(9), state_encoder(STATES)
+    identify, identify_k = (InverseDynamics(encoder, ACTIONS, k, k > 1) for k in (1, 5))
+    forward, agent = LatentForwardDynamics(encoder, ACTIONS), parse_agent("id+bc")
+    predict, decoder, by_state_decoder = StatePrediction(encoder, STATES), ObservationDecoder(9), state_decoder(STATES)
+    body = Convolutions(9)
+    td3 = TD3BC(body, body.features, ACTIONS)
+    settings, profile = TrainSettings(), PROFILES["paper"]
+    moved_by_actor = {id(p) for group in td3.optimizers["actor"].param_groups for p in group["params"]}
+    bc, default = BehaviorCloning(encoder, ACTIONS), ("relu", "relu", "tanh")
+    rows = {
+        ("Observation encoder", "Frame stacking"): (3, parse_agent("bc").stack),
+        ("Observation encoder", "CNN number of channels"): (
+            (32, 64, 128, 256),
+            tuple(c.out_channels for c in convolutions(encoder)),
+        ),
+        ("Observation encoder", "CNN kernel sizes"): ([(3, 3)] * 4, [c.kernel_size for c in convolutions(encoder)]),
+        ("Observation encoder", "CNN activation"): (("gelu",) * 4, activations(encoder.body)[:4]),
+        ("Observation encoder", "CNN kernel strides"): (
+            (2, 2, 1, 1),
+            tuple(c.stride[0] for c in convolutions(encoder)),
+        ),
+        ("Observation encoder", "Output activation"): ("tanh", activations(encoder.trunk)[-1]),
+        ("Observation encoder", "Output dimension"): (64, encoder.features),
+        ("State encoder", "Frame stacking"): (STATES, last_linear(by_state).in_features),
+        ("State encoder", "Output activation"): ("tanh", activations(by_state.trunk)[-1]),
+        ("State encoder", "Output dimension"): (64, by_state.features),
+        ("State predictor layer", "Output dimension"): (STATES, predict.h.out_features),
+        ("ID action predictor", "Hidden layer sizes"): ((256, 256), hidden(identify.f)),
+        ("ID action predictor", "Activations"): (default, activations(identify.f)),
+        ("ID action predictor", "Output dimension"): (ACTIONS, last_linear(identify.f).out_features),
+        ("BC action predictor", "Hidden layer sizes"): ((256, 256), hidden(bc.policy)),
+        ("BC action predictor", "Activations"): (default, activations(bc.policy)),
+        ("LFD predictor", "Hidden layer sizes"): ((256, 256), hidden(forward.g)),
+        ("LFD predictor", "Activations"): (default, activations(forward.g)),
+        ("LFD predictor", "Output dimension"): (64, last_linear(forward.g).out_features),
+        ("Action encoder", "Hidden layer sizes"): ((256, 256), hidden(forward.embed_action)),
+        ("Action encoder", "Activations"): (default, activations(forward.embed_action)),
+        ("Action encoder", "Output dimension"): (64, last_linear(forward.embed_action).out_features),
+        ("LFD", "Target network decay rate"): (0.99, forward.decay),
+        ("ID step embedding", "Output dimension"): (64, identify_k.embed_k.out_features),
+        ("ID step embedding", "Number of ID steps"): (1, agent.k),
+        ("ID step embedding", "Sample ID steps"): (False, agent.sample_k),
+        ("TD3-BC", "Trade-off alpha"): (2.5, td3.alpha),
+        ("TD3-BC", "Discount factor"): (0.99, td3.gamma),
+        ("TD3-BC", "Policy noise"): (0.2, td3.noise),
+        ("TD3-BC", "Policy noise clipping"): (0.5, td3.noise_clip),
+        ("TD3-BC", "Policy update frequency"): (2, td3.actor_every),
+        ("TD3-BC", "Target network decay rate"): (0.99, td3.decay),
+        ("TD3-BC", "Loss for shared CNN"): (True, {id(p) for p in td3.net.body.parameters()} <= moved_by_actor),
+        ("Observation decoder", "Linear layer dimension"): (16 * 16 * 256, decoder.linear.out_features),
+        ("Observation decoder", "DeCNN number of channels"): (
+            (128, 64, 32, 9),
+            tuple(c.out_channels for c in convolutions(decoder)),
+        ),
+        ("Observation decoder", "DeCNN kernel sizes"): ([(3, 3)] * 4, [c.kernel_size for c in convolutions(decoder)]),
+        ("Observation decoder", "DeCNN activation and output"): (("gelu",) * 3 + ("",), activations(decoder)),
+        ("Observation decoder", "DeCNN kernel strides"): (
+            (1, 1, 2, 2),
+            tuple(c.stride[0] for c in convolutions(decoder)),
+        ),
+        ("State decoder", "Hidden layer sizes"): ((256, 256), hidden(by_state_decoder)),
+        ("State decoder", "Activations"): (("relu", "relu", ""), activations(by_state_decoder)),
+        ("State decoder", "Output dimension"): (STATES, last_linear(by_state_decoder).out_features),
+        ("Learning", "Number of iterations"): ({400_000}, {settings.steps, profile.pixel_steps, profile.state_steps,
+                                                            profile.pretrain_steps, profile.frozen_steps}),
+        ("Learning", "Batch size"): ({256}, {settings.batch_size, profile.batch_size, profile.state_batch_size}),
+        ("Learning", "Optimizer"): ("Adam", type(bc.optimizers["main"]).__name__),
+        ("Learning", "Learning rate"): (0.001, bc.optimizers["main"].param_groups[0]["lr"] * settings.rate),
+        ("Learning", "Online evaluation frequency"): (20_000, settings.evaluate_every),
+        ("Online evaluation", "Number of evaluations"): (400_000 // 20_000, profile.evaluations),
+        ("Online evaluation", "Number of runs"): (30, profile.episodes),
+        ("Online evaluation", "Action repeat"): (2, ACTION_REPEAT),
+    }  # fmt: skip
+    for name, module in (("Actor", td3.net.actor), ("Critic 1", td3.net.critic1), ("Critic 2", td3.net.critic2)):
+        rows[name, "Hidden layer sizes"] = (256, 256), hidden(module)
+        rows[name, "Activations"] = default, activations(module)
+        rows[name, "Input"] = 64 + (ACTIONS if "Critic" in name else 0), module[0].in_features
+    for name, trunk in (("actor", td3.net.actor_trunk), ("critic", td3.net.critic_trunk)):
+        rows["TD3-BC", f"Loss for {name} trunk"] = True, {id(p) for p in trunk.parameters()} <= moved_by_actor
+    return rows
+
+
+@pytest.fixture(scope="module")
+def table():
+    return papers_table()
+
+
+def test_the_papers_table_of_hyperparameters_holds_row_by_row(table):
+    wrong = {row: values for row, values in table.items() if values[0] != values[1]}
+    assert not wrong and len(table) == 60
+
+
+def test_frame_differences_are_those_of_the_pictures():
+    """The map on the weights is the same convolution of the newest frame and of successive differences."""
+    body = FrameDifferences(9, 8, 4, 4, 0, frames=3)
+    pictures = torch.rand(2, 9, 16, 16)
+    oldest, middle, newest = pictures.split(3, dim=1)
+    by_hand = torch.cat([newest, newest - middle, middle - oldest], dim=1)
+    wanted = torch.nn.functional.conv2d(by_hand, body.weight, body.bias, 4)
+    torch.testing.assert_close(body(pictures), wanted, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("frozen", ["bc", "td3-bc"])
+def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
+    from tests.test_agents_data import make_data
+
+    data, policies = make_data(), []
+    for encoded in (False, True):
+        torch.manual_seed(0)
+        encoder = observation_encoder(data.channels, data.frames.size)
+        policy = BehaviorCloning(encoder, 2, frozen=True) if frozen == "bc" else TD3BC(encoder, 64, 2, frozen=True)
+        seen = data.encoded(encoder) if encoded else data
+        train(policy, seen, TrainSettings(steps=4, batch_size=8, evaluate_every=4, half=False, shift=False), seed=3)
+        policies.append(policy)
+    observation = data.observe(data.train_rows, *data._no_shift(len(data)))
+    torch.testing.assert_close(*(policy.act(observation) for policy in policies), atol=1e-5, rtol=1e-4)
+
+
 # -- gradients ------------------------------------------------------------------------------------
 
 
-def td3(alpha=2.5):
+def td3(alpha=2.5, bounded=True):
     torch.manual_seed(0)
     body = Convolutions(CHANNELS, SIZE)
-    return TD3BC(body, body.features, ACTIONS, alpha=alpha)
+    return TD3BC(body, body.features, ACTIONS, alpha=alpha, bounded=bounded)
 
 
 MOVED = {
@@ -240,12 +396,12 @@ def test_lfds_target_is_an_average_of_the_encoders():
 
 
 def constant(mlp, value):
-    torch.nn.init.zeros_(mlp[-1 if isinstance(mlp[-1], torch.nn.Linear) else -2].weight)
-    torch.nn.init.constant_(mlp[-1 if isinstance(mlp[-1], torch.nn.Linear) else -2].bias, value)
+    torch.nn.init.zeros_(last_linear(mlp).weight)
+    torch.nn.init.constant_(last_linear(mlp).bias, value)
 
 
 def test_td3s_target_value_by_hand():
-    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS, bounded=False)
     constant(learner.target.critic1, 5.0)
     constant(learner.target.critic2, 3.0)
     batch = Batch(
@@ -363,7 +519,7 @@ def test_an_unknown_option_is_refused_with_the_known_ones(name):
 
 @pytest.mark.parametrize("name, cure", [
     ("bc:k=5", "id\\+bc:k=5"), ("lfd+bc:k=10,sample", "leave them out"), ("state-bc:k=3", "leave them out"),
-    ("state-bc:frames=1", "not stacked"), ("id+bc:sample", "k=2 or more"),
+    ("state-bc:frames=1", "not stacked"), ("id+bc:sample", "k=2 or more"), ("bc:unbounded", "td3-bc"),
 ])  # fmt: skip
 def test_an_option_that_an_agent_does_not_hear_is_refused(name, cure):
     with pytest.raises(DmcvbError, match=cure):

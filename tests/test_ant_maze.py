@@ -239,7 +239,7 @@ def test_starts_and_goals():
     assert (np.rint(layout.grid(start)) != np.rint(layout.grid(goal))).any(axis=1).all()
     height = batch._qpos[:, 2]
     assert -0.25 <= height.min() < -0.23 and 0.23 < height.max() <= 0.25 and (batch._qpos[:, 7:] == 0).all()
-    assert task.max_steps == 600 and task.evaluation_steps == 1200
+    assert task.max_steps == 600 and task.evaluation_steps == 1000
     yaw = 2 * np.arctan2(batch._qpos[:, 6], batch._qpos[:, 3])
     counts = np.histogram(yaw % (2 * np.pi), 8, (0, 2 * np.pi))[0]
     assert counts.min() > 25

@@ -18,6 +18,7 @@ from dmcvb_gen.agents.data import (
     normalize_pixels,
     training_views,
 )
+from dmcvb_gen.benchmarks import report
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.experiments import _DataCache, run_cell, train_settings
 from dmcvb_gen.benchmarks.paper import paper_score
@@ -508,7 +509,27 @@ def test_data_that_grew_or_look_otherwise_are_read_again(small_release):
 def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
     setup = Setup(root="r", out="o", profile=PROFILES["brief"])
     pixels, states = train_settings(setup, 10), train_settings(setup, 10, pixels=False)
-    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, False, True)
+    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 1.0, False, False)
     assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
     whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10)
     assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
+
+
+def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
+    def result(benchmark, task, label, mean, scores=True):
+        cell = dict(benchmark=benchmark, task=task, policy_label=label, setting="visible", agent_name="bc")
+        score = dict(mean=mean, stderr=3.0, success=0.5)
+        return dict(cell=cell | dict(pretrain_label=""), profile=dict(scores=scores), score=score)
+
+    layouts = ("easy7x7a", "easy7x7b", "easy7x7c", "empty7x7", "medium7x7a")
+    results = [result("b1", f"ant-maze-{layout}", "expert", -100.0 - 30 * i) for i, layout in enumerate(layouts)]
+    results += [result("b3", "ant-maze-empty7x7", f"expert goal {pair}", -200.0 - pair) for pair in range(5)]
+    results += [result("b1", "walker-walk", "expert", 900.0), result("b1", "ant-maze-tiny", "expert", -9.0)]
+    rows = {(row[0], row[1]): row[5:] for row in report._groups(results)}
+    assert rows == {
+        ("b1", "ant-maze/single-obstacle"): ("3", "-130 ± 1.7", "50 %"),
+        ("b1", "ant-maze/empty"): ("1", "-190 ± 3.0", "50 %"),
+        ("b1", "ant-maze/multi-obstacle"): ("1", "-220 ± 3.0", "50 %"),
+        ("b3", "ant-maze-empty7x7"): ("5", "-202 ± 1.3", "50 %"),
+    }
+    assert not report._groups([result("b1", "ant-maze-empty7x7", "expert", -9.0, scores=False)])

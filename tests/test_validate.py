@@ -110,12 +110,12 @@ def report(release, tmp_path_factory):
 def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     _, out, result = report
     assert result.exit_code == 0, result.output
-    scores = [line for line in result.output.splitlines() if ", paper " in line]
-    assert len(scores) == 3 and all("[smoke]" in line for line in scores)
+    scores = [line for line in result.output.splitlines() if " [smoke]" in line]
+    assert len(scores) == 3 and "paper 9" not in result.output, "noise is not set beside the paper's numbers"
     assert "walker-walk/expert/none" in result.output and "dmcvb-gen rollout walker-walk" in result.output
     page = (out / "report.html").read_text()
     assert page.index("Sound") < page.index("Structure") < page.index("Episode returns") < page.index("Scores")
-    assert "paper 913 &plusmn; 10" in page and "claims no score" in page
+    assert "paper 913" not in page and "claims no score" in page
     assert page.count("<span class=tag>smoke</span>") == 3
     assert page.count("data:image/png;base64") >= 6 and "src='http" not in page and "href=" not in page
     facts = json.loads((out / "report.json").read_text())
@@ -124,6 +124,7 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     assert by_agent["bc"]["paper"] == {"mean": 913, "stderr": 10} and by_agent["state-bc"]["share"] == 1
     assert by_agent["bc"]["paper_share"] == pytest.approx(913 / 960)
     assert by_agent["id+bc"]["pretraining"]["curve"] and by_agent["id+bc"]["inspection"]["state_mse"] > 0
+    assert set(by_agent["bc"]["inspection"]["state_l1"]) == {"orientations", "height", "velocity"}
     assert (out / "cells" / "b1_walker-walk_dynamic_bc_expert.decoder.png").exists()
 
 
@@ -146,7 +147,7 @@ def test_its_tables_stand_in_markdown_too(report):
     for entry in facts["results"]:
         lines = shown.pop(entry["cell"]["agent_name"]).splitlines()
         assert float(lines[0].split(" ±")[0]) == pytest.approx(entry["score"]["mean"], rel=0.1)
-        assert f"paper {entry['paper']['mean']:.0f} ± {entry['paper']['stderr']:.0f}" in lines[-1]
+        assert "paper" not in lines[-1]
     assert not shown and "This profile claims no score." in text
 
 

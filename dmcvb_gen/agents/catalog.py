@@ -1,9 +1,10 @@
 """Agents by name: "id+bc" in, what pre-trains its encoder and what learns its policy out.
 
-    [PRETRAIN+]POLICY[:frames=N,k=N,sample]
+    [PRETRAIN+]POLICY[:frames=N,k=N,sample,unbounded]
 
 PRETRAIN is one of id, lfd, ae, state, dino, bc (its encoder is then frozen) or null (none: the policy trains its
-encoder); POLICY is bc or td3-bc. state-bc and state-td3-bc see states instead of pictures.
+encoder); POLICY is bc or td3-bc (with `unbounded`, its critics lack the paper's tanh). state-bc and state-td3-bc see
+states instead of pictures.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ class Agent:
       sees_state: states instead of pictures.
       stack: frames an observation.
       k, sample_k: of inverse dynamics.
+      unbounded: TD3-BC's critics end without tanh.
     """
 
     policy: str
@@ -56,6 +58,7 @@ class Agent:
     stack: int = FRAMES
     k: int = 1
     sample_k: bool = False
+    unbounded: bool = False
 
     @property
     def base(self) -> str:
@@ -69,6 +72,7 @@ class Agent:
         options = [f"frames={self.stack}"] if self.stack != FRAMES and not self.sees_state else []
         options += [f"k={self.k}"] if self.k != 1 else []
         options += ["sample"] if self.sample_k else []
+        options += ["unbounded"] if self.unbounded else []
         return self.base + (":" + ",".join(options) if options else "")
 
     @property
@@ -91,15 +95,19 @@ def parse_agent(name: str) -> Agent:
     base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
     if base not in AGENTS:
         raise UnknownNameError("agent", name, AGENTS)
-    values = {"stack": FRAMES, "k": 1, "sample_k": False}
+    values = {"stack": FRAMES, "k": 1, "sample_k": False, "unbounded": False}
     for option in filter(None, options.split(",")):
         key, _, value = option.partition("=")
         if key == "sample" and not value:
             values["sample_k"] = True
+        elif key == "unbounded" and not value:
+            values["unbounded"] = True
         elif key in ("frames", "k") and value.isdigit() and 1 <= int(value) <= 64:
             values["stack" if key == "frames" else "k"] = int(value)
         else:
-            raise DmcvbError(f"agent {name!r}: {option!r} is not an option; known: frames=1..64, k=1..64, sample")
+            raise DmcvbError(
+                f"agent {name!r}: {option!r} is not an option; known: frames=1..64, k=1..64, sample, unbounded"
+            )
     if base.startswith("state-"):
         agent = Agent(base.removeprefix("state-"), sees_state=True, **values)
     else:
@@ -115,6 +123,8 @@ def _check_heard(agent: Agent, name: str) -> None:
         raise DmcvbError(f"agent {name!r}: states are not stacked; leave frames=... out")
     if agent.pretrain != "id" and (agent.k != 1 or agent.sample_k):
         raise DmcvbError(f"agent {name!r}: k and sample are of inverse dynamics (id+bc:k=5); leave them out")
+    if agent.unbounded and agent.policy != "td3-bc":
+        raise DmcvbError(f"agent {name!r}: only the critics of td3-bc can be unbounded; leave it out")
     if agent.sample_k and agent.k == 1:
         raise DmcvbError(f"agent {name!r}: sample draws k from 1 to a largest one; give it, k=2 or more")
 
@@ -131,7 +141,7 @@ def make_encoder(
         return state_encoder(data.state.shape[1])
     if agent.pretrain == "dino":
         return load_dino(dino_weights, data.channels, data.frames.size)
-    return observation_encoder(data.channels, data.frames.size, architecture)
+    return observation_encoder(data.channels, data.frames.size, architecture, data.stack)
 
 
 def make_pretrainer(agent: Agent, encoder: Encoder, data: TrainingData, architecture: Architecture = PAPER) -> Learner:
@@ -152,9 +162,10 @@ def make_policy(agent: Agent, encoder: nn.Module, data: TrainingData, architectu
     actions, frozen = data.action.shape[1], agent.pretrain is not None
     if agent.policy == "bc":
         return BehaviorCloning(encoder, actions, frozen=frozen)
+    bounded = not agent.unbounded
     if frozen:
-        return TD3BC(encoder, encoder.features, actions, frozen=True)
+        return TD3BC(encoder, encoder.features, actions, frozen=True, bounded=bounded)
     if agent.sees_state:
-        return TD3BC(nn.Identity(), data.state.shape[1], actions)
-    body = Convolutions(data.channels, data.frames.size, architecture)
-    return TD3BC(body, body.features, actions)
+        return TD3BC(nn.Identity(), data.state.shape[1], actions, bounded=bounded)
+    body = Convolutions(data.channels, data.frames.size, architecture, data.stack)
+    return TD3BC(body, body.features, actions, bounded=bounded, latent=architecture.latent)

@@ -21,6 +21,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from torch import nn
 from torch.utils.data import Dataset
 
 from dmcvb_gen.agents.learners import Batch
@@ -35,6 +36,8 @@ PAD = 4
 HOLD_OUT = 0.05
 """Share of the episodes that no agent learns from."""
 STD_FLOOR = 1e-3
+ENCODED_ROWS = 256
+"""Observations that are encoded at a time."""
 READ_EPISODES = 10
 """Episodes decoded at a time while a subset is loaded."""
 
@@ -192,7 +195,10 @@ class TrainingData(Dataset):
       normalization: of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.
       returns: (episode,) float64, of all episodes in it.
+      latent: (row, latent) float32 of a frozen encoder (`encoded`); None elsewhere.
     """
+
+    latent: torch.Tensor | None = None
 
     def __init__(
         self,
@@ -270,6 +276,7 @@ class TrainingData(Dataset):
         shift: bool = True,
         dtype: torch.dtype = torch.float32,
         reuse: Batch | None = None,
+        pictures: bool = True,
     ) -> Batch:
         """Transitions drawn uniformly, with replacement.
 
@@ -281,6 +288,7 @@ class TrainingData(Dataset):
           dtype: of pictures. Half the bytes are half the time to write them.
           reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
             memory for a large batch costs several times the work that fills it.
+          pictures: give observations even if the data are encoded.
         """
         rows = self.hold_out_rows if hold_out else self.train_rows
         if next_observation and k > 1:
@@ -291,22 +299,51 @@ class TrainingData(Dataset):
                 "episodes"
             )
         chosen = rows[self._to_device(generator.integers(len(rows), size=size))]
-        if hold_out or not shift or self.frames is None:
+        if hold_out or not shift or self.frames is None or self.latent is not None:
             down, right = self._no_shift(size)
         else:
             down, right = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
-        later = steps = None
+        steps = None
         if next_observation:
             steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-            later = self.observe(chosen + steps, down, right, dtype, reuse and reuse.next_observation)
+        return self.transitions(chosen, steps, down, right, dtype, reuse, pictures)
+
+    def transitions(
+        self,
+        rows: torch.Tensor,
+        steps: torch.Tensor | None = None,
+        down: torch.Tensor | None = None,
+        right: torch.Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+        reuse: Batch | None = None,
+        pictures: bool = True,
+    ) -> Batch:
+        """The transitions of given rows.
+
+        Args:
+          rows: (batch,) long.
+          steps: (batch,) long, how far off the next observation is; None: no next observation.
+          down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
+          dtype, reuse, pictures: as for `batch`.
+        """
+        if down is None or right is None:
+            down, right = self._no_shift(len(rows))
+        now = later = None
+        if pictures or self.latent is None:
+            now = self.observe(rows, down, right, dtype, reuse and reuse.observation)
+            if steps is not None:
+                later = self.observe(rows + steps, down, right, dtype, reuse and reuse.next_observation)
+        latent = self.latent
         return Batch(
-            observation=self.observe(chosen, down, right, dtype, reuse and reuse.observation),
-            state=self.state[chosen],
-            action=self.action[chosen],
-            reward=self.reward[chosen],
-            discount=self.discount[chosen],
+            observation=now,
+            state=self.state[rows],
+            action=self.action[rows],
+            reward=self.reward[rows],
+            discount=self.discount[rows],
             next_observation=later,
             k=steps,
+            latent=None if latent is None else latent[rows],
+            next_latent=None if latent is None or steps is None else latent[rows + steps],
         )
 
     def _to_device(self, values: np.ndarray) -> torch.Tensor:
@@ -319,6 +356,16 @@ class TrainingData(Dataset):
     def with_stack(self, stack: int) -> TrainingData:
         """The same episodes seen in stacks of another number of frames."""
         return self._with(stack=stack)
+
+    @torch.no_grad()
+    def encoded(self, encoder: nn.Module, dtype: torch.dtype = torch.float32) -> TrainingData:
+        """The same episodes with the latents of a frozen encoder, computed once; its pictures are not shifted."""
+        rows = torch.arange(len(self.state), device=self.device)
+        parts = []
+        for few in rows.split(ENCODED_ROWS):
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
+                parts.append(encoder(self.observe(few, *self._no_shift(len(few)), dtype)).float())
+        return self._with(latent=torch.cat(parts))
 
     def _with(self, **changes) -> TrainingData:
         twin = object.__new__(TrainingData)
@@ -357,7 +404,11 @@ def part_count(share: float, episodes: int) -> int:
 
 
 def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """(episodes, held out) of a source: its share, and which of those no agent learns from (5 %, none of one)."""
+    """(episodes, held out) of a source: its share, and which of those no agent learns from.
+
+    5 % are held out, but none of a single episode, of a counted few or of a goal pair's: the paper's policies learn
+    from all of those.
+    """
     names = source.subset.episodes
     if source.goal_pair is not None:
         names = names[source.subset.read("goal_pair") == source.goal_pair]
@@ -365,7 +416,8 @@ def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
             raise DmcvbError(f"{source.subset.name} has no episodes of goal pair {source.goal_pair}")
     order = np.random.default_rng(seed).permutation(len(names))
     count = min(source.episodes or part_count(source.share, len(names)), len(names))
-    out = min(math.ceil(HOLD_OUT * count), count - 1)
+    few = source.episodes is not None or source.goal_pair is not None
+    out = 0 if few else min(math.ceil(HOLD_OUT * count), count - 1)
     chosen = order[:count]
     held = np.zeros(count, bool)
     held[:out] = True

@@ -38,20 +38,23 @@ class Batch:
     """Transitions; tensors with leading axis (batch,).
 
     Attributes:
-      observation, next_observation: what the agent sees at t and t + k; None for the latter where no one asks.
+      observation, next_observation: what the agent sees at t and t + k; None if nobody asks for it.
       state: (batch, state) normalized state at t.
       action: (batch, action) in [-1, 1].
       reward, discount: (batch,) of the action at t; discount 0 where the task ended the episode.
       k: (batch,) long, how many steps lie between the two observations.
+      latent, next_latent: (batch, latent) of a frozen encoder, of data that are encoded once; None elsewhere.
     """
 
-    observation: torch.Tensor
+    observation: torch.Tensor | None
     state: torch.Tensor
     action: torch.Tensor
     reward: torch.Tensor
     discount: torch.Tensor
     next_observation: torch.Tensor | None = None
     k: torch.Tensor | None = None
+    latent: torch.Tensor | None = None
+    next_latent: torch.Tensor | None = None
 
 
 def adam(modules: Iterable[nn.Module], lr: float = LEARNING_RATE) -> torch.optim.Adam:
@@ -83,6 +86,8 @@ class Learner(nn.Module, abc.ABC):
 
     needs_next = False
     """Whether batches need `next_observation`."""
+    needs_pictures = True
+    """Whether batches need observations even if they hold the latents of a frozen encoder."""
     k_max, sample_k = 1, False
     """How far off the next observation is."""
     compiled = ("losses",)
@@ -146,7 +151,7 @@ class InverseDynamics(Learner):
         super().__init__()
         self.encoder, self.k_max, self.sample_k = encoder, k_max, sample_k
         self.embed_k = initialize(nn.Linear(1, LATENT)) if sample_k else None
-        self.f = MLP((3 if sample_k else 2) * LATENT, action_size, tanh=True)
+        self.f = MLP(2 * encoder.features + sample_k * LATENT, action_size, tanh=True)
         self.optimizers = {"main": adam([self], lr)}
 
     def losses(self, batch):
@@ -167,7 +172,7 @@ class LatentForwardDynamics(Learner):
         self.encoder, self.decay = encoder, decay
         self.target_encoder = frozen_copy(encoder)
         self.embed_action = MLP(action_size, LATENT, tanh=True)
-        self.g = MLP(2 * LATENT, LATENT, tanh=True)
+        self.g = MLP(encoder.features + LATENT, encoder.features, tanh=True)
         self.optimizers = {"main": adam([self], lr)}
 
     def losses(self, batch):
@@ -194,7 +199,7 @@ class Autoencoder(Learner):
         lr=LEARNING_RATE,
     ):
         super().__init__()
-        self.encoder, self.decoder = encoder, ObservationDecoder(channels, size, LATENT, architecture)
+        self.encoder, self.decoder = encoder, ObservationDecoder(channels, size, encoder.features, architecture)
         self.optimizers = {"main": adam([self], lr)}
 
     def losses(self, batch):
@@ -206,7 +211,7 @@ class StatePrediction(Learner):
 
     def __init__(self, encoder: Encoder, state_size: int, lr=LEARNING_RATE):
         super().__init__()
-        self.encoder, self.h = encoder, initialize(nn.Linear(LATENT, state_size))
+        self.encoder, self.h = encoder, initialize(nn.Linear(encoder.features, state_size))
         self.optimizers = {"main": adam([self], lr)}
 
     def losses(self, batch):
@@ -219,6 +224,8 @@ class StatePrediction(Learner):
 class BehaviorCloning(Policy):
     """BC: || pi(phi(o)) - a ||^2 (equation 3), end to end, or with phi frozen after pre-training."""
 
+    needs_pictures = False
+
     def __init__(self, encoder: nn.Module, action_size: int, frozen: bool = False, lr=LEARNING_RATE):
         super().__init__()
         self.encoder = encoder.requires_grad_(not frozen)
@@ -226,26 +233,29 @@ class BehaviorCloning(Policy):
         self.policy = MLP(encoder.features, action_size, tanh=True)
         self.optimizers = {"main": adam([self], lr)}
 
-    def act(self, observation):
+    def _encode(self, observation: torch.Tensor) -> torch.Tensor:
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            latent = self.encoder(observation)
-        return self.policy(latent)
+            return self.encoder(observation)
+
+    def act(self, observation):
+        return self.policy(self._encode(observation))
 
     def losses(self, batch):
-        return {"loss": F.mse_loss(self.act(batch.observation).float(), batch.action)}
+        latent = self._encode(batch.observation) if batch.latent is None else batch.latent
+        return {"loss": F.mse_loss(self.policy(latent).float(), batch.action)}
 
 
 class _ActorCritic(nn.Module):
     """The networks of TD3-BC: a shared body, two trunks, an actor and two critics."""
 
-    def __init__(self, body: nn.Module, features: int, action_size: int, trunks: bool):
+    def __init__(self, body: nn.Module, features: int, action_size: int, trunks: int | None, bounded: bool):
         super().__init__()
         self.body = body
-        self.actor_trunk = Trunk(features) if trunks else nn.Identity()
-        self.critic_trunk = Trunk(features) if trunks else nn.Identity()
-        self.latent = latent = LATENT if trunks else features
+        self.actor_trunk = Trunk(features, trunks) if trunks else nn.Identity()
+        self.critic_trunk = Trunk(features, trunks) if trunks else nn.Identity()
+        self.latent = latent = trunks or features
         self.actor = MLP(latent, action_size, tanh=True)
-        self.critic1, self.critic2 = MLP(latent + action_size, 1), MLP(latent + action_size, 1)
+        self.critic1, self.critic2 = (MLP(latent + action_size, 1, tanh=bounded) for _ in range(2))
 
     def act(self, body: torch.Tensor) -> torch.Tensor:
         return self.actor(self.actor_trunk(body)).float()
@@ -278,15 +288,19 @@ class TD3BC(Policy):
 
     Critics: y = r + discount gamma min(Q1', Q2')(o', clip(pi'(o') + clip(noise))); || Q - y ||^2 moves the critic
     heads alone. Actor, every second step: - lambda Q1(o, pi(o)) + || pi(o) - a ||^2 with lambda = alpha / mean |Q1|
-    moves the actor, both trunks and the body. So alpha = 0 is BC. Values are unbounded: the critics end without tanh.
+    moves the actor, both trunks and the body. So alpha = 0 is BC. The critics end with tanh, as the paper's
+    hyperparameter table says: values lie in (-1, 1), saturate on these rewards, and what is left is nearly BC.
 
     Args:
       body: `Convolutions` or `nn.Identity` (states), trained with trunks of their own; or a frozen encoder.
       features: what the body gives.
       frozen: the body is a pre-trained encoder that stays as it is; heads read its latent, without trunks.
+      bounded: critics end with tanh; False leaves their values unbounded, as in TD3-BC's own paper.
+      latent: width of the trunks.
     """
 
     needs_next = True
+    needs_pictures = False
     compiled = ("critic_loss", "actor_loss")
 
     def __init__(
@@ -302,9 +316,12 @@ class TD3BC(Policy):
         actor_every: int = 2,
         decay: float = EMA_DECAY,
         lr=LEARNING_RATE,
+        bounded: bool = True,
+        latent: int = LATENT,
     ):
         super().__init__()
-        self.net = _ActorCritic(body.requires_grad_(not frozen), features, action_size, trunks=not frozen)
+        trunks = None if frozen else latent
+        self.net = _ActorCritic(body.requires_grad_(not frozen), features, action_size, trunks, bounded)
         self.target = frozen_copy(self.net)
         self.frozen = frozen
         if frozen:
@@ -322,6 +339,9 @@ class TD3BC(Policy):
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             return self.net.body(observation)
 
+    def _seen(self, batch: Batch) -> torch.Tensor:
+        return self._body(batch.observation) if batch.latent is None else batch.latent
+
     @property
     def encoder(self) -> nn.Module:
         """phi as the actor sees it: body and actor's trunk."""
@@ -333,7 +353,7 @@ class TD3BC(Policy):
     @torch.no_grad()
     def target_value(self, batch: Batch, noise: torch.Tensor | None = None) -> torch.Tensor:
         """y: (batch,)."""
-        body = self.target.body(batch.next_observation)
+        body = self.target.body(batch.next_observation) if batch.next_latent is None else batch.next_latent
         if noise is None:
             noise = torch.randn_like(batch.action) * self.noise
         action = (self.target.act(body) + noise.clamp(-self.noise_clip, self.noise_clip)).clamp(-1, 1)
@@ -341,14 +361,14 @@ class TD3BC(Policy):
 
     def critic_loss(self, batch: Batch) -> torch.Tensor:
         with torch.no_grad():
-            latent = self.net.critic_trunk(self.net.body(batch.observation))
+            latent = self.net.critic_trunk(self._seen(batch))
         y = self.target_value(batch)
         critics = (self.net.critic1, self.net.critic2)
         return sum(F.mse_loss(self.net.value(critic, latent, batch.action), y) for critic in critics)
 
     def actor_loss(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor's loss, and the cloning error in it."""
-        body = self._body(batch.observation)
+        body = self._seen(batch)
         action = self.net.act(body)
         value = self.net.values(body, action)[0]
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)
@@ -377,6 +397,13 @@ class TD3BC(Policy):
 # -- inspection: what a frozen encoder still knows ------------------------------------------------
 
 
+def _frozen_latent(encoder: nn.Module, batch: Batch) -> torch.Tensor:
+    if batch.latent is not None:
+        return batch.latent
+    with torch.no_grad():
+        return encoder(batch.observation)
+
+
 class ObservationProbe(Learner):
     """|| psi(phi(o)) - o ||^2 over psi, phi frozen."""
 
@@ -393,17 +420,18 @@ class ObservationProbe(Learner):
         self.decoder = ObservationDecoder(channels, size, encoder.features, architecture)
         self.optimizers = {"main": adam([self.decoder], lr)}
 
-    def reconstruct(self, observation: torch.Tensor) -> torch.Tensor:
-        with torch.no_grad():
-            latent = self.encoder(observation)
-        return self.decoder(latent)
+    def reconstruct(self, batch: Batch) -> torch.Tensor:
+        """(batch, channels, size, size): the observations as the decoder sees them."""
+        return self.decoder(_frozen_latent(self.encoder, batch))
 
     def losses(self, batch):
-        return {"loss": F.mse_loss(self.reconstruct(batch.observation).float(), batch.observation.float())}
+        return {"loss": F.mse_loss(self.reconstruct(batch).float(), batch.observation.float())}
 
 
 class StateProbe(Learner):
     """|| s - h(phi(o)) ||^2 over an MLP h, phi frozen."""
+
+    needs_pictures = False
 
     def __init__(self, encoder: nn.Module, state_size: int, lr=LEARNING_RATE):
         super().__init__()
@@ -411,6 +439,9 @@ class StateProbe(Learner):
         self.optimizers = {"main": adam([self.h], lr)}
 
     def losses(self, batch):
-        with torch.no_grad():
-            latent = self.encoder(batch.observation)
-        return {"loss": F.mse_loss(self.h(latent).float(), batch.state)}
+        predicted = self.h(_frozen_latent(self.encoder, batch)).float()
+        return {"loss": F.mse_loss(predicted, batch.state)}
+
+    def field_errors(self, batch: Batch) -> torch.Tensor:
+        """(batch, state): absolute errors of the normalized state."""
+        return (self.h(_frozen_latent(self.encoder, batch)).float() - batch.state).abs()

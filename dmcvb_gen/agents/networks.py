@@ -24,22 +24,36 @@ ACTIVATIONS = {"gelu": nn.GELU, "relu": nn.ReLU}
 
 @dataclass(frozen=True)
 class Architecture:
-    """The 3x3 convolutions of an encoder; its decoder has the same ones in reverse.
+    """The convolutions of an encoder; its decoder has the same ones in reverse.
 
     Attributes:
       channels: of each convolution's output. strides: of each.
       activation: behind each convolution.
+      patch: the first convolution cuts the picture into patches of its stride that do not overlap; it is 3x3 otherwise,
+        as all others are.
+      differences: the first convolution reads the newest frame and the differences of successive frames, instead of
+        the frames.
+      latent: width of the encoder's output.
     """
 
     channels: tuple[int, ...]
     strides: tuple[int, ...]
     activation: Literal["gelu", "relu"] = "gelu"
+    patch: bool = False
+    differences: bool = False
+    latent: int = LATENT
+
+    @property
+    def kernels(self) -> tuple[tuple[int, int], ...]:
+        """(size, padding) of each convolution."""
+        first = (self.strides[0], 0) if self.patch else (3, 1)
+        return (first, *[(3, 1)] * (len(self.strides) - 1))
 
     def sizes(self, size: int) -> tuple[int, ...]:
         """Pixels a side before the first convolution and after each: (64, 32, 16, 16, 16)."""
         found = [size]
-        for stride in self.strides:
-            found.append(-(-found[-1] // stride))
+        for stride, (kernel, padding) in zip(self.strides, self.kernels, strict=True):
+            found.append((found[-1] + 2 * padding - kernel) // stride + 1)
         return tuple(found)
 
 
@@ -49,6 +63,12 @@ PAPER = Architecture((32, 64, 128, 256), (2, 2, 1, 1))
 NARROW = Architecture((16, 32, 32, 64), (2, 2, 2, 1), "relu")
 """For short trainings on a CPU: 8 x 8 x 64 = 4,096 features for a 23rd of the paper's work, without GELU, which takes
 a quarter of a step of so narrow a network and does not raise its score (`scripts/bench_profiles.py`)."""
+
+PATCHES = Architecture((64, 64, 64), (4, 2, 1), "relu", patch=True, differences=True, latent=256)
+"""For short trainings on a CPU: 4x4 patches of the newest frame and of frame differences, 8 x 8 x 64 features."""
+
+NETWORKS = {"paper": PAPER, "narrow": NARROW, "patches": PATCHES}
+"""Name -> architecture."""
 
 
 def initialize(module: nn.Module) -> nn.Module:
@@ -62,11 +82,11 @@ def initialize(module: nn.Module) -> nn.Module:
 
 
 class Trunk(nn.Sequential):
-    """(batch, features) -> (batch, 64) in (-1, 1): linear, LayerNorm, tanh."""
+    """(batch, features) -> (batch, latent) in (-1, 1): linear, LayerNorm, tanh."""
 
-    def __init__(self, features: int):
-        super().__init__(nn.Linear(features, LATENT), nn.LayerNorm(LATENT), nn.Tanh())
-        self.features = LATENT
+    def __init__(self, features: int, latent: int = LATENT):
+        super().__init__(nn.Linear(features, latent), nn.LayerNorm(latent), nn.Tanh())
+        self.features = latent
         initialize(self)
 
 
@@ -92,17 +112,51 @@ class _Flatten(nn.Module):
         return _SameLayout.apply(pictures).flatten(1)
 
 
-class Convolutions(nn.Sequential):
-    """(batch, channel, size, size) -> (batch, features): 3x3 convolutions, an activation behind each, flattened.
+class FrameDifferences(nn.Conv2d):
+    """A convolution of the newest frame and of the differences of successive frames.
 
-    Weights lie in memory with the channels last, which makes the kernels a fifth faster on a CPU.
+    The differences are a linear map of the frames, so it is applied to the weights, which are few, and not to the
+    pictures.
+
+    Args:
+      channels: of the stack, oldest frame first. frames: of the stack.
     """
 
-    def __init__(self, channels: int, size: int = 64, architecture: Architecture = PAPER):
+    def __init__(self, channels: int, out: int, kernel: int, stride: int, padding: int, frames: int):
+        super().__init__(channels, out, kernel, stride, padding)
+        self.frames = frames
+        of_frames = torch.zeros(frames, frames)  # (input, frame): input 0 is the newest frame, the others differences
+        of_frames[0, -1] = 1
+        for index in range(1, frames):
+            of_frames[index, frames - index], of_frames[index, frames - index - 1] = 1, -1
+        self.register_buffer("of_frames", of_frames, persistent=False)
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        weight = self.weight.unflatten(1, (self.frames, -1))
+        weight = torch.einsum("oichw,if->ofchw", weight, self.of_frames).flatten(1, 2)
+        return nn.functional.conv2d(pictures, weight, self.bias, self.stride, self.padding)
+
+
+class Convolutions(nn.Sequential):
+    """(batch, channel, size, size) -> (batch, features): convolutions, an activation behind each, flattened.
+
+    Weights lie in memory with the channels last, which makes the kernels a fifth faster on a CPU.
+
+    Args:
+      frames: of the stack that the channels hold; only an architecture with `differences` asks.
+    """
+
+    def __init__(self, channels: int, size: int = 64, architecture: Architecture = PAPER, frames: int = 3):
         layers: list[nn.Module] = []
         width = channels
-        for out, stride in zip(architecture.channels, architecture.strides, strict=True):
-            layers += [nn.Conv2d(width, out, 3, stride, padding=1), ACTIVATIONS[architecture.activation]()]
+        for out, stride, (kernel, padding) in zip(
+            architecture.channels, architecture.strides, architecture.kernels, strict=True
+        ):
+            if architecture.differences and not layers:
+                layers.append(FrameDifferences(width, out, kernel, stride, padding, frames))
+            else:
+                layers.append(nn.Conv2d(width, out, kernel, stride, padding))
+            layers.append(ACTIVATIONS[architecture.activation]())
             width = out
         super().__init__(*layers, _Flatten())
         self.features = width * architecture.sizes(size)[-1] ** 2
@@ -110,26 +164,27 @@ class Convolutions(nn.Sequential):
 
 
 class Encoder(nn.Module):
-    """phi: an observation to a 64-d latent; `body` is shared by TD3-BC's actor and critic, `trunk` is not.
+    """phi: an observation to a latent; `body` is shared by TD3-BC's actor and critic, `trunk` is not.
 
     Args:
       body: `Convolutions` for pictures, `nn.Identity` for states.
       features: what the body gives.
+      latent: width of the latent.
     """
 
-    def __init__(self, body: nn.Module, features: int):
+    def __init__(self, body: nn.Module, features: int, latent: int = LATENT):
         super().__init__()
-        self.body, self.trunk = body, Trunk(features)
-        self.features = LATENT
+        self.body, self.trunk = body, Trunk(features, latent)
+        self.features = latent
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return self.trunk(self.body(observation))
 
 
-def observation_encoder(channels: int, size: int = 64, architecture: Architecture = PAPER) -> Encoder:
+def observation_encoder(channels: int, size: int = 64, architecture: Architecture = PAPER, frames: int = 3) -> Encoder:
     """phi for frame stacks."""
-    body = Convolutions(channels, size, architecture)
-    return Encoder(body, body.features)
+    body = Convolutions(channels, size, architecture, frames)
+    return Encoder(body, body.features, architecture.latent)
 
 
 def state_encoder(state_size: int) -> Encoder:
@@ -159,11 +214,12 @@ class ObservationDecoder(nn.Module):
         self.linear = nn.Linear(features, width * sizes[0] ** 2)
         layers: list[nn.Module] = []
         wanted = (*architecture.channels[-2::-1], channels)
-        for index, (out, stride) in enumerate(zip(wanted, architecture.strides[::-1], strict=True)):
-            # Without output padding n pixels become stride (n - 1) + 1: what an odd size needs.
-            missing = sizes[index + 1] - (stride * (sizes[index] - 1) + 1)
+        reverse = zip(wanted, architecture.strides[::-1], architecture.kernels[::-1], strict=True)
+        for index, (out, stride, (kernel, padding)) in enumerate(reverse):
+            # Without output padding n pixels become stride (n - 1) + kernel - 2 padding: what an odd size needs.
+            missing = sizes[index + 1] - (stride * (sizes[index] - 1) + kernel - 2 * padding)
             layers += [
-                nn.ConvTranspose2d(width, out, 3, stride, padding=1, output_padding=missing),
+                nn.ConvTranspose2d(width, out, kernel, stride, padding, output_padding=missing),
                 ACTIVATIONS[architecture.activation](),
             ]
             width = out

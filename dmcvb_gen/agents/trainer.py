@@ -85,6 +85,7 @@ def draw(
         shift=shift,
         dtype=torch.bfloat16 if learner.half else torch.float32,
         reuse=reuse,
+        pictures=learner.needs_pictures,
     )
 
 

@@ -1,8 +1,8 @@
 """Online evaluation: a policy and the subset it learned from in, scores of fresh episodes out, all in one batch.
 
 The episodes are those of the subset's task, painted by its renderer at its size, with its kind of distractors: unseen
-`val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). Mazes give an
-agent twice the time that their data had (`Task.evaluation_steps`), as the paper's evaluation does.
+`val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). In mazes an agent
+has 1,000 steps (`Task.evaluation_steps`), where the authors' evaluation stops; the data were cut at 600.
 """
 
 from __future__ import annotations

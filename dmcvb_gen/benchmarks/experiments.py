@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,8 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
-from dmcvb_gen.agents.data import Source, TrainingData, load_data
-from dmcvb_gen.agents.learners import ObservationProbe, Policy, StateProbe
+from dmcvb_gen.agents.data import Normalization, Source, TrainingData, load_data
+from dmcvb_gen.agents.learners import Batch, Learner, ObservationProbe, Policy, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
@@ -32,7 +33,7 @@ from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json
 from dmcvb_gen.parallel import ignore
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks import Task, get_task
 from dmcvb_gen.version import __version__
 
 ProgressCallback = Callable[[str, int], None]
@@ -58,16 +59,22 @@ class _DataCache:
 
 _cache = _DataCache()
 
+INSPECTED = 150_000
+"""Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
+UNIT_EPISODES = 100
 
-def train_settings(setup: Setup, steps: int, pixels: bool = True, evaluations: int = 1) -> TrainSettings:
-    """How a piece of a cell is trained under a profile."""
+
+def train_settings(
+    setup: Setup, steps: int, pixels: bool = True, evaluations: int = 1, frozen: bool = False
+) -> TrainSettings:
+    """How a piece of a cell is trained under a profile; `frozen`: on an encoder that does not learn."""
     return TrainSettings(
         steps=steps,
         batch_size=setup.profile.batch_size if pixels else setup.profile.state_batch_size,
         evaluate_every=-(-steps // evaluations),
-        half=pixels,
+        half=pixels and setup.precision == "bfloat16",
         rate=setup.profile.rate if pixels else 1.0,
-        shift=setup.profile.shift,
+        shift=setup.profile.frozen_shift if frozen else setup.profile.shift,
         decay=setup.profile.decay,
         compile=setup.compile,
         workers=1 if setup.device != "cpu" else 0,
@@ -131,6 +138,13 @@ def _load_encoder(setup: Setup, work: Pretraining, encoder: nn.Module) -> None:
         encoder.load_state_dict(load_file(str(path)))
     except (OSError, SafetensorError, RuntimeError) as error:
         raise DmcvbError(f"cannot read the encoder {path} ({error}); delete it and run again") from None
+
+
+def encoded(setup: Setup, encoder: nn.Module, data: TrainingData) -> TrainingData:
+    """Data of a frozen encoder: its latents are computed once where the profile does not shift pictures."""
+    if setup.profile.frozen_shift:
+        return data
+    return data.encoded(encoder, torch.bfloat16 if setup.precision == "bfloat16" else torch.float32)
 
 
 # -- a cell ---------------------------------------------------------------------------------------
@@ -212,7 +226,9 @@ def _train_policy(
         return {"score": score.facts()}
 
     label = f"{cell.agent.name} on {cell.task} {cell.policy_label}/{cell.setting}"
-    settings = train_settings(setup, policy_steps(profile, cell.agent), pixels, profile.evaluations)
+    frozen = cell.agent.pretrain is not None
+    settings = train_settings(setup, policy_steps(profile, cell.agent), pixels, profile.evaluations, frozen)
+    data = encoded(setup, policy.encoder, data) if frozen else data
     started = time.perf_counter()
     try:
         curve = train(
@@ -254,7 +270,12 @@ def _facts(
         "seconds": seconds,
         "steps_per_second": policy_steps(profile, agent) / max(seconds["training"], 1e-9),
         "memory_bytes": _peak_memory(setup.device),
-        "machine": {"device": setup.device, "threads": setup.threads, "torch": torch.__version__},
+        "machine": {
+            "device": setup.device,
+            "threads": setup.threads,
+            "precision": setup.precision,
+            "torch": torch.__version__,
+        },
         "generator": f"dmcvb-gen {__version__}",
     }
 
@@ -321,13 +342,14 @@ def inspect(
       folder: where the decoders' states are kept while they train, one in a folder each.
     """
     curves: dict[str, Curve] = {}
-    errors: dict[str, float | None] = {}
+    errors: dict[str, Any] = {}
     torch.manual_seed(setup.seed)  # of the readouts' weights, also where training has just been resumed
     readouts = {
         "observation": ObservationProbe(encoder, data.channels, data.frames.size, setup.profile.network),
         "state": StateProbe(encoder, data.state.shape[1]),
     }
-    settings = train_settings(setup, setup.profile.readout_steps)
+    settings = train_settings(setup, setup.profile.readout_steps, frozen=True)
+    data = encoded(setup, encoder, data)
     for name, learner in readouts.items():
         learner.to(setup.device)
         curves[name] = train(
@@ -338,15 +360,70 @@ def inspect(
             folder=folder / name,
             tick=lambda made, n=name: tick(f"{n} decoder", made),
         )
-        errors[f"{name}_mse"] = curves[name][-1].get("test_loss")
+        errors[f"{name}_mse"] = _hold_out_error(learner, data, setup.profile.batch_size)
+    units = state_units(setup, cell.task)
+    errors["state_l1"] = _field_errors(readouts["state"], data, get_task(cell.task), units, setup.profile.batch_size)
     held_out = len(data.hold_out_rows) > 0
     batch = draw(readouts["observation"], data, 8, setup.seed, 0, hold_out=held_out)
     with torch.no_grad(), readouts["observation"].precision():
-        seen = readouts["observation"].reconstruct(batch.observation).float()
+        seen = readouts["observation"].reconstruct(batch).float()
     newest = slice(-data.frames.channels, None)
     rows = [_to_pictures(pictures[:, newest][:, :3]) for pictures in (batch.observation, seen)]
     _save_sheet(setup.cells / f"{cell.id}.decoder.png", rows)
     return {**errors, "curves": curves, "held_out": held_out}
+
+
+def _hold_out_batches(learner: Learner, data: TrainingData, size: int) -> Iterator[Batch]:
+    """Every held-out transition once, at most 150,000 of them, evenly spread."""
+    rows = data.hold_out_rows
+    rows = rows[:: max(1, -(-len(rows) // INSPECTED))]
+    for few in rows.split(size):
+        yield data.transitions(few, pictures=learner.needs_pictures)
+
+
+@torch.no_grad()
+def _hold_out_error(learner: Learner, data: TrainingData, size: int) -> float | None:
+    """Mean loss over the held-out transitions; None if none are held out."""
+    total = count = 0.0
+    for batch in _hold_out_batches(learner, data, size):
+        total, count = total + float(learner.metrics(batch)["loss"]) * len(batch.action), count + len(batch.action)
+    return total / count if count else None
+
+
+@torch.no_grad()
+def _field_errors(
+    learner: StateProbe, data: TrainingData, task: Task, units: torch.Tensor, size: int
+) -> dict[str, float] | None:
+    """State field -> mean absolute error of its prediction on held-out transitions.
+
+    Args:
+      units: (state,) what an error is measured in: the same for all cells of a task.
+    """
+    errors = [learner.field_errors(batch) for batch in _hold_out_batches(learner, data, size)]
+    if not errors:
+        return None
+    scale = (data.normalization.std / units).to(data.device)
+    each = (torch.cat(errors) * scale).mean(dim=0)
+    return {name: float(each[part].mean()) for name, part in task.state_slices.items()}
+
+
+@functools.lru_cache(maxsize=8)
+def state_units(setup: Setup, task: str) -> torch.Tensor:
+    """(state,) standard deviations of a task's states over all levels of the release, floored at 1e-3.
+
+    One normalization for all levels, so that errors of agents that learned from different levels compare. A level
+    counts by up to 100 episodes of its first setting, as the settings of a level often share their trajectories.
+    """
+    first: dict[str, Subset] = {}
+    for subset in data_of_run(setup).subsets.values():
+        if subset.task == task:
+            first.setdefault(subset.level, subset)
+    parts = []
+    for subset in first.values():
+        few, lengths = subset.episodes[:UNIT_EPISODES], subset.lengths[:UNIT_EPISODES]
+        states = subset.read("state", few)
+        parts += [values[: length + 1] for values, length in zip(states, lengths, strict=True)]
+    return Normalization.of(torch.from_numpy(np.concatenate(parts)).float()).std
 
 
 def _to_pictures(values: torch.Tensor) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
 from dmcvb_gen.names import ANT_MAZE, DISTRACTOR_KINDS, FIXED, VISIBLE, family_of, pluralize, task_folder
-from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_returns, paper_task
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
@@ -226,6 +227,7 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         failed=[(entry["cell"], entry["error"]) for entry in facts["failed"]],
         returns=_returns(facts["returns"]),
         scores=[_scores(name, facts) for name in dict.fromkeys(r["cell"]["benchmark"] for r in facts["results"])],
+        groups=_groups(facts["results"]),
         notes=_notes(facts["results"]),
         answers=_answers(facts["results"]),
         missing=_missing(facts["missing"]),
@@ -322,6 +324,29 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _groups(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Means that the paper gives: of mazes by their group of layouts (B1), of goal pairs by their maze (B3)."""
+    groups: dict[tuple, list[Mapping[str, Any]]] = {}
+    for result in results:
+        cell = result["cell"]
+        group, layouts = paper_task(cell["task"]), cell["policy_label"]
+        if group not in MAZE_GROUPS.values() or not result["profile"]["scores"]:
+            continue
+        if cell["benchmark"] == "b3":
+            group, layouts = task_folder(cell["task"]), layouts.partition(" goal ")[0]
+        encoder = f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else ""
+        key = (cell["benchmark"], group, layouts, cell["setting"], cell["agent_name"] + encoder)
+        groups.setdefault(key, []).append(result)
+    rows = []
+    for key, members in groups.items():
+        scores = [member["score"] for member in members]
+        mean = sum(score["mean"] for score in scores) / len(scores)
+        error = math.sqrt(sum(score["stderr"] ** 2 for score in scores)) / len(scores)
+        success = sum(score["success"] for score in scores) / len(scores)
+        rows.append((*key, str(len(scores)), f"{_number(mean)} ± {_number(error)}", f"{100 * success:.0f} %"))
+    return rows
+
+
 def _number(value: float) -> str:
     """A return: one decimal where that is worth something."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
@@ -338,9 +363,11 @@ def _score(result: Mapping[str, Any]) -> dict[str, Any]:
         lines.insert(0, f"{_number(abs(result['difference']))} {side} {result['reference']}")
     if result["cell"]["pretrain_label"]:
         lines.append(f"encoder: {result['cell']['pretrain_label']}")
-    if paper:
+    if paper and result["profile"]["scores"]:
         share = f", {100 * result['paper_share']:.0f} %" if result["paper_share"] is not None else ""
         paper = {"mean": f"{paper['mean']:.0f}", "stderr": f"{paper['stderr']:.0f}", "share": share}
+    else:
+        paper = None  # noise is never set beside the paper's numbers
     return {"mean": _number(score["mean"]), "stderr": _number(score["stderr"]), "lines": lines, "paper": paper}
 
 
@@ -358,7 +385,9 @@ def _data_lines(data: Mapping[str, Any]) -> list[str]:
 
 def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
     """What must be known to read the scores."""
-    notes = ["A score is the best of a training's online evaluations, mean and standard error over its episodes."]
+    most = max((result["evaluations"] for result in results), default=1)
+    kind = "of the trained policy" if most == 1 else f"the best of {most} over a training, as in the paper"
+    notes = [f"A score is an online evaluation {kind}: mean and standard error over its episodes."]
     for evaluated, data in sorted({(r["score"]["limit"], r["data"]["limit"]) for r in results}):
         if evaluated == data:
             notes.append(f"Evaluations are cut at {evaluated:,} agent steps, as the data are.")
@@ -394,6 +423,7 @@ def _inspection(good: Results, profile: str) -> list[tuple]:
                 "-" if result["inspection"][key] is None else f"{result['inspection'][key]:.4f}"
                 for key in ("observation_mse", "state_mse")
             ),
+            ", ".join(f"{field} {error:.3f}" for field, error in (result["inspection"]["state_l1"] or {}).items()),
             profile,
         )
         for cell, result in good

@@ -148,6 +148,11 @@ def planned_steps(profile: Profile, cells: Sequence[Cell]) -> int:
     return policies + decoders + len(encoders) * profile.pretrain_steps
 
 
+def default_workers(device: str) -> int:
+    """Cells side by side: two of one thread each are faster than one of two. An accelerator is not shared."""
+    return min(2, os.cpu_count() or 1) if device == "cpu" else 1
+
+
 def default_threads(workers: int) -> int:
     """Threads of each of `workers` processes."""
     return max(1, (os.cpu_count() or 1) // workers)

@@ -30,7 +30,7 @@ from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, PaintedSubset, Painting, painted_release
 from dmcvb_gen.names import ANT_MAZE, family_of
 
-RESULT_VERSION = 2
+RESULT_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Setup:
       root: the release's folder. out: the report's folder.
       device: "cpu" or "cuda". threads: of torch and physics in one process.
       compile: torch.compile the losses.
+      precision: "float32" or "bfloat16", of losses on pictures.
       memory: bytes of pictures held at most, over all workers (on a cluster: by each cell); None: half of what is free
         (on a cluster: of a cell's share of its node).
       run: of one run's cells, so that a process opens the release for the first of them; "": for each.
@@ -53,6 +54,7 @@ class Setup:
     device: str = "cpu"
     threads: int = 1
     compile: bool = False
+    precision: str = "float32"
     dino_weights: str | None = None
     backgrounds: str | None = None
     memory: int | None = None

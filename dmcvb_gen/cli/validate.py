@@ -31,7 +31,7 @@ TRAINING = (
 @click.option("--checks-only", is_flag=True, help="Structure checks and report, no training.")
 @click.option("--strict", is_flag=True, help="Exit with 1 on warnings too (data unlike the paper's).")
 @click.option("--train-unsound", is_flag=True, help="Run the benchmarks even where a structure check fails.")
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Cells side by side.")
+@click.option("--workers", type=click.IntRange(1), help="Cells side by side.  [default: 2, on one core 1]")
 @executor_option
 @ray_option
 @click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
@@ -54,7 +54,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
     dmcvb-gen validate releases/mini --profile quick --benchmark b1 --agents bc,state-bc,id+bc --out reports/mini
     """
     from dmcvb_gen.benchmarks.profiles import get_profile
-    from dmcvb_gen.benchmarks.run import default_threads
+    from dmcvb_gen.benchmarks.run import default_threads, default_workers
     from dmcvb_gen.benchmarks.setup import Setup
     from dmcvb_gen.benchmarks.validate import Progress
     from dmcvb_gen.benchmarks.validate import validate as run
@@ -67,7 +67,8 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
 
         if not torch.cuda.is_available():
             raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
-    workers, memory, weights = options.pop("workers"), options.pop("memory"), options.pop("dino_weights")
+    workers = options.pop("workers") or default_workers(options["device"])
+    memory, weights = options.pop("memory"), options.pop("dino_weights")
     executor = make_executor(workers, options.pop("executor"), options.pop("ray_address"))
     threads = default_threads(workers) if isinstance(executor, int) else 1  # of a task on a cluster
     train_unsound = options.pop("train_unsound")
@@ -110,7 +111,8 @@ def _show_score(cell, facts, profile) -> None:
     if "error" in facts:
         return  # told at the end, where it is not overlooked
     score, paper = facts["score"], facts["paper"]
-    beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if paper else ""
+    shown = paper and profile.scores  # noise is never set beside the paper's numbers
+    beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if shown else ""
     where = f"{task_folder(cell.task)} {cell.policy_label}/{cell.setting}"
     goal = "" if score["success"] is None else f", success {100 * score['success']:.0f} %"
     goal += "" if score["speed"] is None else f" at {score['speed']:.2f} m/s"

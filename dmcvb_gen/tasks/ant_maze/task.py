@@ -30,7 +30,7 @@ from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, m
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
 
-EPISODE_STEPS, EVALUATION_STEPS = 600, 1200
+EPISODE_STEPS, EVALUATION_STEPS = 600, 1000
 """Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
 SPAWN_NOISE, GOAL_NOISE = 0.25, 0.5
 """Meters that the spawn lies off its place at most, along x, y and z, and the goal off its cell's center in x and y."""
