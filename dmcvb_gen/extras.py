@@ -16,6 +16,7 @@ EXTRAS = {
     "minari": ("minari",),
     "lerobot": ("pyarrow",),
     "ray": ("ray",),
+    "rerun": ("rerun",),
 }
 """Extra -> the modules that it brings."""
 SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safetensors", "PIL", "gymnasium")
@@ -25,6 +26,7 @@ _PACKAGES = {
     "sb3_contrib": "sb3-contrib",
     "mujoco_warp": "mujoco-warp",
     "warp": "warp-lang",
+    "rerun": "rerun-sdk",
     "skfmm": "scikit-fmm",
     "dm_control": "dm-control",
     "PIL": "pillow",

@@ -544,7 +544,7 @@ def warm() -> None:
         importlib.import_module(f"dmcvb_gen.cli.{module}")
     for name in ("release.publish", "generate.repaint", "release.verify", "generate.regenerate", "release.export"):
         importlib.import_module(f"dmcvb_gen.{name}")
-    for name in ("export.vd4rl", "export.replay_buffer"):
+    for name in ("export.formats.vd4rl", "export.formats.replay_buffer"):
         importlib.import_module(f"dmcvb_gen.release.{name}")
     importlib.import_module("s3fs")
     for kind in KINDS.values():

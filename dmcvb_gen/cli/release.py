@@ -317,7 +317,7 @@ def card(context, path, check, out, url, as_json):
 
 @click.command()
 @click.argument("path", metavar="RELEASE|URL")
-@click.option("--to", required=True, help="hdf5, npz, replay-buffer, minari, lerobot or rlds.")
+@click.option("--to", required=True, help="Format, for example hdf5, minari, lerobot, rlds or rerun.")
 @only_option
 @click.option("--episodes", metavar="A:B", callback=parse_episodes, help="Only the episodes A to B - 1.")
 @click.option("--merge", is_flag=True, help="lerobot: all subsets as the tasks of one data set.")

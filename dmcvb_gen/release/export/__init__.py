@@ -3,93 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.manifest import Manifest
-from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
 from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
 from dmcvb_gen.names import select
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
+from dmcvb_gen.release.export.registry import all_formats, get_format
 from dmcvb_gen.storage.remote import local_path, storage_errors
-
-
-@dataclass(frozen=True)
-class Format:
-    """One export format.
-
-    Attributes:
-      module: where its `write(source, folder)` lives.
-      reader: the program that it is for. mark: pattern of a file that only this format has.
-      keeps, drops: what of a subset is in it and what is not, in words.
-      packages: what it needs beyond dmcvb-gen's own dependencies.
-      options: those of `export` that are for it.
-    """
-
-    module: str
-    reader: str
-    keeps: str
-    drops: str
-    mark: str
-    packages: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
-
-
-FORMATS = {
-    "hdf5": Format(
-        "vd4rl:write_hdf5",
-        "V-D4RL's DrQ+BC loader (`observation`, `action`, `reward`, `discount`, `step_type`)",
-        "pixels (channels first), states, actions, rewards, discounts",
-        "physics, labels, seeds",
-        "data_*.hdf5",
-        ("h5py",),
-    ),
-    "npz": Format(
-        "vd4rl:write_npz",
-        "V-D4RL's DreamerV2 loader (`image`, `action`, `reward`, `discount`, `is_first`, `is_last`, `is_terminal`)",
-        "pixels, states, actions, rewards, discounts",
-        "physics, labels, seeds",
-        "[0-9]*-[0-9]*.npz",
-    ),
-    "replay-buffer": Format(
-        "replay_buffer:write",
-        "diffusion policy's `ReplayBuffer` (Zarr 2: `data/img`, `data/state`, `data/action`, `meta/episode_ends`)",
-        "pixels, states, actions, rewards",
-        "the last observation of each episode, discounts, physics, labels",
-        "replay_buffer.zarr/.zgroup",
-    ),
-    "minari": Format(
-        "minari_format:write",
-        "minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless pictures)",
-        "pixels, states, actions, rewards, ends, seeds, the Gymnasium environment",
-        "physics, labels",
-        "data/main_data.hdf5",
-        ("minari", "h5py"),
-    ),
-    "lerobot": Format(
-        "lerobot:write",
-        "LeRobot v3 (Parquet with PNG pictures, or mp4), `datasets.load_dataset`",
-        "pixels, states, actions, rewards, ends",
-        "the last observation of each episode, physics, labels",
-        "meta/info.json",
-        ("pyarrow",),
-        ("merge", "video"),
-    ),
-    "rlds": Format(
-        "rlds:write",
-        "TensorFlow Datasets (`tfds.builder_from_directory`): RLDS steps, PNG, state fields also under DMC-VB's names",
-        "pixels, states, actions, rewards, discounts, ends",
-        "physics, labels",
-        "dataset_info.json",
-    ),
-}
-"""Name -> format."""
-
 
 STAMP = ".dmcvb-gen.json"
 """File in each export: what it was made from, so that the same command goes on where it was stopped."""
@@ -137,8 +64,8 @@ def export(
 
     Args:
       path: a release, here or at a URL.
-      to: a name out of `FORMATS`.
-      out: folder of the exports; each subset gets `<out>/<task>/<level>/<setting>` (minari: see its `folder_name`).
+      to: name of a format, see `all_formats`.
+      out: folder of the exports; each subset gets `<out>/<task>/<level>/<setting>` (minari has its own tree).
       only: subset patterns; episodes: (first, last + 1); all by default.
       merge: lerobot: all subsets as the tasks of one data set, `out` itself.
       video: lerobot: pictures as mp4 (smaller, with losses) and not as PNG.
@@ -153,18 +80,16 @@ def export(
       this format. StoreError: a subset is not whole (or lacks some of `episodes`), it is damaged, there is something
       else at `out` already, or it cannot be written.
     """
-    if to not in FORMATS:
-        raise UnknownNameError("format", to, FORMATS)
-    out = local_path(out)
+    kind, out = get_format(to), Path(local_path(out)).absolute()
     options = {name: True for name, given in (("video", video),) if given}
     for name in (*options, *["merge"] * merge):
-        if name not in FORMATS[to].options:
+        if name not in kind.options:
             raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
-    _writer(to)  # its package is missed now, and not in a worker
+    kind.check_installed()  # here, and not first in a worker
     release = open_for_reading(path, storage_options)
     names = select([record.name for record in release.manifest.subsets], list(only))
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
-    folders = [Path(out).absolute()] if merge else [Path(out).absolute() / _folder_name(to)(release, n) for n in names]
+    folders = [out] if merge else [out / kind.folder_name(release, name) for name in names]
     works = [
         _Work(str(path), storage_options, to, options, part, folder, _stamp(release.manifest, to, options, part))
         for part, folder in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
@@ -187,25 +112,7 @@ def _stamp(manifest: Manifest, to: str, options: dict, subsets: Sequence[tuple[s
 
 
 def _formats_with(option: str) -> list[str]:
-    return [name for name, kind in FORMATS.items() if option in kind.options]
-
-
-def _module(to: str):
-    return importlib.import_module(f"{__name__}.{FORMATS[to].module.split(':')[0]}")
-
-
-def _writer(to: str) -> Callable:
-    try:
-        for package in FORMATS[to].packages:
-            importlib.import_module(package)
-        return getattr(_module(to), FORMATS[to].module.split(":")[1])
-    except ImportError as error:
-        cure = f"pip install {' '.join(FORMATS[to].packages)}"
-        raise DmcvbError(f"export to {to} needs a package that is not installed ({error.name}): {cure}") from None
-
-
-def _folder_name(to: str) -> Callable[[ReleaseReader, str], str]:
-    return getattr(_module(to), "folder_name", lambda release, name: name)
+    return [name for name, kind in all_formats().items() if option in kind.options]
 
 
 def _episodes(release: ReleaseReader, name: str, asked: tuple[int, int] | None) -> tuple[int, ...]:
@@ -229,23 +136,14 @@ def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
     """Write one folder, whole or not at all."""
     release = open_for_reading(work.path, work.storage_options)
     sources = [Source(release, release[name], list(episodes), tick) for name, episodes in work.subsets]
-    write, parent = _writer(work.to), work.folder.parent
+    kind, parent = get_format(work.to), work.folder.parent
     with storage_errors(work.folder, "write to"):
         parent.mkdir(parents=True, exist_ok=True)
         remove_partial(parent, below=False)
         with folder_in_the_making(parent, work.folder.name) as made:
             inside = made / work.folder.name
             inside.mkdir()
-            write(sources if "merge" in FORMATS[work.to].options else sources[0], inside, **work.options)
+            kind.write(sources if "merge" in kind.options else sources[0], inside, **work.options)
             write_json(inside / STAMP, work.stamp)
             if not work.done:  # somebody else may have been faster
                 inside.rename(work.folder)
-
-
-def format_table() -> str:
-    """The formats as a Markdown table: which program reads them, what they keep and what they leave out."""
-    lines = ["| `--to` | read by | keeps | leaves out | needs |", "|---|---|---|---|---|"]
-    for name, kind in FORMATS.items():
-        needs = f"`pip install {' '.join(kind.packages)}`" if kind.packages else ""
-        lines.append(f"| `{name}` | {kind.reader} | {kind.keeps} | {kind.drops} | {needs} |")
-    return "\n".join(lines)

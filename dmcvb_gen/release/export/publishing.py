@@ -11,7 +11,7 @@ from dmcvb_gen.dataset.manifest import FileRecord
 from dmcvb_gen.dataset.transfer import in_parallel, upload
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
-from dmcvb_gen.release.export import FORMATS
+from dmcvb_gen.release.export.registry import all_formats
 from dmcvb_gen.release.hub import client_errors, new_api, newest_of
 from dmcvb_gen.release.publish import Moved
 from dmcvb_gen.storage.remote import file_system, public
@@ -20,8 +20,8 @@ LEROBOT_INFO = "meta/info.json"
 
 
 def export_format(folder: str | Path) -> str | None:
-    """The format of the exports in a folder, by the files that each is known by; None where there is no export."""
-    for name, kind in FORMATS.items():
+    """The format of the exports in a folder, by the file that only that format has; None if there is no export."""
+    for name, kind in all_formats().items():
         if any(True for _ in Path(folder).rglob(kind.mark)):
             return name
     return None

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+from dmcvb_gen.release.export.registry import register_exporter
 
 FIRST, MID, LAST = 0, 1, 2
 """dm_env's step types."""
@@ -23,6 +24,14 @@ def _step_types(rows: int) -> np.ndarray:
     return types
 
 
+@register_exporter(
+    "hdf5",
+    reader="V-D4RL's DrQ+BC loader (`observation`, `action`, `reward`, `discount`, `step_type`)",
+    keeps="pixels (channels first), states, actions, rewards, discounts",
+    drops="physics, labels, seeds",
+    mark="data_*.hdf5",
+    modules=("h5py",),
+)
 def write_hdf5(source: Source, folder: Path) -> None:
     """Write `data_000.hdf5`, ...: `observation` (row, 3 * view, height, width) uint8, `action`, `reward`, `discount`,
     `state` float32 and `step_type`, episodes one after the other."""
@@ -59,6 +68,15 @@ def _append(file, name: str, value: np.ndarray) -> None:
     file[name][before:] = value
 
 
+@register_exporter(
+    "npz",
+    reader=(
+        "V-D4RL's DreamerV2 loader (`image`, `action`, `reward`, `discount`, `is_first`, `is_last`, `is_terminal`)"
+    ),
+    keeps="pixels, states, actions, rewards, discounts",
+    drops="physics, labels, seeds",
+    mark="[0-9]*-[0-9]*.npz",
+)
 def write_npz(source: Source, folder: Path) -> None:
     """Write `<episode>-<rows>.npz`: `image` (row, height, width, 3 * view) uint8, `action`, `reward`, `discount`,
     `state` float32, `is_first`, `is_last`, `is_terminal` bool."""

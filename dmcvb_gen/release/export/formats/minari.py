@@ -6,23 +6,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import gymnasium
-import minari
 import numpy as np
-from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
-from minari.data_collector import EpisodeBuffer
-from minari.dataset.minari_storage import MinariStorage
 
 from dmcvb_gen import files
-from dmcvb_gen.generate.jobs import BUILTIN
 from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.loaders.release import ReleaseReader
 from dmcvb_gen.names import ANT_MAZE, FIXED, HIDDEN, VISIBLE, DistractorSetting, hides_goal
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
-from dmcvb_gen.release.export.references import reference_returns
+from dmcvb_gen.release.export.registry import register_exporter
 from dmcvb_gen.version import __version__
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+    from minari.data_collector import EpisodeBuffer
 
 
 def folder_name(release: ReleaseReader, subset: str) -> str:
@@ -31,11 +29,26 @@ def folder_name(release: ReleaseReader, subset: str) -> str:
     return f"{NAMESPACE}/{task}/{level}-{setting}-v0"
 
 
+@register_exporter(
+    "minari",
+    reader="minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless pictures)",
+    keeps="pixels, states, actions, rewards, ends, seeds, the Gymnasium environment",
+    drops="physics, labels",
+    mark="data/main_data.hdf5",
+    modules=("minari", "h5py"),
+    folder_name=folder_name,
+)
 def write(source: Source, folder: Path) -> None:
     """Write `<folder>/data`, and what minari keeps of the namespaces above it.
 
     An observation is {"pixels": (size, size, 3 * view) uint8, "state"}, as the environment's.
     """
+    import minari
+    from gymnasium import spaces
+    from minari.dataset.minari_storage import MinariStorage
+
+    from dmcvb_gen.release.export.references import reference_returns
+
     subset, size = source.subset, source.subset.record.size
     name = folder_name(source.release, subset.name)
     picture = spaces.Box(0, 255, (size, size, 3 * len(source.views)), np.uint8)
@@ -74,6 +87,9 @@ def _environment(source: Source, split: str) -> EnvSpec:
 
     Episodes are cut where the data's are, and so compare with the reference scores.
     """
+    import gymnasium
+    from gymnasium.envs.registration import EnvSpec
+
     record = source.subset.record
     maze = record.family == ANT_MAZE
     setting = record.setting if maze else DistractorSetting.parse(record.setting).kind
@@ -107,6 +123,8 @@ def _environment(source: Source, split: str) -> EnvSpec:
 
 def _about_videos(source: Source) -> str:
     """What is said of videos that the package does not bring: where they lie now is nothing to publish."""
+    from dmcvb_gen.generate.jobs import BUILTIN
+
     videos = (source.subset.record.backgrounds or {}).get("source", BUILTIN)
     if videos == BUILTIN:
         return ""
@@ -114,6 +132,8 @@ def _about_videos(source: Source) -> str:
 
 
 def _buffer(number: int, episode: ExportEpisode) -> EpisodeBuffer:
+    from minari.data_collector import EpisodeBuffer
+
     last = np.zeros(episode.length, bool)
     last[-1] = True
     return EpisodeBuffer(

@@ -10,13 +10,22 @@ import numpy as np
 
 from dmcvb_gen.release.dmcvb_names import picture_feature, state_feature
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
+from dmcvb_gen.release.export.registry import register_exporter
 from dmcvb_gen.release.tfrecord import encode_example, record
-from dmcvb_gen.tasks import get_task
 
 EPISODES_PER_FILE = 50
 _FEATURES = "tensorflow_datasets.core.features"
 
 
+@register_exporter(
+    "rlds",
+    reader=(
+        "TensorFlow Datasets (`tfds.builder_from_directory`): RLDS steps, PNG, state fields also under DMC-VB's names"
+    ),
+    keeps="pixels, states, actions, rewards, discounts, ends",
+    drops="physics, labels",
+    mark="dataset_info.json",
+)
 def write(source: Source, folder: Path) -> None:
     """Write `<version>/`: `dataset_info.json`, `features.json` and the TFRecord shards of a split "train".
 
@@ -42,7 +51,7 @@ def write(source: Source, folder: Path) -> None:
         "version": version,
         "description": source.description,
         "fileFormat": "tfrecord",
-        "moduleName": "dmcvb_gen.release.export.rlds",
+        "moduleName": __name__,
         "releaseNotes": {},
         "splits": [
             {
@@ -77,6 +86,8 @@ def _tensor(dtype: str, *shape: int) -> dict[str, Any]:
 
 
 def _features(source: Source) -> dict[str, Any]:
+    from dmcvb_gen.tasks import get_task
+
     subset = source.subset
     size = str(subset.record.size)
     picture = {
@@ -109,6 +120,8 @@ def _picture_name(source: Source, view: str) -> str:
 
 
 def _example(source: Source, episode: ExportEpisode) -> dict[str, np.ndarray | list[bytes]]:
+    from dmcvb_gen.tasks import get_task
+
     task = source.subset.task
     rows = episode.length + 1
     step = np.arange(rows)

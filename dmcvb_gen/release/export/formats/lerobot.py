@@ -8,15 +8,16 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.release.export.registry import register_exporter
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 VERSION = "v3.0"
 CHUNK_FILES, DATA_MB, VIDEO_MB = 1000, 100, 500
@@ -30,6 +31,15 @@ CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
 """Of videos: nearly without loss (crf), and a key frame every second frame, so that any frame is decoded quickly."""
 
 
+@register_exporter(
+    "lerobot",
+    reader="LeRobot v3 (Parquet with PNG pictures, or mp4), `datasets.load_dataset`",
+    keeps="pixels, states, actions, rewards, ends",
+    drops="the last observation of each episode, physics, labels",
+    mark="meta/info.json",
+    modules=("pyarrow",),
+    options=("merge", "video"),
+)
 def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
 
@@ -58,6 +68,9 @@ def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
 
 
 def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, statistics: _Statistics) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     (folder / EPISODES_PATH).parent.mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(rows), folder / EPISODES_PATH)
     tasks = {"task_index": pa.array(range(len(layout.tasks)), pa.int64()), "__index_level_0__": layout.tasks}
@@ -135,6 +148,8 @@ class _Layout:
         self.features = self._features(first)
 
     def _features(self, source: Source) -> dict[str, Any]:
+        from dmcvb_gen.tasks import get_task
+
         task = get_task(source.subset.task)
         scalar: dict[str, Any] = {"shape": [1], "names": None}
         picture: dict[str, Any] = {
@@ -184,6 +199,8 @@ class _Layout:
 
     def schema(self) -> pa.Schema:
         """Of the data tables, with what Hugging Face's `datasets` wants to know."""
+        import pyarrow as pa
+
         fields: list[pa.Field] = []
         huggingface: dict[str, Any] = {}
         told: dict[str, Any]
@@ -238,6 +255,8 @@ class _Files:
         return place
 
     def _rows(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> pa.Table:
+        import pyarrow as pa
+
         arrays = []
         for field in self._schema:
             if field.name in pictures:
@@ -251,6 +270,8 @@ class _Files:
         return pa.table(arrays, schema=self._schema)
 
     def _open(self, chunk: int, file: int) -> None:
+        import pyarrow.parquet as pq
+
         path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._table, self._frames = pq.ParquetWriter(path, self._schema), 0

@@ -1,0 +1,1 @@
+"""Export formats, one file each: every module here registers its writer with `register_exporter`."""

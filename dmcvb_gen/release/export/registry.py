@@ -1,0 +1,130 @@
+"""The table of export formats: each writer registers itself, here or from another package.
+
+A format of your own is a function with a decorator, and a line in your package's pyproject.toml::
+
+    @register_exporter("returns", reader="anybody", keeps="returns", drops="all else", mark="returns.txt")
+    def write(source: Source, folder: Path) -> None:
+        returns = [str(episode.reward.sum()) for episode in source]
+        (folder / "returns.txt").write_text("\\n".join(returns))
+
+    [project.entry-points."dmcvb_gen.exporters"]
+    returns = "my_package.my_module"
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import logging
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.extras import cure
+from dmcvb_gen.loaders.release import ReleaseReader
+
+GROUP = "dmcvb_gen.exporters"
+"""Entry points of other packages: modules that register a format when they are imported."""
+_log = logging.getLogger(__name__)
+
+
+def subset_folder(release: ReleaseReader, subset: str) -> str:
+    """Default folder of a subset's export below `--out`: its name."""
+    return subset
+
+
+@dataclass(frozen=True)
+class Format:
+    """One export format.
+
+    Attributes:
+      name: what `--to` takes.
+      write: writes a subset (`Source`) to an empty folder; with the option "merge", a list of subsets.
+      reader: the program that reads it.
+      keeps, drops: which parts of a subset it contains and which it leaves out, in words.
+      mark: pattern of a file that only this format has.
+      modules: modules that it imports beyond dmcvb-gen's own dependencies.
+      options: the options of `export` that it takes.
+      folder_name: (release, subset) -> folder below `--out`.
+    """
+
+    name: str
+    write: Callable
+    reader: str
+    keeps: str
+    drops: str
+    mark: str
+    modules: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    folder_name: Callable[[ReleaseReader, str], str] = subset_folder
+
+    def check_installed(self) -> None:
+        """Raises DmcvbError if a package that the format needs is not installed."""
+        for module in self.modules:
+            try:
+                importlib.import_module(module)
+            except ImportError as error:
+                name = error.name or module
+                raise DmcvbError(f"export to {self.name}: {cure(name) or f'pip install {name}'}") from None
+
+
+_formats: dict[str, Format] = {}
+
+
+def register_exporter(name: str, **facts) -> Callable[[Callable], Callable]:
+    """Decorator that registers a function as the writer of a format; `facts` are the attributes of `Format`.
+
+    Raises:
+      DmcvbError: another function has that name already.
+    """
+
+    def register(write: Callable) -> Callable:
+        known = _formats.get(name)
+        if known and known.write is not write:
+            raise DmcvbError(f"two exporters are called {name}: {known.write.__module__} and {write.__module__}")
+        _formats[name] = Format(name, write, **facts)
+        return write
+
+    return register
+
+
+@functools.cache
+def _load() -> None:
+    """Import every module that registers a format."""
+    from dmcvb_gen.release.export import formats
+
+    for module in pkgutil.iter_modules(formats.__path__):
+        importlib.import_module(f"{formats.__name__}.{module.name}")
+    for entry in entry_points(group=GROUP):
+        try:
+            entry.load()
+        except Exception as error:  # a broken package of somebody else must not stop an export to HDF5
+            _log.warning("exporter %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
+
+
+def all_formats() -> Mapping[str, Format]:
+    """Name -> format, of this package and of all installed ones."""
+    _load()
+    return _formats
+
+
+def get_format(name: str) -> Format:
+    """The format of a name.
+
+    Raises:
+      UnknownNameError: there is none; the message lists those that there are.
+    """
+    if name not in all_formats():
+        raise UnknownNameError("format", name, all_formats())
+    return _formats[name]
+
+
+def format_table() -> str:
+    """The formats as a Markdown table: which program reads them, what they keep and what they leave out."""
+    lines = ["| `--to` | read by | keeps | leaves out | needs |", "|---|---|---|---|---|"]
+    for name, kind in all_formats().items():
+        needs = ", ".join(f"`{module}`" for module in kind.modules)
+        lines.append(f"| `{name}` | {kind.reader} | {kind.keeps} | {kind.drops} | {needs} |")
+    return "\n".join(lines)

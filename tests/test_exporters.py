@@ -1,0 +1,194 @@
+"""What every export format must do, for a locomotion task and a maze; formats of other packages are found."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import json
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+from PIL import Image
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.release.export import STAMP, export, registry
+from dmcvb_gen.release.export.publishing import export_format
+from dmcvb_gen.release.export.registry import all_formats, format_table, get_format, register_exporter
+from dmcvb_gen.release.tfrecord import offsets, read_example
+
+SUBSETS = {"small_release": "walker-walk/random/static", "small_mazes": "ant-maze-tiny/random/hidden"}
+
+
+def decoded(pictures):
+    return np.stack([np.asarray(Image.open(io.BytesIO(picture))) for picture in pictures])
+
+
+# -- readers: what the program that a format is for finds of episode 0: actions, rewards, images of the first view --
+
+
+def read_hdf5(folder):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(folder / "data_000.hdf5") as file:
+        images = file["observation"][:].transpose(0, 2, 3, 1)
+        return file["action"][1:], file["reward"][1:], images[..., :3]
+
+
+def read_npz(folder):
+    [path] = folder.glob("*.npz")
+    with np.load(path) as data:
+        return data["action"][1:], data["reward"][1:], data["image"][..., :3]
+
+
+def read_replay_buffer(folder):
+    data = zarr.open_group(str(folder / "replay_buffer.zarr"), mode="r")["data"]
+    images = data["img"] if "img" in data else data["img_top"]
+    return data["action"][:], data["reward"][:], images[:]
+
+
+def read_minari(folder):
+    minari = pytest.importorskip("minari")
+    [episode] = minari.MinariDataset(folder / "data").iterate_episodes()
+    return episode.actions, episode.rewards, episode.observations["pixels"][..., :3]
+
+
+def read_lerobot(folder):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet").to_pydict()
+    key = "observation.image" if "observation.image" in rows else "observation.images.top"
+    return rows["action"], rows["next.reward"], decoded(picture["bytes"] for picture in rows[key])
+
+
+def read_rlds(folder):
+    [path] = folder.rglob("*.tfrecord-*")
+    [place] = offsets(path)
+    example = read_example(path, *place)
+    rows = len(example["steps/reward"])
+    key = next(key for key in example if key.endswith("/pixels") or "top_camera" in key)
+    actions = np.reshape(example["steps/action"], (rows, -1))[:-1]
+    return actions, example["steps/reward"][:-1], decoded(example[key])
+
+
+def read_rerun(folder):
+    chunk = pytest.importorskip("rerun.chunk")
+    found = {}
+    for part in chunk.RrdReader(folder / "episode_000000.rrd").stream().to_chunks():
+        batch = part.to_record_batch()
+        for name in ("Scalars:scalars", "EncodedImage:blob"):
+            if name in batch.schema.names:
+                order = np.argsort(batch.column("step").to_pylist())
+                rows = batch.column(name).to_pylist()
+                found.setdefault(part.entity_path.lstrip("/"), []).extend(rows[i] for i in order)
+    images = found["image"] if "image" in found else found["image/top"]
+    return found["action"], np.ravel(found["reward"]), decoded(bytes(blob[0]) for blob in images)
+
+
+READERS = {
+    "hdf5": read_hdf5,
+    "npz": read_npz,
+    "replay-buffer": read_replay_buffer,
+    "minari": read_minari,
+    "lerobot": read_lerobot,
+    "rlds": read_rlds,
+    "rerun": read_rerun,
+}
+
+
+@pytest.mark.parametrize("release", SUBSETS)
+@pytest.mark.parametrize("to", READERS)
+class ExporterTests:
+    """The contract: a format's file says which it is, holds the values, is not written twice, and names no folder."""
+
+    @pytest.fixture
+    def source(self, release, to, request):
+        for module in get_format(to).modules:
+            pytest.importorskip(module)
+        return request.getfixturevalue(release)
+
+    def test_a_reader_finds_the_stored_values(self, source, release, to, tmp_path):
+        name = SUBSETS[release]
+        [folder] = export(str(source), to, tmp_path, [name], (0, 1))
+        assert export_format(folder) == to
+        subset = dmcvb_gen.open(str(source))[name]
+        array = shown(subset).arrays[0]
+        stored = subset.episode(0, ["action", "reward", array])
+        actions, rewards, images = READERS[to](folder)
+        np.testing.assert_array_equal(np.asarray(actions, np.float32), stored["action"])
+        np.testing.assert_array_equal(np.asarray(rewards, np.float32), stored["reward"])
+        np.testing.assert_array_equal(images, stored[array][: len(images)])
+        assert len(images) >= len(stored["reward"])
+
+    def test_the_same_command_again_writes_nothing(self, source, release, to, tmp_path):
+        again = [export(str(source), to, tmp_path, [SUBSETS[release]], (0, 1)) for _ in range(2)]
+        assert again[0] == again[1]
+        with pytest.raises(DmcvbError, match="is there already"):
+            export(str(source), to, tmp_path, [SUBSETS[release]], (1, 2))
+
+    def test_no_file_names_a_folder_of_this_machine(self, source, release, to, tmp_path):
+        [folder] = export(str(source), to, tmp_path / "out", [SUBSETS[release]], (0, 1))
+        for path in folder.rglob("*"):
+            if path.is_file():
+                content = path.read_bytes()
+                for place in (tmp_path, source, source.parent):
+                    assert str(place).encode() not in content, path
+        assert json.loads((folder / STAMP).read_text())["format"] == to
+
+
+class TestExporters(ExporterTests):
+    """The formats of this package."""
+
+
+def test_every_format_of_this_package_has_a_reader_and_a_line_in_the_table():
+    here = [name for name, kind in all_formats().items() if kind.write.__module__.startswith("dmcvb_gen.")]
+    assert sorted(here) == sorted(READERS)
+    assert all(f"| `{name}` |" in format_table() for name in READERS)
+
+
+def test_a_format_of_another_package_is_found_by_its_entry_point(small_release, maze_release, tmp_path, monkeypatch):
+    module = types.ModuleType("their_exporter")
+    monkeypatch.setitem(sys.modules, "their_exporter", module)
+
+    def register():
+        @register_exporter("returns", reader="anybody", keeps="returns", drops="all else", mark="returns.txt")
+        def write(source, folder):
+            returns = [str(float(episode.reward.astype(np.float64).sum())) for episode in source]
+            (folder / "returns.txt").write_text("\n".join(returns))
+
+    class Entry(importlib.metadata.EntryPoint):
+        def load(self):
+            if self.name == "broken":
+                raise ImportError("something is missing")
+            register()
+
+    entries = [Entry(name, "their_exporter", registry.GROUP) for name in ("broken", "returns")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    monkeypatch.setattr(registry, "_formats", dict(all_formats()))
+    registry._load.cache_clear()
+    for release in (small_release, maze_release):
+        command = ["export", str(release), "--to", "returns", "--out", str(tmp_path / release.parent.name)]
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 0, result.output
+        for subset in dmcvb_gen.open(str(release)).subsets.values():
+            text = (tmp_path / release.parent.name / subset.name / "returns.txt").read_text()
+            np.testing.assert_allclose([float(line) for line in text.split()], subset.returns, rtol=1e-6)
+    with pytest.raises(DmcvbError, match="two exporters are called npz"):
+        register_exporter("npz", reader="", keeps="", drops="", mark="")(lambda source, folder: None)
+
+
+def test_exporting_hdf5_needs_no_simulator(small_release, tmp_path):
+    pytest.importorskip("h5py")
+    code = (
+        "import sys;"
+        "sys.modules.update(dict.fromkeys(('mujoco', 'dm_control', 'numba', 'torch')));"
+        "from dmcvb_gen.release.export import export;"
+        f"print(export({str(small_release)!r}, 'hdf5', {str(tmp_path)!r}, ['*/none'], (0, 1)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and "walker-walk/random/none" in done.stdout, done.stderr[-1500:]
