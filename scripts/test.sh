@@ -1,17 +1,25 @@
 #!/usr/bin/env bash
-# Sets everything up on a fresh machine (Python 3.11, pip) and runs the checks: bash scripts/test.sh [pytest options]
+# Sets everything up on a fresh machine (Python 3.11, pip) and runs the checks.
+#   bash scripts/test.sh [pytest options]          the linters and the fast tests: under 5 minutes on two cores
+#   bash scripts/test.sh --all [pytest options]    every test, the slow ones too: under 15 minutes
+tier=(-m "not slow")
+if [ "${1:-}" = --all ]; then
+  tier=()
+  shift
+fi
 extras=test
 . "$(dirname "$0")/setup.sh"
 ruff check .
 ruff format --check .
 mypy
-# The tests write and remove very many small files: in memory, where there is plenty (8 GB), else on the disk.
+# The tests write and remove many small files: in memory if 8 GB are free there, else on the disk.
 if [ -z "${TMPDIR:-}" ] && [ "$(df --output=avail /dev/shm 2>/dev/null | tail -1)" -gt 8000000 ] 2>/dev/null; then
   TMPDIR="$(mktemp -d /dev/shm/dmcvb-XXXX)"
   export TMPDIR
   trap 'rm -rf "$TMPDIR"' EXIT
 fi
-# Two processes, a file of tests each at a time: more would want more memory than small machines have.
-# A thread each for numerics: more than there are cores only wait for each other.
+# Two processes, each with one file of tests at a time: more would need more memory than small machines have.
+# One thread each for numerics: more threads than cores only wait for each other.
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
-python -m pytest -n "$(python -c 'import os; print(min(2, os.cpu_count() or 1))')" --dist loadfile "$@"
+python -m pytest -n "$(python -c 'import os; print(min(2, os.cpu_count() or 1))')" --dist loadfile \
+  --cpu-limit 5 --cpu-times 25 "${tier[@]}" "$@"

@@ -17,6 +17,8 @@ from dmcvb_gen.generate.executors import run_jobs  # noqa: E402
 from dmcvb_gen.generate.plan import finish, make_plan, prepare  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
 
+pytest_plugins = ["tests.compiled_code", "tests.tiers"]
+
 
 def small_recipe(**changes):
     """Walker, random actions, three settings, 3 episodes in shards of 2, small pictures."""

@@ -1,0 +1,62 @@
+"""Pytest plugin of the two tiers of tests: it measures each test's processor time and fails slow tests without a mark.
+
+`bash scripts/test.sh` runs the tests without `@pytest.mark.slow`, `bash scripts/test.sh --all` all of them. Both give
+`--cpu-limit 5`: a test without the mark fails if its own time is over 5 seconds. Its own time is the processor time of
+its body, in this process and in children that it waited for. The clock on the wall is not used, because machines are
+shared; fixtures do not count, because many tests share them.
+"""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dmcvb_gen
+
+COMPILED = [Path(dmcvb_gen.__file__).parent / room / "__pycache__" for room in ("rendering/native", "policies")]
+"""Folders of numba's compiled code. A test in which they change has compiled for all others, and is not judged."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--cpu-limit", type=float, metavar="S", help="fail tests over S s of processor time if not slow")
+    parser.addoption("--cpu-times", type=int, metavar="N", help="list the N tests that take the most processor time")
+
+
+def processor_seconds() -> float:
+    """Seconds that this process and its finished children have computed so far."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
+
+
+def compiled() -> set[tuple[str, int]]:
+    """Files of compiled code, with the time of their last change."""
+    return {(str(path), path.stat().st_mtime_ns) for folder in COMPILED for path in folder.glob("*.nb?")}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    before, known = processor_seconds(), compiled()
+    result = yield
+    seconds = processor_seconds() - before
+    item.user_properties.append(("cpu", seconds))
+    limit = item.config.option.cpu_limit
+    if limit and seconds > limit and compiled() == known and item.get_closest_marker("slow") is None:
+        pytest.fail(
+            f"{seconds:.1f} s of processor time, {limit:g} s at most: make the test faster, or mark it "
+            "@pytest.mark.slow so that it runs with `bash scripts/test.sh --all`",
+            pytrace=False,
+        )
+    return result
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if not config.option.cpu_times:
+        return
+    reports = [report for name in ("passed", "failed") for report in terminalreporter.stats.get(name, [])]
+    times = [(dict(report.user_properties)["cpu"], report.nodeid) for report in reports if report.user_properties]
+    terminalreporter.section(f"processor time: {sum(seconds for seconds, _ in times):.0f} s in {len(times)} tests")
+    for seconds, name in sorted(times, reverse=True)[: config.option.cpu_times]:
+        terminalreporter.line(f"{seconds:7.2f} s  {name}")
