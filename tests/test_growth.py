@@ -26,7 +26,8 @@ from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 
-WALKER = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "episodes_per_shard": 1}
+SHORT = {"levels": "random", "max_steps": 20}
+WALKER = SHORT | {"tasks": "walker-walk", "settings": "none", "episodes": 1, "episodes_per_shard": 1}
 
 
 def walker(*patterns, **changes):
@@ -44,7 +45,7 @@ def grown(tmp_path_factory):
     roll_out(walker(), folder)
     shutil.copytree(folder, folder.parent / "before")
     roll_out(walker({"episodes": 2}, {"settings": "static", "episodes": 2}), folder)
-    maze = {"tasks": TINY_MAZE, "levels": "random", "settings": "hidden", "episodes": 1}
+    maze = SHORT | {"tasks": TINY_MAZE, "settings": "hidden", "episodes": 1}
     roll_out(small_recipe(seed=8, subsets=[maze]), folder)
     return folder
 
@@ -191,7 +192,7 @@ def test_a_published_release_grows_by_its_new_shards_alone(grown, tmp_path):
         publish(grown.parent / "before", url)
 
 
-MAZES = {"tasks": TINY_MAZE, "levels": "random", "settings": ["visible", "hidden"], "episodes_per_shard": 1}
+MAZES = SHORT | {"tasks": TINY_MAZE, "settings": ["visible", "hidden"], "episodes_per_shard": 1}
 SETTINGS = {"settings": ["none", "static"]}
 
 
@@ -228,7 +229,7 @@ def test_what_grows_by_parts_is_sound_at_every_moment(tmp_path, family, bucket):
 def test_the_last_to_finish_keeps_what_others_added_meanwhile(tmp_path, bucket):
     """Walker's rollout ends while somebody has begun to add a maze; then that one ends."""
     there = f"file://{tmp_path}/r" if bucket else str(tmp_path / "r")
-    maze = small_recipe(seed=8, subsets=[{"tasks": TINY_MAZE, "levels": "random", "settings": "hidden", "episodes": 1}])
+    maze = small_recipe(seed=8, subsets=[SHORT | {"tasks": TINY_MAZE, "settings": "hidden", "episodes": 1}])
 
     def begun(recipe):
         return prepare(make_plan(recipe, site_of(there, scratch=tmp_path / "scratch")))
@@ -305,7 +306,7 @@ def test_repainting_keeps_to_the_recipe_that_added_each_subset(grown, tmp_path):
     name = "ant-maze-tiny/random/hidden"
     manifest = repaint(Repainting(grown, tmp_path / "new", split="val"))
     assert manifest.recipe_of(name)["seed"] == 8 and manifest.recipe["seed"] == 3
-    maze = {"tasks": TINY_MAZE, "levels": "random", "settings": "hidden", "episodes": 1}
+    maze = SHORT | {"tasks": TINY_MAZE, "settings": "hidden", "episodes": 1}
     whole = roll_out(small_recipe(seed=8, split="val", subsets=[maze]), tmp_path / "whole")
     digests = {record.name: record.digest for record in manifest.subsets}
     assert digests[name] == whole.subsets[0].digest and len(digests) == 3
