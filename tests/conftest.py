@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 
 os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linux-gnu/libEGL.so.1") else "disable")
@@ -17,7 +18,12 @@ from dmcvb_gen.generate.executors import run_jobs  # noqa: E402
 from dmcvb_gen.generate.plan import finish, make_plan, prepare  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
 
+from dmcvb_gen.rendering.native import textures  # noqa: E402
+
 pytest_plugins = ["tests.compiled_code", "tests.tiers"]
+
+# Tests make hundreds of renderers of mazes in one process, with more textures than a command needs to keep.
+textures._packed_levels = functools.lru_cache(maxsize=256)(textures._packed_levels.__wrapped__)
 
 
 def small_recipe(**changes):
