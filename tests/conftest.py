@@ -17,7 +17,6 @@ from dmcvb_gen.files import sha256_file  # noqa: E402
 from dmcvb_gen.generate.executors import run_jobs  # noqa: E402
 from dmcvb_gen.generate.plan import finish, make_plan, prepare  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
-
 from dmcvb_gen.rendering.native import textures  # noqa: E402
 
 pytest_plugins = ["tests.compiled_code", "tests.tiers"]

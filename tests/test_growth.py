@@ -196,7 +196,7 @@ MAZES = SHORT | {"tasks": TINY_MAZE, "settings": ["visible", "hidden"], "episode
 SETTINGS = {"settings": ["none", "static"]}
 
 
-@pytest.mark.parametrize("family", ["walker", "maze"])
+@pytest.mark.parametrize("family", ["walker", pytest.param("maze", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("bucket", [False, True], ids=["folder", "bucket"])
 def test_what_grows_by_parts_is_sound_at_every_moment(tmp_path, family, bucket):
     """Two subsets of one episode grow to two: first the one, then another subset is asked for, then the rest."""
