@@ -8,8 +8,9 @@ from dmcvb_gen.loaders.register import register_with_gymnasium
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
+    from dmcvb_gen.benchmarks.evaluate import Score
     from dmcvb_gen.loaders.release import ReleaseReader
-__all__ = ["__version__", "open"]
+__all__ = ["__version__", "evaluate", "open"]
 
 
 def open(path: str, storage_options: dict | None = None, *, paint: bool = False, **painting: Any) -> ReleaseReader:
@@ -33,6 +34,20 @@ def open(path: str, storage_options: dict | None = None, *, paint: bool = False,
     from dmcvb_gen.loaders.release import open_for_reading
 
     return open_for_reading(path, storage_options)
+
+
+def evaluate(policy: Any, where: str, **options: Any) -> Score:
+    """Score a policy of your own: `dmcvb_gen.evaluate(policy, "walker-walk/dynamic", episodes=30, seed=0)`.
+
+    The protocol, starts and videos are those of `validate`. See `dmcvb_gen.benchmarks.evaluate.evaluate` for what the
+    policy gets and gives, and for all options.
+
+    Raises:
+      DmcvbError: no such task or setting, or actions that have another shape, are no numbers or leave [-1, 1].
+    """
+    from dmcvb_gen.benchmarks.evaluate import evaluate as run
+
+    return run(policy, where, **options)
 
 
 register_with_gymnasium()  # so that gymnasium.make knows our names wherever this package is imported

@@ -1,5 +1,6 @@
 """Agents by name: "id+bc" in, what pre-trains its encoder and what learns its policy out.
 
+    MODULE:NAME                                           a user's own agent (`benchmarks.own`)
     [PRETRAIN+]POLICY[:frames=N,k=N,sample,unbounded]
 
 PRETRAIN is one of id, lfd, ae, state, dino, bc (its encoder is then frozen) or null (none: the policy trains its
@@ -9,6 +10,7 @@ states instead of pictures.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +33,8 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
 PRETRAIN = ("id", "lfd", "ae", "state", "dino", "bc")
 POLICIES = ("bc", "td3-bc")
+OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""A user's own agent: "module:name"."""
 AGENTS = (
     *POLICIES,
     *(f"state-{policy}" for policy in POLICIES),
@@ -50,6 +54,7 @@ class Agent:
       stack: frames an observation.
       k, sample_k: of inverse dynamics.
       unbounded: TD3-BC's critics end without tanh.
+      own: "module:name" of a user's agent, instead of all this.
     """
 
     policy: str
@@ -59,6 +64,7 @@ class Agent:
     k: int = 1
     sample_k: bool = False
     unbounded: bool = False
+    own: str | None = None
 
     @property
     def base(self) -> str:
@@ -69,6 +75,8 @@ class Agent:
 
     @property
     def name(self) -> str:
+        if self.own:
+            return self.own
         options = [f"frames={self.stack}"] if self.stack != FRAMES and not self.sees_state else []
         options += [f"k={self.k}"] if self.k != 1 else []
         options += ["sample"] if self.sample_k else []
@@ -78,7 +86,7 @@ class Agent:
     @property
     def paper_name(self) -> str | None:
         """The column of the paper's table; None where it has none."""
-        if ":" in self.name or (self.sees_state and self.policy != "bc"):
+        if self.own or ":" in self.name or (self.sees_state and self.policy != "bc"):
             return None
         if self.sees_state:
             return "bc(state)"
@@ -91,6 +99,8 @@ def parse_agent(name: str) -> Agent:
     Raises:
       UnknownNameError, DmcvbError: no such agent or option, or one that this agent has no use for.
     """
+    if OWN.fullmatch(name.strip()) and name.partition(":")[0].lower() not in AGENTS:
+        return Agent("bc", own=name.strip())
     base, _, options = name.strip().lower().partition(":")
     base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
     if base not in AGENTS:

@@ -1,35 +1,46 @@
-"""Online evaluation: a policy and the subset it learned from in, scores of fresh episodes out, all in one batch.
+"""Online evaluation: a policy in, scores of fresh episodes out, all in one batch.
 
-The episodes are those of the subset's task, painted by its renderer at its size, with its kind of distractors: unseen
-`val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). In mazes an agent
-has 1,000 steps (`Task.evaluation_steps`), where the authors' evaluation stops; the data were cut at 600.
+The episodes are those of a task, painted at the data's size by the data's renderer, with a setting's distractors:
+unseen `val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). In mazes
+an agent has 1,000 steps (`Task.evaluation_steps`), where the authors' evaluation stops; the data were cut at 600.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from dmcvb_gen.agents.data import Normalization, normalize_pixels
-from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.pictures import training_pictures
-from dmcvb_gen.distractors import DistractorSampler, load_backgrounds
+from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
+from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.jobs import video_source
-from dmcvb_gen.generate.recipe import RendererChoice
-from dmcvb_gen.generate.render import renderer_for
-from dmcvb_gen.names import distractor_of
+from dmcvb_gen.generate.recipe import RendererChoice, check_size
+from dmcvb_gen.names import FIXED, distractor_of, hides_goal, normalize_setting
+from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
+if TYPE_CHECKING:
+    from dmcvb_gen.agents.data import Normalization
+    from dmcvb_gen.agents.learners import Policy
+
+Act = Callable[[dict[str, np.ndarray]], Any]
+"""A policy of one's own: observations of all episodes in, (episode, action) in [-1, 1] out.
+
+The observations are "pixels" (episode, stack x view x 3, size, size) uint8, oldest frame first, as a release's `source`
+gives them, and "state" (episode, state) float32. A policy that asks for no pictures gets the states alone.
+"""
 STREAM_NAME = "validate"
 """Of the evaluation's streams: no release is made from it."""
+ROUNDING = 1e-5
+"""How far an action may leave [-1, 1] before it is refused: what rounding does."""
 SPLIT = "val"
 """Of videos and maze styles: none of them is in data."""
 
@@ -96,6 +107,51 @@ def renderer_choice(subset: Subset) -> dict[str, Any]:
     return {"name": subset.record.renderer["name"], "samples": subset.record.renderer.get("samples")}
 
 
+@dataclass(frozen=True)
+class EvaluationScene:
+    """What evaluation episodes are of.
+
+    Attributes:
+      task, setting: e.g. "walker-walk", "dynamic"; they name the random streams, too.
+      pictures: that the policy sees.
+      size: pixels a side.
+      renderer, samples: its name; samples a pixel, None for the renderer's default.
+      backgrounds: "builtin" or a folder of videos.
+    """
+
+    task: str
+    setting: str
+    pictures: Pictures
+    size: int = 64
+    renderer: str = RendererChoice().backend
+    samples: int | None = None
+    backgrounds: str = "builtin"
+
+    @classmethod
+    def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
+        """That of a subset; `backgrounds`: where the videos are, if not where the manifest says."""
+        choice, source = renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
+        pictures, size = training_pictures(subset), subset.record.size
+        return cls(subset.task, subset.setting, pictures, size, choice["name"], choice["samples"], source)
+
+    @classmethod
+    def parse(cls, where: str, **options: Any) -> EvaluationScene:
+        """That of "walker-walk/dynamic" or "ant-maze-empty7x7/visible"; `options`: size, renderer, samples, ...
+
+        Raises:
+          DmcvbError: the text has another form, or there is no such task or setting.
+        """
+        task, slash, setting = where.partition("/")
+        if not slash or not setting:
+            raise DmcvbError(f"{where!r} names no evaluation; give TASK/SETTING, e.g. walker-walk/dynamic")
+        setting = normalize_setting(task, setting)
+        if setting == FIXED:
+            raise DmcvbError(f"{where}: goals are fixed by a release's episodes; use `validate --benchmark b3`")
+        views = [view for view in get_task(task).views if view not in NOT_TRAINED_ON]
+        check_size(options.get("size", cls.size))
+        return cls(task, setting, Pictures(tuple(views), hides_goal(setting)), **options)
+
+
 def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
     """Mean speed towards the goal of the episodes that reached it, m/s; None where none did.
 
@@ -108,12 +164,12 @@ def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, ta
 
 
 class Evaluator:
-    """Evaluates policies on one subset's task; a renderer is started once and kept.
+    """Evaluates policies on one scene; a renderer is started once and kept.
 
     Args:
-      subset: what the policy learned from; its setting, size and renderer are evaluated on.
+      where: the scene, or a subset whose task, setting, size and renderer are evaluated on.
       pixels: the policies see pictures; else states.
-      normalization: of the states, for policies that see them.
+      normalization: of the states, for learned policies that see them.
       stack: frames an observation.
       episodes: run side by side, each once.
       seed: of the evaluation's streams.
@@ -128,13 +184,13 @@ class Evaluator:
 
     def __init__(
         self,
-        subset: Subset,
+        where: Subset | EvaluationScene,
         *,
         pixels: bool = True,
         normalization: Normalization | None = None,
         stack: int = 3,
         episodes: int = 30,
-        seed: int = 1,
+        seed: int = 0,
         pair: tuple | None = None,
         max_steps: int | None = None,
         backgrounds: str | None = None,
@@ -142,20 +198,27 @@ class Evaluator:
         threads: int = 1,
         shots: int = 8,
     ):
-        self.subset, self.task = subset, get_task(subset.task)
-        self.setting = distractor_of(subset.task, subset.setting)
+        scene = EvaluationScene.of(where, backgrounds) if isinstance(where, Subset) else where
+        self.scene, self.task = scene, get_task(scene.task)
+        self.setting = distractor_of(scene.task, scene.setting)
         self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
         self.steps = evaluation_steps(self.task, max_steps)
-        self.device, self.normalization, self.stack = torch.device(device), normalization, stack
-        self.pair, self.renderer = pair, None
+        self.device, self.normalization, self.stack = device, normalization, stack
+        self.pair, self.renderer, self._videos = pair, None, None
         if pixels:
-            choice, source = renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
-            on = "cuda" if self.device.type == "cuda" and choice["name"] == "warp" else "cpu"
-            self.renderer, self._videos = renderer_for(subset.record, source, SPLIT, on, **choice)
+            if self.setting.kind != "none":
+                self._videos = load_backgrounds(scene.backgrounds, SPLIT)
+            self.renderer = make_renderer(
+                scene.renderer,
+                self.task,
+                scene.size,
+                backgrounds=self._videos,
+                floor_alpha=floor_alpha_for(self.task, self.setting),
+                device="cuda" if str(device).startswith("cuda") and scene.renderer == "warp" else "cpu",
+                samples=scene.samples,
+            )
             if hasattr(self.renderer, "worlds"):
                 self.renderer.worlds = episodes  # frames a launch: more would only be padding
-            pictures = training_pictures(subset)
-            self.hide_goal, self.views = pictures.hide_goal, list(pictures.views)
 
     def close(self) -> None:
         """Free the renderer."""
@@ -164,11 +227,31 @@ class Evaluator:
 
     def streams(self, name: str) -> list[np.random.Generator]:
         """The evaluation's own streams; the same for every policy, so that scores are compared on like episodes."""
-        names = (STREAM_NAME, self.subset.task, self.subset.setting)
+        names = (STREAM_NAME, self.scene.task, self.scene.setting)
         return [episode_stream(self.seed, names, episode, name) for episode in range(self.episodes)]
 
     def __call__(self, policy: Policy) -> Score:
-        """Roll the policy out. It is asked for one action a step, for all episodes at once."""
+        """Evaluate a learned policy (torch)."""
+        import torch
+
+        from dmcvb_gen.agents.data import normalize_pixels
+
+        def act(observation: dict[str, np.ndarray]) -> np.ndarray:
+            if self.renderer is None:
+                seen = self.normalization(torch.from_numpy(observation["state"])).to(self.device)
+            else:
+                seen = normalize_pixels(torch.from_numpy(observation["pixels"]).to(self.device))
+            with torch.no_grad(), policy.precision():
+                return policy.act(seen).float().clamp(-1, 1).cpu().numpy()
+
+        return self.score(act)
+
+    def score(self, act: Act) -> Score:
+        """Roll a policy out. It is asked for one action a step, for all episodes at once.
+
+        Raises:
+          DmcvbError: its actions have another shape than (episode, action), are no numbers, or leave [-1, 1].
+        """
         started = time.perf_counter()
         task, count = self.task, self.episodes
         batch = task.batch(count, self.threads)
@@ -179,15 +262,13 @@ class Evaluator:
         returns, length = np.zeros(count), np.full(count, self.steps)
         active, ended = np.ones(count, bool), np.zeros(count, bool)
         for step in range(self.steps):
-            if walk is None:
-                observation = self.normalization(torch.from_numpy(state).float()).to(self.device)
-            else:
+            observation = {"state": state.astype(np.float32)}
+            if walk is not None:
                 stack = self._see(stack, batch.physics(), walk, step, active)
                 if step % max(1, self.steps // self.shots) == 0:
                     pictures.append(stack[0, -1, :3].transpose(1, 2, 0).copy())
-                observation = normalize_pixels(torch.from_numpy(stack).to(self.device).flatten(1, 2))
-            with torch.no_grad(), policy.precision():
-                action = policy.act(observation).float().clamp(-1, 1).cpu().numpy()
+                observation["pixels"] = stack.reshape(count, -1, *stack.shape[3:]).copy()
+            action = check_actions(act(observation), (count, task.action_size), step)
             result = batch.step(action, active)
             state = result.state
             returns += result.reward  # episodes that are over earn nothing
@@ -218,7 +299,8 @@ class Evaluator:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
         rows = np.flatnonzero(active)
         labels = walk.frame(step, physics)[rows]
-        painted = self.renderer.render(physics[rows], labels, self.views, hide_goal=self.hide_goal)
+        shown = self.scene.pictures
+        painted = self.renderer.render(physics[rows], labels, list(shown.views), hide_goal=shown.hide_goal)
         frames = painted.transpose(0, 1, 4, 2, 3).reshape(len(rows), -1, *painted.shape[2:4])
         if stack is None:
             return np.repeat(frames[:, None], self.stack, axis=1)
@@ -231,3 +313,70 @@ def _distance(task, state: np.ndarray) -> np.ndarray | None:
     """(episode,) meters to the goal in a straight line, for tasks that have one."""
     part = task.state_slices.get("target_vector")
     return None if part is None else np.linalg.norm(state[:, part], axis=1)
+
+
+def check_actions(actions: Any, shape: tuple[int, int], step: int) -> np.ndarray:
+    """(episode, action) float32: the actions of a policy at a step.
+
+    Raises:
+      DmcvbError: they have another shape, are no numbers, or leave [-1, 1].
+    """
+    try:
+        values = np.asarray(actions, np.float32)
+    except (TypeError, ValueError) as error:
+        raise DmcvbError(f"step {step}: the policy gave no array of actions ({error}); expected {shape}") from None
+    if values.shape != shape:
+        raise DmcvbError(f"step {step}: the policy gave actions of shape {values.shape}; expected {shape}")
+    if not np.isfinite(values).all():
+        place = tuple(map(int, np.argwhere(~np.isfinite(values))[0]))
+        raise DmcvbError(f"step {step}: the policy's action {place} is {values[place]}; expected numbers in [-1, 1]")
+    if np.abs(values).max() > 1 + ROUNDING:
+        place = tuple(map(int, np.unravel_index(np.abs(values).argmax(), shape)))
+        raise DmcvbError(f"step {step}: the policy's action {place} is {values[place]:g}; expected [-1, 1], clip it")
+    return values.clip(-1, 1)
+
+
+def evaluate(
+    policy: Act,
+    where: str,
+    *,
+    episodes: int = 30,
+    seed: int = 0,
+    stack: int = 3,
+    pixels: bool = True,
+    size: int = 64,
+    renderer: str = RendererChoice().backend,
+    backgrounds: str = "builtin",
+    max_steps: int | None = None,
+    threads: int = 1,
+) -> Score:
+    """Score a policy of your own by the protocol, starts and videos of `validate`.
+
+    All episodes run side by side, and the policy is asked for the actions of all of them at once.
+
+    Args:
+      policy: takes {"pixels": (episode, stack x view x 3, size, size) uint8, "state": (episode, state) float32} and
+        gives (episode, action) in [-1, 1], as a numpy array or anything that numpy can read.
+      where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible".
+      episodes: how many, each once.
+      seed: of starts and distractors; `validate` has 0.
+      stack: frames an observation; the first one of an episode is repeated.
+      pixels: give pictures; without them an evaluation takes seconds.
+      size: pixels a side. renderer: its name. backgrounds: "builtin" or a folder of videos.
+      max_steps: cut episodes short.
+
+    Returns:
+      A `Score`: mean, stderr and returns; of mazes also success and speed.
+
+    Raises:
+      DmcvbError: no such task or setting, or actions that have another shape, are no numbers or leave [-1, 1].
+    """
+    if episodes < 1 or stack < 1:
+        raise DmcvbError(f"episodes={episodes}, stack={stack}: give at least 1 of each")
+    scene = EvaluationScene.parse(where, size=size, renderer=renderer, backgrounds=backgrounds)
+    limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
+    evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
+    try:
+        return evaluator.score(policy)
+    finally:
+        evaluator.close()

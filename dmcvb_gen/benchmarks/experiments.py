@@ -19,11 +19,12 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
-from dmcvb_gen.agents.data import Normalization, Source, TrainingData, load_data
+from dmcvb_gen.agents.data import Normalization, Source, TrainingData, choose_episodes, load_data
 from dmcvb_gen.agents.learners import Batch, Learner, ObservationProbe, Policy, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
+from dmcvb_gen.benchmarks.own import AgentData, OwnAgent
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.setup import Pretraining, Setup, data_of_run, fingerprint, pretraining_of, read_result
@@ -32,12 +33,17 @@ from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json
+from dmcvb_gen.loaders.source import StepSource
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.tasks import Task, get_task
 from dmcvb_gen.version import __version__
 
 ProgressCallback = Callable[[str, int], None]
 """Told what is being done and how many Adam steps were made since the last call."""
+
+
+def _source(release: Release, part: Part) -> Source:
+    return Source(release[part.subset], part.share, part.episodes, part.goal_pair)
 
 
 class _DataCache:
@@ -51,7 +57,7 @@ class _DataCache:
         key = (setup.root, setup.seed, tuple(parts), digests, setup.backgrounds, setup.device, setup.memory)
         if self._key is None or self._key[0] != key or (pixels and not self._key[1]):
             self._key = self._data = None  # free the old pictures before new ones are read
-            sources = [Source(release[p.subset], p.share, p.episodes, p.goal_pair) for p in parts]
+            sources = [_source(release, part) for part in parts]
             self._data = load_data(sources, pixels=pixels, seed=setup.seed, device=setup.device, memory=setup.memory)
             self._key = (key, pixels)
         return self._data.with_stack(stack) if pixels else self._data.states_only()
@@ -82,7 +88,9 @@ def train_settings(
 
 
 def policy_steps(profile: Profile, agent: Agent) -> int:
-    """Adam steps of a cell's policy."""
+    """Adam steps of a cell's policy; those of a user's own agent are not known."""
+    if agent.own:
+        return 0
     if agent.sees_state:
         return profile.state_steps
     return profile.frozen_steps if agent.pretrain else profile.pixel_steps
@@ -162,6 +170,8 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     done = read_result(path, mark)
     if done:
         return done
+    if cell.agent.own:
+        return _run_own(setup, cell, release, mark)
     started = time.perf_counter()
     before, pixels = pretraining_of(cell), not cell.agent.sees_state
     pretrained = run_pretraining(setup, before, tick) if before else None
@@ -193,6 +203,52 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     return result
 
 
+def _run_own(setup: Setup, cell: Cell, release: Release, mark: str) -> dict[str, Any]:
+    """The cell of a user's own agent: its policy is trained by the user's code, if at all, and scored by ours.
+
+    Raises:
+      DmcvbError: the agent cannot be loaded, or its policy gives no actions.
+    """
+    started, own, subset = time.perf_counter(), OwnAgent.load(cell.agent.own), release[cell.policy[0].subset]
+    data = _cache.get(setup, release, cell.policy, False, own.stack)
+    sources = []
+    for part in cell.policy:
+        episodes, held = choose_episodes(_source(release, part), setup.seed)
+        sources.append(StepSource(release[part.subset], episodes[~held], None if own.pixels else (), own.stack))
+    policy = own.policy(AgentData(tuple(sources), cell.task, cell.setting, setup.seed))
+    trained = time.perf_counter() - started
+    evaluator = _evaluator(setup, cell, subset, pixels=own.pixels, stack=own.stack)
+    try:
+        score = evaluator.score(policy)
+    finally:
+        evaluator.close()
+    if score.pictures is not None:
+        _save_sheet(setup.cells / f"{cell.id}.rollout.png", [score.pictures])
+    curve = [{"step": 0, "seconds": trained, "score": score.facts()}]
+    everything = time.perf_counter() - started
+    seconds = {"training": trained, "evaluation": score.seconds, "inspection": 0.0, "all": everything}
+    digests = {name: subset_digest(release[name].commits) for name in cell.subsets}
+    result = {"fingerprint": mark, "seed": setup.seed, "digests": digests}
+    result |= _facts(setup, cell, subset, data, curve, seconds) | {"pretraining": None, "inspection": None}
+    write_json(setup.cells / f"{cell.id}.json", result)
+    return result
+
+
+def _evaluator(setup: Setup, cell: Cell, subset: Subset, **options: Any) -> Evaluator:
+    """The evaluation of a cell."""
+    pair = cell.policy[0].goal_pair
+    return Evaluator(
+        subset,
+        episodes=setup.profile.episodes,
+        max_steps=setup.profile.episode_steps,
+        pair=None if pair is None else goal_cells(subset, pair),
+        backgrounds=setup.backgrounds,
+        device=setup.device,
+        threads=setup.threads,
+        **options,
+    )
+
+
 def _make_policy(setup: Setup, cell: Cell, before: Pretraining | None, data: TrainingData) -> Policy:
     torch.manual_seed(setup.seed)
     encoder = make_encoder(cell.agent, data, setup.dino_weights, setup.profile.network)
@@ -205,19 +261,8 @@ def _train_policy(
     setup: Setup, cell: Cell, subset: Subset, data: TrainingData, policy: Policy, folder: Path, tick: ProgressCallback
 ) -> tuple[Curve, float]:
     """Train a cell's policy, with its online evaluations; gives the curve and the seconds since it was last stopped."""
-    profile, pixels, pair = setup.profile, not cell.agent.sees_state, cell.policy[0].goal_pair
-    evaluator = Evaluator(
-        subset,
-        pixels=pixels,
-        normalization=data.normalization,
-        stack=cell.agent.stack,
-        episodes=profile.episodes,
-        max_steps=profile.episode_steps,
-        pair=None if pair is None else goal_cells(subset, pair),
-        backgrounds=setup.backgrounds,
-        device=setup.device,
-        threads=setup.threads,
-    )
+    profile, pixels = setup.profile, not cell.agent.sees_state
+    evaluator = _evaluator(setup, cell, subset, pixels=pixels, normalization=data.normalization, stack=cell.agent.stack)
 
     def evaluate(learner) -> dict[str, Any]:
         score: Score = evaluator(learner)

@@ -143,7 +143,7 @@ class _Pace:
 def planned_steps(profile: Profile, cells: Sequence[Cell]) -> int:
     """Adam steps of cells, their encoders and decoders."""
     encoders = set(filter(None, map(pretraining_of, cells)))
-    decoders = sum(2 * profile.readout_steps for cell in cells if not cell.agent.sees_state)
+    decoders = sum(2 * profile.readout_steps for cell in cells if not (cell.agent.sees_state or cell.agent.own))
     policies = sum(policy_steps(profile, cell.agent) for cell in cells)
     return policies + decoders + len(encoders) * profile.pretrain_steps
 

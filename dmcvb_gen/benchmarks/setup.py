@@ -23,6 +23,7 @@ from dmcvb_gen.agents.catalog import Agent
 from dmcvb_gen.agents.dino import dino_digest
 from dmcvb_gen.benchmarks.evaluate import protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
+from dmcvb_gen.benchmarks.own import OwnAgent
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.suites import Cell, Part, slug
 from dmcvb_gen.dataset import Release, open_release
@@ -149,6 +150,8 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
         )
         if family_of(work.task) == ANT_MAZE:
             facts["speed"] = "straight"  # results of before measured the data's along the path
+        if work.agent.own:
+            facts["own"] = OwnAgent.load(work.agent.own).digest
         if work.agent.pretrain == "dino":
             facts["dino"] = dino_digest(setup.dino_weights)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

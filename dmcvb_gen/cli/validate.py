@@ -14,7 +14,7 @@ from dmcvb_gen.cli.unused_options import given_options, refuse
 from dmcvb_gen.names import pluralize
 
 TRAINING = (
-    *("benchmarks", "agents", "profile", "scale", "seed"),
+    *("benchmarks", "agents", "own", "profile", "scale", "seed"),
     *("train_unsound", "threads", "device", "compile", "dino_weights"),
 )
 """Options of `validate` that say what is trained, and how."""
@@ -26,6 +26,7 @@ TRAINING = (
 @click.option("--scale", type=click.FloatRange(0, min_open=True), default=1.0, help="Times the profile's steps.")
 @click.option("--benchmark", "benchmarks", multiple=True, help="b1, b2, b3, ablations. Repeatable.  [default: b1]")
 @click.option("--agents", default="", metavar="A,B", help="Names such as bc,state-bc,id+bc instead of all.")
+@click.option("--agent", "own", multiple=True, metavar="MODULE:NAME", help="Also score your own agent. Repeatable.")
 @click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/expert/*'.")
 @click.option("--out", type=OutPath(path_type=Path, file_okay=False), help="Folder.  [default: reports/NAME]")
 @click.option("--checks-only", is_flag=True, help="Structure checks and report, no training.")
@@ -43,7 +44,9 @@ TRAINING = (
 @click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
 @json_option
 @click.pass_context
-def validate(context, path, out, profile, scale, benchmarks, agents, only, checks_only, strict, as_json, **options):
+def validate(
+    context, path, out, profile, scale, benchmarks, agents, own, only, checks_only, strict, as_json, **options
+):
     """Check a release and run the paper's benchmarks on it, scores set beside the paper's.
 
     Exit code 0 when sound and complete, 1 when a check or a cell fails or episodes are missing, 2 on bad usage. The
@@ -91,7 +94,7 @@ def validate(context, path, out, profile, scale, benchmarks, agents, only, check
             path,
             setup,
             benchmarks=() if checks_only else benchmarks or ("b1",),
-            agents=split_agents(agents),
+            agents=_agents(agents, own),
             patterns=only,
             workers=executor,
             train_unsound=train_unsound,
@@ -124,6 +127,16 @@ def _show_score(cell, facts, profile) -> None:
 def split_agents(text: str) -> list[str]:
     """ "bc,id+bc:k=10,sample" -> ["bc", "id+bc:k=10,sample"]: commas stand between agents and in their options."""
     return [name for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip()]
+
+
+def _agents(names: str, own: tuple[str, ...]) -> list[str]:
+    """The agents asked for; one's own alone are set beside BC from states."""
+    from dmcvb_gen.agents.catalog import OWN
+
+    for name in own:
+        if not OWN.fullmatch(name):
+            raise click.UsageError(f"--agent {name} is not MODULE:NAME; the paper's agents are chosen with --agents.")
+    return [*(split_agents(names) or (["state-bc"] if own else [])), *own]
 
 
 def _show(result, profile) -> None:

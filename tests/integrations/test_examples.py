@@ -15,7 +15,7 @@ from click.testing import CliRunner
 import dmcvb_gen
 from dmcvb_gen.cli import main
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "docs/examples").glob("*.py"))
+EXAMPLES = sorted((Path(__file__).parents[2] / "docs/examples").glob("bc_*.py"))
 SUBSETS = {
     "walker-walk/expert/dynamic": ["walker-walk", "--distractor", "dynamic"],
     "ant-maze-empty7x7/expert/hidden": ["ant-maze-empty7x7", "--goal", "hidden"],

@@ -1,0 +1,106 @@
+"""Agents of one's own in a validation: "module:name" in, a policy out.
+
+The name is that of a ready policy, or of a function whose only parameter is called `data`: it gets the episodes that a
+cell learns from (`AgentData`) and returns a policy. A policy is a callable as `dmcvb_gen.evaluate` takes it. Two
+attributes of the named object, if it has them, say what its policy sees: `stack` (frames, 3) and `pixels` (True).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen.benchmarks.evaluate import Act
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.loaders.source import StepSource
+
+
+@dataclass(frozen=True)
+class AgentData:
+    """What an agent of one's own learns from.
+
+    Attributes:
+      sources: one a subset, all steps of its training episodes (`StepSource`: len(), [i] and gather(), numpy alone).
+      task, setting: that its policy is scored on. seed: of the validation.
+    """
+
+    sources: tuple[StepSource, ...]
+    task: str
+    setting: str
+    seed: int
+
+    @property
+    def source(self) -> StepSource:
+        """The first source; the only one, unless levels are mixed."""
+        return self.sources[0]
+
+
+@dataclass(frozen=True)
+class OwnAgent:
+    """An agent that a user brought.
+
+    Attributes:
+      name: "module:name". value: what it names.
+    """
+
+    name: str
+    value: Any
+
+    @classmethod
+    def load(cls, name: str) -> OwnAgent:
+        """Import it; modules of the working folder are found.
+
+        Raises:
+          DmcvbError: there is no such module or name, importing it fails, or it cannot be called.
+        """
+        module, _, attribute = name.partition(":")
+        if os.getcwd() not in sys.path:
+            sys.path.insert(0, os.getcwd())
+        try:
+            value = getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # a user's module may raise anything
+            raise DmcvbError(f"cannot load agent {name} ({error}); give MODULE:NAME, run from its folder") from None
+        if not callable(value):
+            raise DmcvbError(f"agent {name} is a {type(value).__name__}; expected a policy or a function of `data`")
+        return cls(name, value)
+
+    @property
+    def learns(self) -> bool:
+        """Whether it is a function of data that returns a policy."""
+        if isinstance(self.value, type):
+            return False
+        try:
+            return list(inspect.signature(self.value).parameters) == ["data"]
+        except (TypeError, ValueError):
+            return False
+
+    @property
+    def stack(self) -> int:
+        return int(getattr(self.value, "stack", 3))
+
+    @property
+    def pixels(self) -> bool:
+        return bool(getattr(self.value, "pixels", True))
+
+    def policy(self, data: AgentData) -> Act:
+        """The policy, trained if it learns.
+
+        Raises:
+          DmcvbError: training gives something that cannot be called.
+        """
+        policy = self.value(data) if self.learns else self.value
+        if not callable(policy):
+            raise DmcvbError(f"agent {self.name} returned a {type(policy).__name__}; expected a policy to call")
+        return policy
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the module's file, so that a changed agent is scored again; "" for code without a file."""
+        file = getattr(sys.modules[self.name.partition(":")[0]], "__file__", None)
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""

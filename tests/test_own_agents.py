@@ -1,0 +1,140 @@
+"""Policies of one's own: scored by `dmcvb_gen.evaluate` and by `validate --agent`; wrong actions are one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.tasks import get_task
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "docs" / "examples"
+
+
+@pytest.mark.parametrize("where, channels", [("walker-walk/dynamic", 9), ("ant-maze-empty7x7/hidden", 27)])
+def test_a_policy_sees_stacks_and_states_of_all_episodes_at_once(where, channels):
+    task, seen = get_task(where.split("/")[0]), []
+
+    def policy(observation):
+        seen.append(observation)
+        return np.full((2, task.action_size), 0.1)
+
+    score = dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=3, size=16, seed=4)
+    assert len(seen) == 3 and score.limit == 3 and len(score.returns) == 2
+    assert seen[0]["pixels"].shape == (2, channels, 16, 16) and seen[0]["pixels"].dtype == np.uint8
+    assert seen[0]["state"].shape == (2, task.state_size) and seen[0]["state"].dtype == np.float32
+    half = channels // 3
+    np.testing.assert_array_equal(seen[2]["pixels"][:, half : 2 * half], seen[1]["pixels"][:, 2 * half :])
+    assert score.mean == pytest.approx(np.mean(score.returns))
+    again = dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=3, size=16, seed=4, pixels=False)
+    assert again.returns == score.returns and set(seen[-1]) == {"state"}
+
+
+def test_it_is_the_evaluation_of_validate(small_release):
+    """The same policy as a learned one of `validate` on a subset, and as one's own by the subset's name."""
+    subset = open_release(small_release)["walker-walk/random/dynamic"]
+
+    class Learned:
+        def precision(self):
+            return torch.autocast("cpu", enabled=False)
+
+        def act(self, observation):
+            return observation.flatten(1)[:, :6].tanh()
+
+    evaluator = Evaluator(subset, episodes=2, max_steps=5)
+    ours = evaluator(Learned())
+    evaluator.close()
+
+    def own(observation):
+        return np.tanh(observation["pixels"].reshape(2, -1)[:, :6] / np.float32(255) - 0.5)
+
+    size = subset.record.size
+    renderer = subset.record.renderer["name"]
+    theirs = dmcvb_gen.evaluate(own, "walker-walk/dynamic", episodes=2, max_steps=5, size=size, renderer=renderer)
+    np.testing.assert_allclose(theirs.returns, ours.returns, rtol=1e-4)
+
+
+@pytest.mark.parametrize("actions, told", [
+    (np.zeros((2, 5)), r"step 0: .*shape \(2, 5\); expected \(2, 6\)"),
+    (np.full((2, 6), np.nan), r"step 0: .*is nan; expected numbers"),
+    (np.full((2, 6), 1.5), r"step 0: .*is 1\.5; expected \[-1, 1\]"),
+    ("none", r"step 0: .*no array of actions"),
+])  # fmt: skip
+def test_wrong_actions_are_one_line_with_the_step_and_what_was_expected(actions, told):
+    with pytest.raises(DmcvbError, match=told) as error:
+        dmcvb_gen.evaluate(lambda observation: actions, "walker-walk/none", episodes=2, max_steps=2, pixels=False)
+    assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("where, told", [
+    ("walker-walk", "TASK/SETTING"), ("walker-wlk/none", "walker-walk"), ("walker-walk/dynamc", "dynamic"),
+    ("ant-maze-empty7x7/fixed", "b3"),
+])  # fmt: skip
+def test_a_place_that_cannot_be_evaluated_is_refused_with_what_can(where, told):
+    with pytest.raises(DmcvbError, match=told):
+        dmcvb_gen.evaluate(lambda observation: None, where, pixels=False)
+
+
+AGENTS = """
+import numpy as np
+
+def still(observation):
+    return np.zeros((len(observation["state"]), 6))
+still.pixels = False
+
+def learned(data):
+    assert data.task == "walker-walk" and len(data.source) > 0 and "pixels" not in data.source[0]
+    mean = data.source.gather(np.arange(len(data.source)))["action"].mean(axis=0)
+    return lambda observation: np.tile(mean, (len(observation["state"]), 1))
+learned.pixels = False
+
+def broken(observation):
+    return np.zeros((1, 1))
+broken.pixels = False
+"""
+
+
+def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_path, monkeypatch):
+    (tmp_path / "own_agents.py").write_text(AGENTS)
+    monkeypatch.chdir(tmp_path)
+    command = ["validate", str(small_release), "--profile", "smoke", "--only", "walker-walk/random/none"]
+    command += [value for name in ("still", "learned", "broken") for value in ("--agent", f"own_agents:{name}")]
+    result = CliRunner().invoke(main, [*command, "--workers", "1", "--threads", "1", "--out", str(tmp_path / "report")])
+    facts = json.loads((tmp_path / "report" / "report.json").read_text())
+    scores = {r["cell"]["agent_name"]: r["score"] for r in facts["results"]}
+    assert set(scores) == {"state-bc", "own_agents:still", "own_agents:learned"}, result.output
+    [failed] = facts["failed"]
+    assert "step 0" in failed["error"] and "expected (2, 6)" in failed["error"] and result.exit_code == 1
+    assert scores["own_agents:still"]["returns"] != scores["own_agents:learned"]["returns"]
+    alone = dmcvb_gen.evaluate(lambda o: np.zeros((2, 6)), "walker-walk/none", episodes=2, max_steps=10, pixels=False)
+    assert scores["own_agents:still"]["returns"] == list(alone.returns)
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "own_agents:still" in page
+
+
+@pytest.mark.parametrize("name, told", [("own_agnts:still", "cannot load"), ("bc", "--agents")])
+def test_an_agent_that_cannot_be_loaded_is_one_line(small_release, tmp_path, name, told):
+    command = ["validate", str(small_release), "--agent", name, "--only", "walker-walk/random/none", "--workers", "1"]
+    result = CliRunner().invoke(main, [*command, "--agents", "state-bc", "--out", str(tmp_path)])
+    assert result.exit_code != 0 and told in result.output
+
+
+@pytest.mark.parametrize("example", ["evaluate_torch", "evaluate_jax"])
+def test_examples_train_and_score_a_policy(small_release, example):
+    pytest.importorskip("jax" if "jax" in example else "torch")
+    command = [sys.executable, str(EXAMPLES / f"{example}.py"), str(small_release), "walker-walk/random/dynamic"]
+    shown = subprocess.run([*command, "2", "5"], capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert shown.returncode == 0, shown.stderr
+    assert "return " in shown.stdout and "over 2 episodes" in shown.stdout
