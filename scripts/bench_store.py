@@ -18,10 +18,9 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.dataset.schema import create_arrays, picture_spec
-from dmcvb_gen.generate.engine import painted_arrays, simulate_job
+from dmcvb_gen.generate.engine import shard_arrays, simulated_episodes
 from dmcvb_gen.generate.plan import make_plan
 from dmcvb_gen.generate.recipe import make_recipe
-from dmcvb_gen.parallel import ignore
 
 LAYOUTS = (
     "zstd",
@@ -46,7 +45,7 @@ def pictures(task_id: str, setting: str, episodes: int) -> np.ndarray:
         }
     )
     job = make_plan(recipe, tempfile.mkdtemp()).jobs[0]
-    return next(painted_arrays(job, job.subsets[0], simulate_job(job), ignore))[1]
+    return next(shard_arrays(job, job.subsets[0], simulated_episodes(job)))[1]
 
 
 def measure(values: np.ndarray, layout: str, chunk: int) -> dict[str, float]:

@@ -18,7 +18,7 @@ from dmcvb_gen.dataset.index import write_release
 from dmcvb_gen.dataset.manifest import commit_path
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
-from dmcvb_gen.generate import paint
+from dmcvb_gen.generate import executors, paint
 from dmcvb_gen.generate.paint import paint_release, without_pictures
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
@@ -79,18 +79,18 @@ def test_painting_a_light_release_gives_the_files_of_a_painted_one(made, tmp_pat
     assert {n: v for n, v in mine.items() if n != ".lock"} == {n: v for n, v in theirs.items() if n != ".lock"}
 
 
-@pytest.mark.parametrize("moment", ["write_lock", "paint_shard"])
+@pytest.mark.parametrize("moment", [(paint, "write_lock"), (executors, "run_job")], ids=["lock", "shard"])
 def test_two_who_paint_a_release_end_in_what_one_ends_in(made, tmp_path, monkeypatch, moment):
     """Another one paints all of it before the first has the lock, or while the first is about to paint a shard."""
     shutil_copy(made / "light", tmp_path / "copy")
-    mine = getattr(paint, moment)
+    mine = getattr(*moment)
 
     def meanwhile(*arguments, **options):
-        monkeypatch.setattr(paint, moment, mine)
+        monkeypatch.setattr(*moment, mine)
         paint_release(tmp_path / "copy")
         return mine(*arguments, **options)
 
-    monkeypatch.setattr(paint, moment, meanwhile)
+    monkeypatch.setattr(*moment, meanwhile)
     paint_release(tmp_path / "copy")
     found, wanted = files(tmp_path / "copy"), files(made / "painted")
     assert {n: v for n, v in found.items() if n != ".lock"} == {n: v for n, v in wanted.items() if n != ".lock"}
@@ -100,17 +100,17 @@ def test_the_last_painter_keeps_how_others_painted_meanwhile(made, tmp_path, mon
     """One subset at 40 pixels, painted by another while this one paints the other subset at 48."""
     shutil_copy(made / "light", tmp_path / "copy")
     mine, other = list(open_release(made / "light").subsets)
-    work = paint.paint_shard
+    work = executors.run_job
 
     def meanwhile(*arguments, **options):
-        monkeypatch.setattr(paint, "paint_shard", work)
+        monkeypatch.setattr(executors, "run_job", work)
         (making := tmp_path / "copy" / f"{mine}.zarr/x.foreign.partial").touch()
-        paint_release(tmp_path / "copy", [other], painter=paint.RenderConfig(look=paint.RenderOverrides(size=40)))
+        paint_release(tmp_path / "copy", [other], config=paint.RenderConfig(overrides=paint.RenderOverrides(size=40)))
         assert making.exists()  # somebody is still at work
         return work(*arguments, **options)
 
-    monkeypatch.setattr(paint, "paint_shard", meanwhile)
-    paint_release(tmp_path / "copy", [mine], painter=paint.RenderConfig(look=paint.RenderOverrides(size=48)))
+    monkeypatch.setattr(executors, "run_job", meanwhile)
+    paint_release(tmp_path / "copy", [mine], config=paint.RenderConfig(overrides=paint.RenderOverrides(size=48)))
     release = open_release(tmp_path / "copy")
     assert {name: subset.record.size for name, subset in release.subsets.items()} == {mine: 48, other: 40}
     assert verify(tmp_path / "copy").sound and release.manifest.complete
@@ -480,11 +480,11 @@ def test_shards_are_painted_while_others_come_and_a_cut_loses_nothing(made, publ
     from dmcvb_gen.release import fetch as fetching
 
     painted, real = [], fetching.download
-    plain = painting.paint_shard
+    plain = executors.run_job
 
-    def paint_shard(work, tick):
-        painted.append((work.subset.name, work.shard))
-        return plain(work, tick)
+    def run_job(job, tick):
+        painted.append((job.subsets[0].name, job.shard))
+        return plain(job, tick=tick)
 
     def download(filesystem, place, remote, local, record):
         if "/c/1" in record.path and len(painted) < 1:
@@ -499,7 +499,7 @@ def test_shards_are_painted_while_others_come_and_a_cut_loses_nothing(made, publ
         return not any(thread.name == "fetch" for thread in threading.enumerate())
 
     monkeypatch.setattr(fetching, "download", download)
-    monkeypatch.setattr(painting, "paint_shard", paint_shard)
+    monkeypatch.setattr(executors, "run_job", run_job)
     with pytest.raises(StoreError, match="line went dead"):
         fetching.fetch_and_paint(published, tmp_path / "r", painter=painting.RenderConfig())
     assert painted and open_release(tmp_path / "r").subsets

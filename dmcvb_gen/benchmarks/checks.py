@@ -19,7 +19,7 @@ import numpy as np
 from dmcvb_gen.dataset import Release, Subset, open_release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import background_source
-from dmcvb_gen.generate.paint import drift
+from dmcvb_gen.generate.paint import render_differences
 from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
@@ -178,7 +178,7 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
     """What is another version here than where the pictures that are painted on reading belong."""
     painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
     sources = {record.name: background_source(release.path, record, backgrounds) for record in painted}
-    return drift(release.manifest, painted, sources)
+    return render_differences(release.manifest, painted, sources)
 
 
 class _Longer:

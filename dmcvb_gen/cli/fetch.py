@@ -9,7 +9,7 @@ import click
 
 from dmcvb_gen.cli.common import OutPath, ProgressBar, format_bytes, json_option, print_json, remote_option
 from dmcvb_gen.cli.release import episodes_option, only_option, transfers_option
-from dmcvb_gen.cli.render_options import look_of, look_options, painted_facts, show_painted, tell
+from dmcvb_gen.cli.render_options import override_options, overrides_of, painted_facts, show_painted, tell
 
 
 @click.command()
@@ -17,7 +17,7 @@ from dmcvb_gen.cli.render_options import look_of, look_options, painted_facts, s
 @only_option
 @episodes_option
 @click.option("--paint", "painting", is_flag=True, help="Fill in pictures that travelled without, a shard as it comes.")
-@look_options
+@override_options
 @click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the release here.")
 @remote_option
 @transfers_option
@@ -41,7 +41,7 @@ def fetch(context, url, only, episodes, painting, size, views, goal, out, option
         with ProgressBar(as_json, unit="B", unit_scale=True) as bar:
             moved, done = run(url, out, only, episodes, tick=bar, **given), None
     else:
-        moved, done = _fetch_painted(url, out, only, episodes, look_of(size, views, goal), given, as_json)
+        moved, done = _fetch_painted(url, out, only, episodes, overrides_of(size, views, goal), given, as_json)
     if as_json:
         print_json(dataclasses.asdict(moved) | (painted_facts(done) if done else {}))
     else:
@@ -51,7 +51,7 @@ def fetch(context, url, only, episodes, painting, size, views, goal, out, option
     context.exit(1 if done and done.differing else 0)
 
 
-def _fetch_painted(url, out, only, episodes, look, given, as_json):
+def _fetch_painted(url, out, only, episodes, overrides, given, as_json):
     from dmcvb_gen.generate.paint import RenderConfig
     from dmcvb_gen.release.fetch import fetch_and_paint
 
@@ -59,5 +59,5 @@ def _fetch_painted(url, out, only, episodes, look, given, as_json):
         ProgressBar(as_json, unit="B", unit_scale=True, desc="fetched") as bytes_bar,
         ProgressBar(as_json, unit=" frames", unit_scale=True, desc="painted") as frames,
     ):
-        painter = RenderConfig(look=look, workers=os.cpu_count() or 1, tick=frames, tell=tell)
+        painter = RenderConfig(overrides=overrides, workers=os.cpu_count() or 1, progress=frames, notify=tell)
         return fetch_and_paint(url, out, only, episodes, painter=painter, tick=bytes_bar, **given)

@@ -7,14 +7,14 @@ import click
 from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
 from dmcvb_gen.cli.common import OutPath, background_source, json_option, print_json
 from dmcvb_gen.cli.release import episodes_option, frames_bar, only_option, workers_option
-from dmcvb_gen.cli.render_options import look_of, look_options, painted_facts, show_painted, tell
+from dmcvb_gen.cli.render_options import override_options, overrides_of, painted_facts, show_painted, tell
 
 
 @click.command()
 @click.argument("path", type=OutPath())
 @only_option
 @episodes_option
-@look_options
+@override_options
 @workers_option
 @executor_option
 @ray_option
@@ -40,7 +40,7 @@ def paint(
     videos = background_source(backgrounds) if backgrounds else None
     executor = make_executor(workers, executor, ray_address)
     with frames_bar(as_json) as bar:
-        painter = RenderConfig(look_of(size, views, goal), executor, device, videos, bar, tell)
+        painter = RenderConfig(overrides_of(size, views, goal), executor, device, videos, bar, tell)
         done = paint_release(path, only, episodes, painter)
     if as_json:
         print_json({"out": path} | painted_facts(done))

@@ -13,14 +13,14 @@ _OPTIONS = (
 )
 
 
-def look_options(command):
+def override_options(command):
     """--size, --views and --goal."""
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
 
 
-def look_of(size, views, goal):
+def overrides_of(size, views, goal):
     """The `RenderOverrides` that the options ask for."""
     from dmcvb_gen.generate.paint import RenderOverrides
 

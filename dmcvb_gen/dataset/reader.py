@@ -25,6 +25,7 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.writer import read_commits
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.names import pluralize
 from dmcvb_gen.storage.remote import file_system, is_url, public, storage_errors
@@ -243,6 +244,10 @@ class Subset:
         if not len(chosen):
             return np.zeros((0, *source.shape[1:]), source.dtype)
         return source.rows(chosen)
+
+    def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
+        """The stored labels of the distractors, leading shape (episode, step); see `read`."""
+        return DistractorState(**{name: self.read(f"exogenous/{name}", episodes) for name in DISTRACTOR_STATE_NAMES})
 
     def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """One episode, cut to its length L.

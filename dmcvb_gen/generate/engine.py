@@ -1,34 +1,74 @@
-"""Doing a job: simulate its episodes, paint them for each setting, commit the shards."""
+"""The generation engine: take the states of a shard's episodes, render them, and commit the shard.
+
+::
+
+    command      states                            what is written
+    rollout      simulated                         every array
+    regenerate   simulated                         every array, compared with the release's digests
+    repaint      read from another release         every array; distractors are stored or drawn anew
+    paint        read from the release itself      pictures, added to the shard
+
+`estimate` times the same functions on a few episodes.
+"""
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, commit_path, environment
 from dmcvb_gen.dataset.pictures import stored_pictures
-from dmcvb_gen.dataset.writer import write_shard
+from dmcvb_gen.dataset.shards import damage
+from dmcvb_gen.dataset.writer import write_pictures, write_shard
+from dmcvb_gen.distractor_state import DistractorState
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import Inputs, Job
-from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, renderers
-from dmcvb_gen.generate.site import Site, staging_folder_of
+from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, paint_labels, renderers
+from dmcvb_gen.generate.site import staging_folder_of
 from dmcvb_gen.parallel import Future, ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.policies.simulate import Simulation, simulate
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
+
+COPIED = ("state", "action", "reward", "discount", "length", "terminated", "return", "seed", "behaviour", "goal_pair")
+"""Arrays that a repaint copies besides the physics states."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes before they are rendered; rows past an episode's end are zero.
+
+    Attributes:
+      index: (episode,) int, in the subset.
+      physics: (episode, row, physics) float64.
+      length: (episode,) int32, transitions of each.
+      arrays: the values to store beside pictures and labels, by name.
+      labels: of the distractors, (episode, row up to the longest episode's last); None: drawn from the streams.
+      seconds: time spent so far, by part.
+    """
+
+    index: np.ndarray
+    physics: np.ndarray
+    length: np.ndarray
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    labels: DistractorState | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """What a job gave.
+    """The result of a job.
 
     Attributes:
-      commits: a record a setting.
-      steps: transitions committed, over all settings.
+      commits: one record for each subset of the job.
+      steps: transitions committed, over all subsets.
       seconds: time spent in "physics", "policy", "rendering" and "storage".
     """
 
@@ -37,20 +77,45 @@ class JobResult:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def load_policies(job: Job) -> list[Policy]:
-    """The behaviour policies of a job (uniform random actions where there is no file)."""
-    record = job.subsets[0]
-    task = get_task(record.task)
-    return [load_policy(path, task) for path in inputs_of(job, record).policies] or [random_policy(task)]
+def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobResult | Future:
+    """Take the states of a job's episodes, render them for each subset, and commit the shards.
+
+    Args:
+      threads: of the physics.
+      tick: called with the number of frames rendered since the last call.
+
+    Returns:
+      The result, or a `Future` of it while shards are being uploaded.
+
+    Raises:
+      StoreError: a source shard is damaged, or the disk is full or cannot be written.
+    """
+    episodes = stored_episodes(job) if job.stored else simulated_episodes(job, threads)
+    seconds = dict(episodes.seconds) | {"rendering": 0.0, "storage": 0.0}
+    sent = []
+    for record in job.subsets:
+        started, rendering = time.perf_counter(), Stopwatch()
+        arrays = rendering.time(shard_arrays(job, record, episodes, tick))
+        sent.append(_write_and_commit(job, record, arrays, episodes.length))
+        seconds["rendering"] += rendering.seconds
+        seconds["storage"] += time.perf_counter() - started - rendering.seconds
+
+    def committed() -> JobResult:
+        for _, wait in sent:
+            wait()
+        commits = tuple(commit for commit, _ in sent)
+        return JobResult(commits, sum(commit.steps for commit in commits), seconds)
+
+    return Future(committed) if job.site.slow else committed()
 
 
-def inputs_of(job: Job, record: SubsetRecord) -> Inputs:
-    """What a subset of a job is made from, on this machine."""
-    return job.inputs or staging_folder_of(job.site).inputs(record)
+# -- states ---------------------------------------------------------------------------------------
 
 
-def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_steps: int | None = None) -> Simulation:
-    """The episodes of a job, without pictures.
+def simulated_episodes(
+    job: Job, threads: int = 1, episodes: range | None = None, max_steps: int | None = None
+) -> Episodes:
+    """Simulate the episodes of a job.
 
     Args:
       threads: of the physics.
@@ -59,9 +124,9 @@ def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_
     record = job.subsets[0]
     task = get_task(record.task)
     pairs = fixed_pairs(as_maze(task).layout, record.fixed_goals, job.seed) if record.fixed_goals else None
-    return simulate(
+    made = simulate(
         task,
-        load_policies(job),
+        _policies(record.task, inputs_of(job, record).policies, tuple(policy.digest for policy in record.policies)),
         list(episodes or job.episodes),
         job.seed,
         job.names,
@@ -71,92 +136,97 @@ def simulate_job(job: Job, threads: int = 1, episodes: range | None = None, max_
         threads=threads,
         max_steps=max_steps or record.max_steps,
     )
+    return Episodes(made.episodes, made.physics, made.length, made.arrays(), seconds=made.seconds)
 
 
-def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobResult | Future:
-    """Simulate, paint and commit a job.
-
-    Args:
-      threads: of the physics.
-      tick: told how many frames were painted since the last call.
-
-    Returns:
-      What it gave; later, where shards are still on their way to a bucket.
-
-    Raises:
-      StoreError: the disk is full or cannot be written.
-    """
-    simulation = simulate_job(job, threads)
-    seconds = dict(simulation.seconds) | {"rendering": 0.0, "storage": 0.0}
-    sent = []
-    for record in job.subsets:
-        started, painting = time.perf_counter(), Stopwatch()
-        arrays = painting.time(painted_arrays(job, record, simulation, tick))
-        sent.append(make_shard(job.site, record, job.shard, arrays, simulation.length, job.device))
-        seconds["rendering"] += painting.seconds
-        seconds["storage"] += time.perf_counter() - started - painting.seconds
-
-    def arrived() -> JobResult:
-        for _, wait in sent:
-            wait()
-        commits = tuple(commit for commit, _ in sent)
-        return JobResult(commits, sum(commit.steps for commit in commits), seconds)
-
-    return Future(arrived) if job.site.slow else arrived()
-
-
-def make_shard(
-    site: Site,
-    record: SubsetRecord,
-    shard: int,
-    arrays: Iterator[tuple[str, np.ndarray]],
-    lengths: np.ndarray,
-    device: str,
-) -> tuple[CommitRecord, Callable[[], None]]:
-    """Write a shard on this process's stage and deliver it.
+@functools.lru_cache(maxsize=4)
+def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) -> list[Policy]:
+    """The policies of a subset (uniform random actions without files), read once in each process.
 
     Args:
-      arrays, lengths: as for `write_shard`.
-      device: that painted.
+      digests: of the policies, so that a file that was replaced is read again.
+    """
+    task = get_task(task_name)
+    return [load_policy(path, task) for path in files] or [random_policy(task)]
 
-    Returns:
-      Its commit record, and a call that waits until it is delivered.
+
+def stored_episodes(job: Job) -> Episodes:
+    """Read the episodes of a job from the release that has them.
 
     Raises:
-      StoreError: it cannot be written or delivered.
+      StoreError: the shard is damaged.
     """
-    folder = staging_folder_of(site).prepare(record)
-    commit = write_shard(folder, record, shard, arrays, lengths, environment(device))
-    (folder / commit_path(record.name, shard)).unlink()  # it belongs to the delivery
-    return commit, site.deliver(folder, commit)
+    assert job.stored
+    subset = job.stored.subset
+    if broken := damage(Path(subset.root), subset.record, job.shard):
+        raise StoreError(f"{subset.name} shard {job.shard}: {broken}; run `dmcvb-gen regenerate {subset.root}`")
+    index = np.asarray(job.episodes)
+    physics, length = subset.read("physics", index), subset.read("length", index)
+    labels = None if job.stored.new_labels else subset.labels(index)[:, : int(length.max()) + 1]
+    copied = {} if job.stored.in_place else {name: subset.read(name, index) for name in COPIED} | {"physics": physics}
+    return Episodes(index, physics, length, copied, labels)
 
 
-def painted_arrays(
-    job: Job, record: SubsetRecord, simulation: Simulation, tick: ProgressCallback
+def inputs_of(job: Job, record: SubsetRecord) -> Inputs:
+    """The policy files and videos of a subset on this machine."""
+    return job.inputs or staging_folder_of(job.site).inputs(record)
+
+
+# -- rendering and storing ------------------------------------------------------------------------
+
+
+def shard_arrays(
+    job: Job, record: SubsetRecord, episodes: Episodes, tick: ProgressCallback = ignore
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of a shard, one at a time: pictures, labels, and what was simulated."""
-    task, rows = get_task(record.task), simulation.state.shape[1]
+    """The arrays of a shard, made one at a time: pictures, labels, states, depth and segmentation.
+
+    Yields:
+      (name, (episode, row, ...)), or (name, (episode,)) for arrays without steps.
+    """
+    task, length, rows = get_task(record.task), episodes.length, episodes.physics.shape[1]
     renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
-    episodes, physics, length = simulation.episodes, simulation.physics, simulation.length
-    exogenous = distractor_state_of(record, job.seed, job.names, episodes, physics, length, videos)
+    labels = episodes.labels
+    if labels is None:
+        labels = distractor_state_of(record, job.seed, job.names, episodes.index, episodes.physics, length, videos)
+    physics = episodes.physics[:, : len_rows(labels)]
     if record.pixels:
-        physics = physics[:, : len_rows(exogenous)]
-        arrays = stored_pictures(record, bool(task.goal_geoms))
-        yield from paint(task, renderer, physics, exogenous, length, rows, tick, arrays)
+        pictures = stored_pictures(record, bool(task.goal_geoms))
+        yield from paint(task, renderer, physics, labels, length, rows, tick, pictures)
     else:
         tick(int((length + 1).sum()))
-    yield from label_arrays(exogenous, length, rows)
-    yield from simulation.arrays().items()
+    if job.in_place:
+        return
+    yield from label_arrays(labels, length, rows)
+    yield from episodes.arrays.items()
+    for label in job.labels:
+        yield from paint_labels(task, renderer, physics, labels, length, rows, label, record.hidden_goal)
+
+
+def _write_and_commit(job: Job, record: SubsetRecord, arrays: Iterator[tuple[str, np.ndarray]], lengths: np.ndarray):
+    """Write a shard and commit it: its commit record, and a function that waits until it is in the release.
+
+    Raises:
+      StoreError: it cannot be written, or another machine has committed this shard with other bytes.
+    """
+    made_by = environment(job.device)
+    if job.stored and job.in_place:
+        subset = job.stored.subset
+        added = write_pictures(Path(subset.root), record, subset.commits[job.shard], arrays, made_by)
+        return added, lambda: None
+    folder = staging_folder_of(job.site).prepare(record)
+    commit = write_shard(folder, record, job.shard, arrays, lengths, made_by)
+    (folder / commit_path(record.name, job.shard)).unlink()  # it is delivered last
+    return commit, job.site.deliver(folder, commit)
 
 
 class Stopwatch:
-    """The time that an iterator takes for its items, apart from what is done with them."""
+    """Measure the time that an iterator takes for its items, without what the caller does with them."""
 
     def __init__(self):
         self.seconds = 0.0
 
     def time(self, items: Iterator) -> Iterator:
-        """The items."""
+        """The same items."""
         started = time.perf_counter()
         for item in items:
             self.seconds += time.perf_counter() - started

@@ -21,16 +21,14 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.dataset.manifest import SubsetRecord
-from dmcvb_gen.dataset.pictures import stored_pictures
 from dmcvb_gen.dataset.schema import PIXEL_CHUNK_STEPS, EpisodeShape, create_arrays, picture_layout_for, subset_specs
 from dmcvb_gen.dataset.writer import find_array
-from dmcvb_gen.generate.engine import inputs_of, simulate_job
+from dmcvb_gen.generate.engine import Episodes, inputs_of, shard_arrays, simulated_episodes
 from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.plan import Plan
-from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, renderers
+from dmcvb_gen.generate.render import distractor_state_of, renderers
 from dmcvb_gen.names import ANT_MAZE, LOCOMOTION, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, ignore, in_order
-from dmcvb_gen.policies.simulate import Simulation
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
@@ -102,43 +100,38 @@ def _alike(record: SubsetRecord) -> tuple:
     return _trajectory(record) if record.family == LOCOMOTION else (ANT_MAZE, *_trajectory(record)[1:])
 
 
-def _simulate(job: Job, count: int, threads: int) -> tuple[Simulation, float]:
+def _simulate(job: Job, count: int, threads: int) -> tuple[Episodes, float]:
     """Whole episodes of a trajectory, and the seconds that a step takes one core without pictures."""
-    simulate_job(job, max_steps=1)  # models are compiled, policies read
+    simulated_episodes(job, max_steps=1)  # models are compiled, policies read
     started = time.perf_counter()
-    timed = simulate_job(job, max_steps=TIMED_STEPS)
+    timed = simulated_episodes(job, max_steps=TIMED_STEPS)
     seconds = (time.perf_counter() - started) / timed.length.sum()
-    return simulate_job(job, min(threads, count), episodes=range(count)), seconds  # what is timed had one thread
+    return simulated_episodes(job, min(threads, count), episodes=range(count)), seconds  # what is timed had one thread
 
 
-def _paint(job: Job, record: SubsetRecord, sample: Simulation) -> tuple[float, float]:
+def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, float]:
     """Seconds and bytes a step of painting and storing one setting."""
     task, chunk = get_task(record.task), min(PIXEL_CHUNK_STEPS, record.max_steps + 1)
-    renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
-    exogenous = distractor_state_of(
-        record, job.seed, job.names, sample.episodes, sample.physics, sample.length, videos
+    _, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
+    labels = distractor_state_of(
+        record, job.seed, job.names, sample.index, sample.physics, sample.length, videos
     )  # of whole episodes: a walk's camera is elsewhere at their end
     runs = _runs(sample.length + 1, chunk)
     episode, row = (np.array([[run[i] for run in runs]]).T for i in (0, 1))
     row = np.minimum(row + np.arange(chunk), sample.length[episode])
-    physics, labels = sample.physics[episode, row], exogenous[episode, row]
+    values = {name: value[episode, row] for name, value in sample.arrays.items() if value.ndim > 1}
     length = np.full(len(runs), chunk - 1)
-    paint_once = list(paint(task, renderer, physics[:1, :2], labels[:1, :2], length[:1] * 0 + 1, 2))
-    del paint_once  # kernels are compiled and buffers made
+    timed = Episodes(sample.index[episode[:, 0]], sample.physics[episode, row], length, values, labels[episode, row])
+    first = Episodes(timed.index[:1], timed.physics[:1, :2], length[:1] * 0 + 1, {}, labels[episode, row][:1, :2])
+    for _ in shard_arrays(job, record, first):
+        pass  # kernels are compiled and buffers made
     specs, layout = subset_specs(EpisodeShape.of(task), record), picture_layout_for(record.setting)
     with tempfile.TemporaryDirectory() as folder:
         group = zarr.create_group(folder)
         create_arrays(group, specs, len(runs), chunk, len(runs), layout)
         started = time.perf_counter()
-        stored = stored_pictures(record, bool(task.goal_geoms))
-        pictures = paint(task, renderer, physics[:, : len_rows(labels)], labels, length, chunk, arrays=stored)
-        for name, value in pictures:
+        for name, value in shard_arrays(job, record, timed):
             find_array(group, name)[0][:] = value
-        for name, value in label_arrays(labels, length, chunk):
-            find_array(group, name)[0][:] = value
-        for name, value in sample.arrays().items():
-            if value.ndim > 1:
-                find_array(group, name)[0][:] = value[episode, row]
         seconds = time.perf_counter() - started
         files = [path for path in Path(folder).rglob("*") if path.is_file() and path.name != "zarr.json"]
         size = sum(path.stat().st_size for path in files)

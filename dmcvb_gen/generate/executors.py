@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
+import queue
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
 from dmcvb_gen.generate.engine import JobResult, run_job
 from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.render import frame_count
 from dmcvb_gen.generate.site import leave
-from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.parallel import Needs, Pool, ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.tasks import get_task
 
 PROCESS_BYTES = 1 << 30
@@ -49,6 +51,37 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: ProgressCallback =
                 leave(site)
 
 
+def run_arriving(
+    arriving: queue.SimpleQueue, pool: Pool, job_of: Callable[[Any], Job | None]
+) -> Iterator[tuple[Job, JobResult]]:
+    """Run jobs as they come, e.g. while the shards that they read are still being downloaded.
+
+    Args:
+      arriving: items to do, an exception to raise, or None at the end.
+      job_of: the job of an item, None if noitem is left to do for it.
+    """
+    ended, running = False, 0
+    results: Iterator[tuple[Job, JobResult]] = iter(())
+    while not ended or running:
+        while not ended:
+            try:
+                item = arriving.get(block=not running)  # there is noitem else to wait for
+            except queue.Empty:
+                break
+            if isinstance(item, BaseException):
+                raise item
+            ended = item is None
+            if not ended and (job := job_of(item)) is not None:
+                pool.submit(job, run_job, job)
+                running += 1
+        done = next(results, None)
+        if done is not None:
+            running -= 1
+            yield done
+        elif running:
+            results = pool.results()
+
+
 class _Expected:
     """How many frames jobs paint, all in all: full episodes where none is known, then such as those that are done."""
 
@@ -78,6 +111,9 @@ class _Expected:
 
     @staticmethod
     def _planned(job: Job) -> int:
+        if job.stored:
+            steps = job.stored.subset.commits[job.shard].steps
+            return sum(frame_count(record, steps, len(job.episodes)) for record in job.subsets)
         count = len(job.episodes)
         return sum(frame_count(record, count * record.max_steps, count) for record in job.subsets)
 

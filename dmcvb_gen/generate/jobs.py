@@ -1,7 +1,7 @@
-"""The one maker of jobs: a release's manifest and some of its shards in, the work that makes them out.
+"""Jobs: the shards of a release that are to be made, each with all that decides its bytes.
 
-A job is one shard of one trajectory: the fixed run of episodes is simulated once and painted for every setting that
-shares it. It depends on nothing but the manifest, its policies and its videos, so a rollout, a repair and a worker on
+A job is one shard of one trajectory: the fixed run of episodes is simulated once and rendered for every subset that
+shares it. It depends on the manifest, its policies and its videos alone, so a rollout, a repair and a worker on
 another machine make the same bytes.
 """
 
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.manifest import Manifest, SubsetRecord
 from dmcvb_gen.dataset.shards import ShardKey
 from dmcvb_gen.dataset.writer import shard_episodes
@@ -44,16 +45,33 @@ class Inputs:
 
 
 @dataclass(frozen=True)
-class Job:
-    """One shard of subsets that share a trajectory, to be simulated once and painted for each of them.
+class Stored:
+    """The source of a job whose states are read instead of simulated.
 
     Attributes:
-      site: where the release is made.
-      subsets: the records of the subsets to write, one or more settings of a task and level.
+      subset: the subset to read from.
+      new_labels: draw the distractors from the episodes' streams instead of using the stored ones.
+      in_place: add pictures to this very subset's shard; everything else stays as it is.
+    """
+
+    subset: Subset
+    new_labels: bool = False
+    in_place: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """One shard of subsets that share a trajectory: its states are simulated (or read) once and rendered for each.
+
+    Attributes:
+      site: the release to write to.
+      subsets: the records of the subsets to write, one or more of a task and level.
       shard: index of the shard.
       inputs: policies and videos; None: the release's own copies.
-      seed, names: the streams of the simulation.
-      device: where pictures are painted.
+      seed, names: the random streams of the episodes.
+      device: renders the pictures, "cpu" or "cuda".
+      stored: where states are read from; None: they are simulated.
+      labels: "depth" and "segmentation", stored beside the pixels.
     """
 
     site: Site
@@ -63,6 +81,13 @@ class Job:
     seed: int
     names: tuple[str, ...]
     device: str = "cpu"
+    stored: Stored | None = None
+    labels: tuple[str, ...] = ()
+
+    @property
+    def in_place(self) -> bool:
+        """Whether pictures are added to a shard that is there."""
+        return self.stored is not None and self.stored.in_place
 
     @property
     def episodes(self) -> range:
@@ -80,13 +105,17 @@ def make_jobs(
     site: Site,
     inputs: Mapping[str, Inputs] | None = None,
     device: str | None = None,
+    stored: Mapping[str, Stored] | None = None,
+    labels: tuple[str, ...] = (),
 ) -> tuple[Job, ...]:
     """The jobs that make shards; subsets that share trajectories are simulated once.
 
     Args:
-      site: where the jobs write to.
+      site: the release that the jobs write to.
       inputs: of each subset, by name; the release's own copies by default.
-      device: paint there instead of where the manifest says.
+      device: render there instead of on the manifest's device.
+      stored: where the states of each subset are read from, by name; by default they are simulated.
+      labels: see `Job`.
 
     Raises:
       RecipeError: the manifest does not say the goals of a subset with fixed ones.
@@ -97,11 +126,12 @@ def make_jobs(
             raise RecipeError(f"the manifest does not say the goals of {name}; make it from its recipe again")
         where = device or record.renderer.get("device") or "cpu"
         seed = manifest.recipe_of(name).get("seed", 0)
-        key = (*_trajectory(manifest, record), seed, shard, inputs and inputs[name], where)
+        source = stored[name] if stored else None  # which no two subsets share
+        key = (*_trajectory(manifest, record), source, seed, shard, inputs and inputs[name], where)
         groups.setdefault(key, []).append(record)
     return tuple(
-        Job(site, tuple(records), shard, given, seed, names, where)
-        for (names, *_, seed, shard, given, where), records in groups.items()
+        Job(site, tuple(records), shard, given, seed, names, where, source, labels)
+        for (names, *_, source, seed, shard, given, where), records in groups.items()
     )
 
 

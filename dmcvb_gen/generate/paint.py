@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import os
 import queue
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.index import INDEX, ZARR_JSON, refuse_altered_folder
@@ -27,22 +25,22 @@ from dmcvb_gen.dataset.manifest import (
     Manifest,
     SubsetRecord,
     commit_path,
-    environment,
     write_json_atomically,
 )
 from dmcvb_gen.dataset.pictures import Pictures, picture_of, stored_pictures
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
-from dmcvb_gen.dataset.shards import ShardKey, chosen_shards, damage, read_commit
-from dmcvb_gen.dataset.writer import add_arrays, finish_release, finish_together, write_lock, write_pictures
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
+from dmcvb_gen.dataset.shards import ShardKey, chosen_shards, read_commit
+from dmcvb_gen.dataset.writer import add_arrays, finish_release, finish_together, write_lock
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import copy_file, sha256_file, write_json
-from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.generate.executors import run_arriving
+from dmcvb_gen.generate.jobs import Inputs, Job, Stored, background_source
 from dmcvb_gen.generate.plan import painting_facts, subset_attributes
 from dmcvb_gen.generate.recipe import check_size
 from dmcvb_gen.generate.regenerate import environment_diff
-from dmcvb_gen.generate.render import frame_count, paint, renderers
+from dmcvb_gen.generate.render import frame_count
+from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.storage.remote import local_path, storage_errors
@@ -56,12 +54,15 @@ REPAINTED = "-repainted"
 
 @dataclass(frozen=True)
 class RenderOverrides:
-    """How pictures are to be, where not as the manifest says.
+    """Ask for other pictures than the manifest describes; None keeps what the manifest says.
 
     Attributes:
       size: pixels a side.
       views: of mazes, only these.
-      goal: of mazes, only the pictures with it ("visible") or without it ("hidden"), and no others.
+      goal: of mazes, only the pictures with the goal ("visible") or without it ("hidden").
+
+    Raises:
+      DmcvbError: a size that no renderer takes, or an unknown kind of goal.
     """
 
     size: int | None = None
@@ -75,7 +76,7 @@ class RenderOverrides:
             raise DmcvbError(f"goal {self.goal!r} is unknown; give one of {', '.join(GOAL_PICTURES)}")
 
     def of(self, record: SubsetRecord) -> SubsetRecord:
-        """The record of a subset that looks so.
+        """The record of a subset with these pictures.
 
         Raises:
           UnknownNameError: it has no such view.
@@ -91,54 +92,35 @@ class RenderOverrides:
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """Who paints, and how.
+    """How pictures are rendered.
 
     Attributes:
-      look: of the pictures.
+      overrides: pictures other than the manifest's.
       workers: processes, or a Ray cluster that sees the same folder.
       device: "cpu" or "cuda".
-      backgrounds: where the videos are now, where the release has no copies.
-      tick: told how many frames were painted since the last call.
-      tell: told what is other here than where the release was made, before anything is painted.
+      backgrounds: folder of the videos, if the release has no copies.
+      progress: called with the number of frames rendered since the last call.
+      notify: called with a line for each difference to the environment that made the release, before rendering.
     """
 
-    look: RenderOverrides = RenderOverrides()
+    overrides: RenderOverrides = RenderOverrides()
     workers: Workers = 1
     device: str = "cpu"
     backgrounds: str | None = None
-    tick: ProgressCallback = ignore
-    tell: Callable[[str], None] = field(default=ignore)
-
-
-@dataclass(frozen=True)
-class PaintShard:
-    """One shard to be painted in place.
-
-    Attributes:
-      subset: read from and written to.
-      shard: index.
-      backgrounds: "builtin" or the folder of its videos.
-      device: where pictures are painted.
-      known: whether its pictures should have the digests that its record knows.
-    """
-
-    subset: Subset
-    shard: int
-    backgrounds: str
-    device: str = "cpu"
-    known: bool = True
+    progress: ProgressCallback = ignore
+    notify: Callable[[str], None] = field(default=ignore)
 
 
 @dataclass(frozen=True)
 class RenderResult:
-    """What painting gave.
+    """The result of painting.
 
     Attributes:
       manifest: of the release, with its digests.
       shards: how many were painted.
-      known: of these, how many had known digests.
-      differing: "<subset> shard <n>" of those whose pictures are not the known ones.
-      drift: what here differs from where the release was made, in words.
+      known: how many of these had known digests.
+      differing: "<subset> shard <n>" of those whose pictures do not have the known digests.
+      drift: how this machine differs from the one that made the release, in words.
     """
 
     manifest: Manifest
@@ -152,140 +134,145 @@ def paint_release(
     root: str | Path,
     only: Sequence[str] = (),
     episodes: tuple[int, int] | None = None,
-    painter: RenderConfig | None = None,
+    config: RenderConfig | None = None,
 ) -> RenderResult:
-    """Fill in the pictures of a release; what is painted already is left alone, so run again it goes on.
+    """Render the missing pictures of a release. Shards that have pictures stay as they are.
 
     Args:
       root: the release's folder.
       only: subset patterns, all by default.
       episodes: (first, last + 1) of each subset; the shards that hold any of them are painted.
-      painter: who paints, and how.
+      config: how to render.
 
     Raises:
-      DmcvbError: nothing fits, a shard is damaged, the videos are not those of the manifest, pictures of another look
-        are there already, or the disk is full.
+      DmcvbError: nothing matches, a shard is damaged, the videos are not those of the manifest, the release has (or
+        another process is rendering) pictures of another size or views, or the disk is full.
     """
-    root, painter = Path(root), painter or RenderConfig()
+    root, config = Path(root), config or RenderConfig()
     open_release(root)  # or says what is wrong with it
     with storage_errors(root, "write to"), write_lock(root, wait=60):
         release = open_release(root)
         shards = [key for key in chosen_shards(release.manifest, only, episodes) if key[0] in release.subsets]
         todo = [key for key in shards if (c := release[key[0]].commits.get(key[1])) and not c.painted]
-        studio = RenderSession.open(release, {name for name, _ in shards}, painter, needed={name for name, _ in todo})
-        studio.expect([release[name].commits[shard] for name, shard in todo])
+        session = RenderSession.open(release, {name for name, _ in shards}, config, needed={name for name, _ in todo})
+        session.expect([release[name].commits[shard] for name, shard in todo])
     waiting: queue.SimpleQueue = queue.SimpleQueue()
     for key in [*todo, None]:
         waiting.put(key)
-    found = tuple(studio.paint(waiting))
-    unfinished = todo or studio.manifest.digest is None  # or one who painted it all was stopped before the end
-    manifest = finish_together(root) if unfinished else studio.manifest
-    return studio.report(manifest, found)
+    found = tuple(session.paint(waiting))
+    unfinished = todo or session.manifest.digest is None  # or a painter of all of it was stopped before the end
+    manifest = finish_together(root) if unfinished else session.manifest
+    return session.report(manifest, found)
 
 
 @dataclass(frozen=True)
 class RenderSession:
-    """A release's folder that is ready to be painted in: its manifest says which pictures, and its arrays are there.
+    """A release that is ready to be painted: its manifest says which pictures it has, and the arrays exist.
 
     Attributes:
       root, manifest: of the release.
       backgrounds: of each subset to paint, "builtin" or the folder of its videos.
-      known: subsets whose pictures should have the digests that are known.
+      known: subsets whose pictures must have the digests that are known.
       drift: see `RenderResult`.
     """
 
     root: Path
     manifest: Manifest
-    painter: RenderConfig
+    config: RenderConfig
     backgrounds: Mapping[str, str]
     known: frozenset[str]
     drift: tuple[str, ...]
 
     @classmethod
     def open(
-        cls, release: Release, names: set[str], painter: RenderConfig, needed: set[str], painted: set[str] | None = None
+        cls,
+        release: Release,
+        names: set[str],
+        config: RenderConfig,
+        needed: set[str],
+        painted: Collection[str] = (),
     ) -> RenderSession:
-        """Make a release ready; its folder must be locked.
+        """Claim the pictures of a release, whose folder must be locked, and create the arrays for them.
+
+        A subset's pictures are decided by the first who paints any of it: then its record says `pixels`, and nobody
+        can ask for others.
 
         Args:
           names: subsets that are asked for.
-          needed: of these, the ones that have (or will have) shards to paint.
-          painted: of these, the ones that have (or will have) shards with pictures; by default those here that have.
+          needed: those of them that have (or will have) shards to paint.
+          painted: those of them that will have shards with pictures, besides the ones that have some here.
 
         Raises:
           DmcvbError: see `paint_release`.
         """
-        root, manifest, look = release.path, release.manifest, painter.look
-        if manifest.imported:
-            raise StoreError(f"{root} was imported and has no physics states to paint from")
+        root, manifest, overrides = release.path, release.manifest, config.overrides
         old = {record.name: record for record in manifest.subsets}
         asked = [record for name, record in old.items() if name in names]
-        if look.goal and not any(get_task(record.task).goal_geoms for record in asked):
-            raise DmcvbError("--goal is for ant-maze tasks, and none of them is asked for; leave it away")
-        new = {record.name: look.of(record) for record in asked}
+        if any(record.imported for record in asked):
+            raise StoreError(f"{root} was imported and has no physics states to paint from")
+        if overrides.goal and not any(get_task(record.task).goal_geoms for record in asked):
+            raise DmcvbError("--goal is for ant-maze tasks, and none of them is selected; remove it")
+        new = {record.name: overrides.of(record) for record in asked}
         changed = {name for name, record in new.items() if record != old[name]}
-        if painted is None:
-            painted = {n for n, s in release.subsets.items() if any(c.painted for c in s.commits.values())}
-        for name in sorted(changed & painted):
-            raise _has_others(old[name])
-        sources = {name: background_source(root, new[name], painter.backgrounds) for name in sorted(needed)}
-        told = drift(manifest, [new[name] for name in sorted(needed)], sources, painter.device)
-        for text in told:
-            painter.tell(text)
+        for name in sorted(changed):
+            if old[name].pixels or name in painted:
+                raise _has_others(old[name])
+        sources = {name: background_source(root, new[name], config.backgrounds) for name in sorted(needed)}
+        differences = render_differences(manifest, [new[name] for name in sorted(needed)], sources, config.device)
+        for text in differences:
+            config.notify(text)
         known = frozenset(name for name, record in new.items() if record.size == old[name].size) - _resized(manifest)
         if needed:
-            manifest = _make_room(root, manifest, {name: new[name] for name in changed | needed}, changed, look)
-        return cls(root, manifest, painter, sources, known, told)
+            manifest = _make_room(root, manifest, {name: new[name] for name in changed | needed}, changed, overrides)
+        return cls(root, manifest, config, sources, known, differences)
 
     def expect(self, commits: Iterable[CommitRecord]) -> None:
-        """Tell the painter's tick how many frames the shards of some commit records have."""
+        """Tell the progress callback how many frames the shards of some commit records have."""
         records = {record.name: record for record in self.manifest.subsets}
         frames = (frame_count(records[c.subset], c.steps, c.episode_count) for c in commits)
-        expect(self.painter.tick, sum(frames))
+        expect(self.config.progress, sum(frames))
 
     def paint(self, arriving: queue.SimpleQueue) -> Iterator[tuple[str, bool, bool]]:
-        """Paint shards as they come; what `paint_shard` gives of each.
+        """Paint shards as they come.
 
         Args:
-          arriving: (subset, shard) of committed shards, an exception to raise, or None at the end; what somebody else
-            has painted meanwhile is left alone.
-        """
-        with open_pool(self.painter.workers, tick=self.painter.tick) as pool:
-            ended, at_work = False, 0
-            results: Iterator[tuple[Any, Any]] = iter(())
-            while True:
-                while not ended:
-                    try:
-                        key = arriving.get(block=not at_work)  # there is nothing else to wait for
-                    except queue.Empty:
-                        break
-                    if isinstance(key, BaseException):
-                        raise key
-                    ended = key is None
-                    work = None if key is None else self._work(key)
-                    if work and not work.subset.commits[work.shard].painted:
-                        pool.submit(key, paint_shard, work)
-                        at_work += 1
-                if ended and not at_work:
-                    return
-                done = next(results, None)
-                if done is None:
-                    results = pool.results()
-                    continue
-                at_work -= 1
-                yield done[1]
+          arriving: (subset, shard) of committed shards, an exception to raise, or None at the end. Shards that
+            another process has painted in the meantime are left alone.
 
-    def _work(self, key: ShardKey) -> PaintShard:
+        Yields:
+          The shard's name; whether digests of its pictures were known; whether the pictures have them.
+        """
+        with open_pool(self.config.workers, tick=self.config.progress) as pool:
+            for job, result in run_arriving(arriving, pool, self._job):
+                yield self._compared(job, result.commits[0])
+
+    def _job(self, key: ShardKey) -> Job | None:
+        """The job that paints a shard, None if it is painted."""
         name, shard = key
         record = next(record for record in self.manifest.subsets if record.name == name)
         commit = read_commit(self.root, record, shard)
         if commit is None:
             raise StoreError(f"{name} shard {shard} has no commit record; run `dmcvb-gen regenerate {self.root}`")
-        subset = Subset(str(self.root), record, {shard: commit}, {})
-        return PaintShard(subset, shard, self.backgrounds[name], self.painter.device, name in self.known)
+        if commit.painted:
+            return None
+        source = Stored(Subset(str(self.root), record, {shard: commit}, {}), in_place=True)
+        inputs = Inputs(backgrounds=self.backgrounds[name])
+        return Job(FolderSite(self.root), (record,), shard, inputs, 0, (), self.config.device, source)
+
+    def _compared(self, job: Job, painted: CommitRecord) -> tuple[str, bool, bool]:
+        assert job.stored
+        subset, record = job.stored.subset, job.subsets[0]
+        name = f"{subset.name} shard {job.shard}"
+        if subset.name not in self.known:
+            return name, False, True
+        stored = {file.path: file for file in painted.files}
+        pictures = stored_pictures(record, bool(get_task(record.task).goal_geoms))
+        folders = {f"{subset.name}.zarr/{subset.paths[picture]}" for picture in pictures}
+        known = [file for file in subset.commits[job.shard].pictures if file.path.split("/c/")[0] in folders]
+        return name, bool(known), all(stored.get(file.path) == file for file in known)
 
     def report(self, manifest: Manifest, found: Iterable[tuple[str, bool, bool]]) -> RenderResult:
-        """What came of it."""
+        """The result, from what `paint` yielded."""
         found = list(found)
         differing = tuple(sorted(name for name, had, same in found if had and not same))
         return RenderResult(manifest, len(found), sum(had for _, had, _ in found), differing, self.drift)
@@ -297,18 +284,19 @@ def _resized(manifest: Manifest) -> frozenset[str]:
 
 
 def _has_others(record: SubsetRecord) -> StoreError:
-    """The error where a subset has pictures of another look than is asked for."""
+    """The error if a subset has other pictures than are asked for, or another process is painting them."""
     views = "" if record.views == ("pixels",) else f", views {', '.join(record.views)}"
     return StoreError(
-        f"{record.name} has pictures already, and others than asked for: {record.size} pixels a side{views}; leave "
-        "--size, --views and --goal away to go on with those, or paint others beside with `dmcvb-gen repaint`"
+        f"{record.name} has pictures already (or is being painted), and others than asked for: {record.size} pixels a "
+        f"side{views}; remove --size, --views and --goal to go on with those, or write a second release with "
+        "`dmcvb-gen repaint`"
     )
 
 
-def drift(
+def render_differences(
     manifest: Manifest, records: Iterable[SubsetRecord], backgrounds: Mapping[str, str], device: str = "cpu"
 ) -> tuple[str, ...]:
-    """What here may paint other bits than where a release was made, in words: versions, processor, the painter.
+    """What may make other pixels here than where a release was made, in words: versions, processor, renderer.
 
     Args:
       records: of the subsets to paint.
@@ -329,7 +317,7 @@ def drift(
 
 
 def _make_room(
-    root: Path, manifest: Manifest, new: Mapping[str, SubsetRecord], changed: set[str], look: RenderOverrides
+    root: Path, manifest: Manifest, new: Mapping[str, SubsetRecord], changed: set[str], overrides: RenderOverrides
 ) -> Manifest:
     """Say that subsets have pictures, and which, and give them the (empty) arrays for them."""
     subsets = tuple(
@@ -338,7 +326,7 @@ def _make_room(
     )
     facts: dict[str, Any] = {"subsets": subsets, "digest": None}
     if changed:
-        facts |= _derived(root, manifest, subsets, changed, look)
+        facts |= _derived(root, manifest, subsets, changed, overrides)
     with storage_errors(root, "write to"):
         refuse_altered_folder(root, manifest)
         manifest = manifest.model_copy(update=facts)
@@ -352,7 +340,7 @@ def _make_room(
 
 
 def _derived(
-    root: Path, old: Manifest, subsets: Sequence[SubsetRecord], changed: set[str], look: RenderOverrides
+    root: Path, old: Manifest, subsets: Sequence[SubsetRecord], changed: set[str], overrides: RenderOverrides
 ) -> dict[str, Any]:
     """Name and lineage of a release that is painted otherwise than it was."""
     sizes = {record.name: record.size for record in old.subsets}
@@ -363,57 +351,15 @@ def _derived(
         "manifest_sha256": published[0] if published else sha256_file(root / MANIFEST),
         "subsets": {name: name for name in sorted(changed)},
         "resized": sorted(record.name for record in subsets if record.size != sizes[record.name]),
-        "size": look.size,
-        "views": None if look.views is None else list(look.views),
-        "goal": look.goal,
+        "size": overrides.size,
+        "views": None if overrides.views is None else list(overrides.views),
+        "goal": overrides.goal,
     }
     name = old.name if old.name.endswith(REPAINTED) else f"{old.name[:80]}{REPAINTED}"
     return {"name": name, "lineage": (*old.lineage, entry)}
 
 
-def paint_shard(work: PaintShard, tick: ProgressCallback = ignore) -> tuple[str, bool, bool]:
-    """Paint one shard in place.
-
-    Returns:
-      Its name; whether digests of its pictures were known; whether they have them.
-
-    Raises:
-      StoreError: the shard is damaged, or cannot be written.
-    """
-    subset, record, root = work.subset, work.subset.record, Path(work.subset.root)
-    broken = damage(root, record, work.shard)
-    if broken:
-        raise StoreError(f"{subset.name} shard {work.shard}: {broken}; run `dmcvb-gen regenerate {root}`")
-    commit = subset.commits[work.shard]
-    pictures = shard_pictures(subset, np.arange(*commit.episodes), work.backgrounds, work.device, tick)
-    painted = write_pictures(root, record, commit, pictures, environment(work.device))
-    stored = {file.path: file for file in painted.files}
-    folders = {f"{subset.name}.zarr/{subset.paths[name]}" for name in _stored(record)}
-    known = [file for file in commit.pictures if work.known and file.path.split("/c/")[0] in folders]
-    same = all(stored.get(file.path) == file for file in known)
-    return f"{subset.name} shard {work.shard}", bool(known), same
-
-
-def shard_pictures(
-    subset: Subset, episodes: np.ndarray, backgrounds: str, device: str = "cpu", tick: ProgressCallback = ignore
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Picture arrays of episodes, painted from what is stored of them, see `rollout.painting.paint`."""
-    record, task = subset.record, get_task(subset.task)
-    length = subset.read("length", episodes)
-    used = int(length.max()) + 1
-    physics = subset.read("physics", episodes)[:, :used]
-    exogenous = DistractorState(
-        **{name: subset.read(f"exogenous/{name}", episodes)[:, :used] for name in DISTRACTOR_STATE_NAMES}
-    )
-    renderer, _ = renderers.get(record, backgrounds, device)
-    yield from paint(task, renderer, physics, exogenous, length, record.max_steps + 1, tick, _stored(record))
-
-
-def _stored(record: SubsetRecord) -> tuple[str, ...]:
-    return stored_pictures(record, bool(get_task(record.task).goal_geoms))
-
-
-# -- leaving them behind --------------------------------------------------------------------------
+# -- releases without pictures --------------------------------------------------------------------
 
 
 def without_pictures(root: str | Path, out: str | Path) -> Manifest:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.manifest import SubsetRecord
-from dmcvb_gen.dataset.pictures import picture_arrays
+from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.names import distractor_of
+from dmcvb_gen.names import LABEL_TYPES, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.base import Renderer
@@ -26,6 +26,8 @@ from dmcvb_gen.tasks.base import Task
 
 PAINT_FRAMES = 2004
 """Frames painted between two ticks of the progress bar."""
+LABEL_FRAMES = 512
+"""Frames of depth and segmentation that are rendered at once."""
 SIMULATION_STREAMS = ("initial_state", "policy")
 """Streams of an episode that the simulation uses; the others are the distractors'."""
 
@@ -243,3 +245,31 @@ def label_arrays(exogenous: DistractorState, length: np.ndarray, rows: int) -> I
         full[:, : value.shape[1]] = value
         full[np.arange(rows)[None] > length[:, None]] = 0
         yield f"exogenous/{name}", full
+
+
+def paint_labels(
+    task: Task,
+    renderer: Renderer,
+    physics: np.ndarray,
+    exogenous: DistractorState,
+    length: np.ndarray,
+    rows: int,
+    label: str,
+    hide_goal: bool,
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Depth or segmentation of what the subset's pictures show, one array a view.
+
+    Args:
+      label: "depth" or "segmentation".
+
+    Yields:
+      (name, (episode, rows, size, size)); rows past an episode's end stay zero.
+    """
+    episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
+    for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
+        out = np.zeros((len(physics), rows, renderer.size, renderer.size), LABEL_TYPES[label])
+        for first in range(0, len(episode), LABEL_FRAMES):
+            e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
+            found = renderer.render_labels(physics[e, r], exogenous[e, r], [view], hide_goal)
+            out[e, r] = found[label][:, 0]
+        yield name, out

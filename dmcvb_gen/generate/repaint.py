@@ -8,46 +8,41 @@ the very bytes that rolling it out would have given.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dmcvb_gen.dataset import Release, open_release
-from dmcvb_gen.dataset.manifest import MANIFEST, CommitRecord, Manifest, SubsetRecord, VersionEntry, environment
-from dmcvb_gen.dataset.pictures import stored_pictures, view_arrays
+from dmcvb_gen.dataset.manifest import MANIFEST, Manifest, SubsetRecord, VersionEntry, environment
+from dmcvb_gen.dataset.pictures import view_arrays
 from dmcvb_gen.dataset.reader import Subset, load_manifest
 from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, subset_specs
-from dmcvb_gen.dataset.shards import damage
 from dmcvb_gen.dataset.writer import create_subset, finish_together, read_commits, start_release
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.generate.engine import make_shard
-from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, make_jobs, policy_files, recipe_of, stream_names, video_source
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.jobs import (
+    BUILTIN,
+    Inputs,
+    Stored,
+    make_jobs,
+    policy_files,
+    recipe_of,
+    stream_names,
+    video_source,
+)
 from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
 from dmcvb_gen.generate.recipe import Recipe, check_size, make_recipe
 from dmcvb_gen.generate.render import (
     check_renderer,
-    distractor_state_of,
-    frame_count,
-    label_arrays,
-    len_rows,
-    paint,
-    renderers,
 )
-from dmcvb_gen.generate.site import FolderSite, leave
+from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, distractor_of, family_of, select
-from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, run_all
+from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
-
-COPIED = ("state", "action", "reward", "discount", "physics")
-COPIED_PER_EPISODE = ("length", "terminated", "return", "seed", "behaviour", "goal_pair")
-LABEL_FRAMES = 512
 
 
 @dataclass(frozen=True)
@@ -83,29 +78,20 @@ class Repainting:
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A subset to read from, the record of the one to write, and what that is made from."""
+class Repainted:
+    """A subset to read from, the record of the one to write, and its policies and videos."""
 
     source: Subset
     record: SubsetRecord
     inputs: Inputs
 
     @property
-    def keep_labels(self) -> bool:
-        """Whether the setting, the videos and the styles are what they were."""
+    def keeps_labels(self) -> bool:
+        """Whether the distractor, the videos and the styles are those of the source."""
         old, new = self.source.record, self.record
         videos = [(record.backgrounds or {}).get("digest") for record in (old, new)]
         styles = [record.split if record.family == ANT_MAZE else "" for record in (old, new)]
         return old.setting == new.setting and videos[0] == videos[1] and styles[0] == styles[1]
-
-
-@dataclass(frozen=True)
-class PaintJob:
-    """A job whose episodes are read instead of simulated; a pair for each of its subsets, in their order."""
-
-    job: Job
-    pairs: tuple[Pair, ...]
-    labels: tuple[str, ...]
 
 
 def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
@@ -129,7 +115,7 @@ def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = 
     """
     out = local_path(request.out)
     release, site = _source(request), FolderSite(out)
-    pairs: dict[str, Pair] = {}
+    pairs: dict[str, Repainted] = {}
     for name in select(list(release.subsets), list(request.only)):
         pair = _pair(release, release[name], request)
         taken = pairs.setdefault(pair.record.name, pair)
@@ -151,17 +137,10 @@ def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = 
         todo |= {(record.name, shard): record for shard in missing}
     inputs = {name: pair.inputs for name, pair in pairs.items()}
     copy_inputs(out, [pair.record for pair in pairs.values()], inputs)
-    jobs = [
-        PaintJob(job, tuple(pairs[record.name] for record in job.subsets), tuple(request.labels))
-        for job in make_jobs(manifest, todo, site, inputs, request.device)
-    ]
-    commits = [(pairs[name].record, pairs[name].source.commits[shard]) for name, shard in todo]
-    expect(tick, sum(frame_count(record, commit.steps, commit.episode_count) for record, commit in commits))
-    try:
-        for _ in run_all(paint_shards, jobs, workers, tick=tick):
-            pass
-    finally:
-        leave(site)
+    sources = {name: Stored(pair.source, new_labels=not pair.keeps_labels) for name, pair in pairs.items()}
+    jobs = make_jobs(manifest, todo, site, inputs, request.device, sources, tuple(request.labels))
+    for _ in run_jobs(jobs, workers, tick):
+        pass
     return finish_together(out)
 
 
@@ -201,7 +180,7 @@ def _source(request: Repainting) -> Release:
     return release
 
 
-def _pair(release: Release, subset: Subset, request: Repainting) -> Pair:
+def _pair(release: Release, subset: Subset, request: Repainting) -> Repainted:
     old = subset.record
     setting = _new_setting(subset, request.distractor, request.difficulty)
     backend, samples = request.renderer or old.renderer["name"], request.samples
@@ -221,7 +200,7 @@ def _pair(release: Release, subset: Subset, request: Repainting) -> Pair:
     )
     source = request.backgrounds or _old_backgrounds(release, old)
     record = record.model_copy(update=painting_facts(record, source, request.device))
-    return Pair(subset, record, Inputs(policy_files(release.path, old), source))
+    return Repainted(subset, record, Inputs(policy_files(release.path, old), source))
 
 
 def _old_backgrounds(release: Release, old: SubsetRecord) -> str:
@@ -240,7 +219,7 @@ def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None)
     return DistractorSetting(given.kind, difficulty or given.difficulty).name
 
 
-def _new_manifest(release: Release, pairs: Mapping[str, Pair], request: Repainting) -> Manifest:
+def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Repainting) -> Manifest:
     """The manifest of the new release; subsets that another recipe added there are additions here, too."""
     old = release.manifest
     groups: list[tuple[Recipe, list[SubsetRecord]]] = []
@@ -257,7 +236,7 @@ def _new_manifest(release: Release, pairs: Mapping[str, Pair], request: Repainti
         "manifest_sha256": sha256_file(release.path / MANIFEST),
         "subsets": {name: pair.source.name for name, pair in pairs.items()},
         "streams": {name: list(stream_names(old, pair.source.record)) for name, pair in pairs.items()},
-        "new_labels": [name for name, pair in pairs.items() if not pair.keep_labels],
+        "new_labels": [name for name, pair in pairs.items() if not pair.keeps_labels],
         "labels": list(request.labels),
     }
     manifest = Manifest(
@@ -316,62 +295,3 @@ def _pattern(record: SubsetRecord) -> dict[str, Any]:
         goals = {"fixed_goals": record.fixed_goals, "episodes_per_goal": record.episodes_per_goal}
         pattern |= goals | {"episodes": None}
     return pattern
-
-
-# -- painting -------------------------------------------------------------------------------------
-
-
-def paint_shards(work: PaintJob, tick: ProgressCallback = ignore) -> tuple[CommitRecord, ...]:
-    """Paint and commit a shard of each of a job's subsets.
-
-    Raises:
-      StoreError: a source shard is damaged, or the target cannot be written.
-    """
-    made = [_paint_shard(work.job, pair, work.labels, tick) for pair in work.pairs]
-    for _, wait in made:
-        wait()
-    return tuple(commit for commit, _ in made)
-
-
-def _paint_shard(
-    job: Job, pair: Pair, labels: Sequence[str], tick: ProgressCallback
-) -> tuple[CommitRecord, Callable[[], None]]:
-    source, record, task = pair.source, pair.record, get_task(pair.record.task)
-    broken = damage(Path(source.root), source.record, job.shard)
-    if broken:
-        raise StoreError(f"{source.name} shard {job.shard}: {broken}; run `dmcvb-gen regenerate {source.root}`")
-    episodes = np.asarray(job.episodes)
-    values = {name: source.read(name, episodes) for name in COPIED + COPIED_PER_EPISODE}
-    length, rows = values["length"], record.max_steps + 1
-
-    def arrays() -> Iterator[tuple[str, np.ndarray]]:
-        renderer, videos = renderers.get(record, pair.inputs.backgrounds, job.device)
-        if pair.keep_labels:
-            used = int(length.max()) + 1
-            stored = {name: source.read(f"exogenous/{name}", episodes)[:, :used] for name in DISTRACTOR_STATE_NAMES}
-            exogenous = DistractorState(**stored)
-        else:
-            exogenous = distractor_state_of(record, job.seed, job.names, episodes, values["physics"], length, videos)
-        physics = values["physics"][:, : len_rows(exogenous)]
-        names = stored_pictures(record, bool(task.goal_geoms))
-        yield from paint(task, renderer, physics, exogenous, length, rows, tick, names)
-        yield from label_arrays(exogenous, length, rows)
-        yield from values.items()
-        for label in labels:
-            yield from _label_pictures(task, renderer, physics, exogenous, length, rows, label, record.hidden_goal)
-
-    return make_shard(job.site, record, job.shard, arrays(), length, job.device)
-
-
-def _label_pictures(
-    task, renderer, physics, exogenous, length, rows, label, hide_goal
-) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, (episode, rows, size, size)) of depth or segmentation, a view each, of what the subset's pictures show."""
-    episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
-    for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
-        out = np.zeros((len(physics), rows, renderer.size, renderer.size), LABEL_TYPES[label])
-        for first in range(0, len(episode), LABEL_FRAMES):
-            e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
-            found = renderer.render_labels(physics[e, r], exogenous[e, r], [view], hide_goal)
-            out[e, r] = found[label][:, 0]
-        yield name, out

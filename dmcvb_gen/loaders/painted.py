@@ -19,7 +19,6 @@ import numpy as np
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.jobs import background_source, stream_names
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
@@ -200,9 +199,7 @@ class PaintedSubset(SubsetReader):
             names = (*self._names, f"epoch {self.epoch}")
             labels = distractor_state_of(self.record, self._seed, names, np.array(index), physics, length, videos)
         else:
-            labels = DistractorState(
-                **{name: self.read(f"exogenous/{name}", index)[:, :used] for name in DISTRACTOR_STATE_NAMES}
-            )
+            labels = self.labels(index)[:, :used]
         task, rows = get_task(self.task), self.record.max_steps + 1
         pictures = paint(task, renderer, physics, labels, length, rows, arrays=arrays)
         return {name: value[0].copy() for name, value in pictures}

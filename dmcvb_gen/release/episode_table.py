@@ -20,7 +20,6 @@ from PIL import Image
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.index import CARD_FOLDER
 from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import background_source
 from dmcvb_gen.generate.render import renderer_for
@@ -167,9 +166,7 @@ def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
     renderer, _ = renderer_for(subset.record, background_source(Path(subset.root), subset.record))
     try:
         physics = subset.read("physics", episodes)[:, 0]
-        labels = DistractorState(
-            **{name: subset.read(f"exogenous/{name}", episodes)[:, 0] for name in DISTRACTOR_STATE_NAMES}
-        )
+        labels = subset.labels(episodes)[:, 0]
         yield from renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]
     finally:
         renderer.close()

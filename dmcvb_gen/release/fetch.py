@@ -111,18 +111,18 @@ def fetch_and_paint(
     folder, source = local_path(out), Source.find(url, options)
     with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
         names, painted = {name for name, _ in arrival.shards}, arrival.painted
-        studio = RenderSession.open(open_release(folder), names, painter, arrival.unpainted, painted)
-        studio.expect(arrival.unpainted_commits)
+        session = RenderSession.open(open_release(folder), names, painter, arrival.unpainted, painted)
+        session.expect(arrival.unpainted_commits)
         arrived: queue.SimpleQueue = queue.SimpleQueue()
         bringing = threading.Thread(target=_bring, args=(arrival, arrived), name="fetch")
         bringing.start()
         try:
-            found = list(studio.paint(arrived))
+            found = list(session.paint(arrived))
         finally:
             arrival.stop.set()
             bringing.join()
         manifest = arrival.finish()
-    return arrival.moved, studio.report(manifest, found)
+    return arrival.moved, session.report(manifest, found)
 
 
 def _bring(arrival: Download, arrived: queue.SimpleQueue) -> None:
