@@ -23,6 +23,7 @@ from dmcvb_gen.loaders.register import MAZES, TASKS, environment_ids
 from dmcvb_gen.names import DISTRACTOR_KINDS as SETTINGS
 from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from tests.conftest import TINY_MAZE
 
 SMALL = dict(size=16)
 
@@ -244,3 +245,28 @@ def test_the_dm_environment_has_the_gymnasium_episodes():
     one._env._stage.frame[:] = 499
     last = one.step(np.ones(6, np.float32))
     assert last.last() and last.discount == 1 and one.step(np.ones(6, np.float32)).step_type == dm_env.StepType.FIRST
+
+
+@pytest.mark.parametrize("task", ["cheetah-run", TINY_MAZE])
+def test_wrong_steps_are_refused_in_a_line(task):
+    env = DistractedEnv(task, max_steps=1, **SMALL)
+    vector = DistractedVectorEnv(2, task, **SMALL)
+    size = env.action_space.shape[0]
+    env.reset(seed=0)
+    vector.reset(seed=0)
+    with pytest.raises(DmcvbError, match=rf"shape \({size + 1},\); .* takes shape \({size},\)"):
+        env.step(np.zeros(size + 1))
+    with pytest.raises(DmcvbError, match=rf"takes shape \(2, {size}\)"):
+        vector.step(np.zeros((3, size)))
+    with pytest.raises(DmcvbError, match="no numbers"):
+        env.step(["left"] * size)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(DmcvbError, match="NaN or infinite"):
+            env.step(np.full(size, wrong))
+        with pytest.raises(DmcvbError, match="NaN or infinite"):
+            vector.step(np.full((2, size), wrong))
+    assert env.step(np.zeros(size))[3]
+    with pytest.raises(DmcvbError, match="after the end of the episode"):
+        env.step(np.zeros(size))
+    env.reset()
+    assert env.step(np.zeros(size))[3]

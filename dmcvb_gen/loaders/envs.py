@@ -1,4 +1,4 @@
-"""The tasks under distractors as Gymnasium environments: actions in; pixels, states and rewards out.
+"""Gymnasium environments of the tasks, with distractors.
 
 For evaluation: by default they show the `val` videos and styles, which no released picture shows, and last as long as
 online evaluation does. Many episodes side by side (`gymnasium.make_vec`) share one batch of simulations
@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
@@ -192,13 +193,33 @@ class _Stage:
         pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
         return {"pixels": pixels, "state": self.state.astype(np.float32)}
 
-    def step(self, actions: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rewards, terminated, truncated of one agent step of the active places."""
-        result = self.batch.step(np.clip(actions, -1, 1), active)
+    def step(self, actions: ArrayLike, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rewards, terminated, truncated of one agent step of the active places.
+
+        Raises:
+          DmcvbError: the actions have another shape, or are not finite numbers.
+        """
+        result = self.batch.step(np.clip(self._checked(actions, active), -1, 1), active)
         self.state = result.state
         self.frame[active] += 1
         truncated = active & (self.frame >= self.max_steps) & ~result.terminated
         return result.reward, result.terminated, truncated
+
+
+    def _checked(self, actions: ArrayLike, active: np.ndarray) -> np.ndarray:
+        """(place, action) float64."""
+        wanted = (self.count, self.task.action_size)
+        try:
+            actions = np.asarray(actions, np.float64)
+        except (TypeError, ValueError):
+            raise DmcvbError(f"the actions are no numbers; give an array of shape {wanted}") from None
+        if actions.shape != wanted:
+            alone = self.count == 1 and actions.shape[:1] == (1,)  # as it was given to an environment of one place
+            given, expected = (actions.shape[1:], wanted[1:]) if alone else (actions.shape, wanted)
+            raise DmcvbError(f"the action has shape {given}; {self.task.id} takes shape {expected}")
+        if not np.isfinite(actions[active]).all():
+            raise DmcvbError("the action holds NaN or infinite values; give finite numbers in [-1, 1]")
+        return actions
 
 
 def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -237,6 +258,7 @@ class DistractedEnv(gymnasium.Env):
         self.observation_space, self.action_space = self._stage.spaces()
         self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
         self._seed: int | None = None
+        self._ended = False
         self._pixels: np.ndarray | None = None
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
@@ -248,12 +270,16 @@ class DistractedEnv(gymnasium.Env):
         if seed is not None or self._seed is None:
             self._seed, self._stage.started[0] = int(self.np_random.integers(2**63)), 0
         self._stage.start([0], [self._seed])
+        self._ended = False
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict]:
         if self._seed is None:
             raise DmcvbError("step before reset; call reset() first")
-        reward, terminated, truncated = self._stage.step(np.asarray(action)[None], np.ones(1, bool))
+        if self._ended:
+            raise DmcvbError("step after the end of the episode; call reset() first")
+        reward, terminated, truncated = self._stage.step([action], np.ones(1, bool))
+        self._ended = bool(terminated[0] or truncated[0])
         return self._observation(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
     def _observation(self) -> dict[str, np.ndarray]:
@@ -315,7 +341,7 @@ class DistractedVectorEnv(VectorEnv):
         if restarted.any():
             places = np.flatnonzero(restarted)
             self._stage.start(places, [self._seeds[place] for place in places])
-        reward, terminated, truncated = self._stage.step(np.asarray(actions, np.float64), ~restarted)
+        reward, terminated, truncated = self._stage.step(actions, ~restarted)
         self._ended = terminated | truncated
         return self._stage.observe(), reward, terminated, truncated, {}
 
