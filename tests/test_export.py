@@ -21,6 +21,9 @@ from dmcvb_gen.benchmarks.goals import GoalPairs, goal_pairs
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.generate.executors import run_jobs
+from dmcvb_gen.generate.paint import paint_release
+from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.card import check_card, write_card
@@ -30,6 +33,7 @@ from dmcvb_gen.release.statistics import level_statistics
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
+from tests.conftest import small_recipe
 
 NAME = "walker-walk/random/static"
 
@@ -525,3 +529,44 @@ def test_a_feature_that_is_none_is_refused_in_one_line(tmp_path):
     (tmp_path / "features.json").write_text(json.dumps(tree))
     with pytest.raises(StoreError, match="features.json does not describe RLDS steps"):
         import_tfds(tmp_path, tmp_path / "out", task="walker-walk", level="expert", setting="none")
+
+
+def test_fixed_goals_exported_to_rlds_keep_their_pairs(small_mazes, tmp_path):
+    [made] = export(str(small_mazes), "rlds", tmp_path / "out", ["*/fixed"])
+    import_tfds(made, tmp_path / "r", task="ant-maze-empty7x7", level="random", setting="fixed")
+    [subset] = dmcvb_gen.open(tmp_path / "r").subsets.values()
+    assert subset.read("goal_pair").tolist() == [0, 1]
+    assert (subset.record.fixed_goals, subset.record.episodes_per_goal) == (2, 1)
+
+
+def test_the_time_limit_is_that_of_a_late_episode_if_the_first_ones_reach_the_goal(dmcvb_mazes, tmp_path):
+    place = "antmaze_random_visible_goal/empty7x7/expert"
+    shutil.copytree(dmcvb_mazes / place, tmp_path / place)
+    [file] = (tmp_path / place).rglob("*.tfrecord-*")
+    example = read_example(file, *next(iter(offsets(file))))
+    steps = {name: value for name, value in example.items() if name.startswith("steps/")}
+    count = len(steps["steps/reward"])
+    short = {name: value[: len(value) * 3 // count] for name, value in steps.items()}  # two transitions
+    short |= {"steps/is_terminal": np.array([0, 0, 1])}
+    cut = {name: value[: len(value) * 5 // count] for name, value in steps.items()}
+    cut |= {"steps/is_terminal": np.zeros(5, int)}
+    few = record(encode_example(short)), record(encode_example(cut))
+    file.write_bytes(few[0] * 25 + few[1])
+    import_tfds(tmp_path / place.split("/")[0], tmp_path / "r")
+    [subset] = open_release(tmp_path / "r").subsets.values()
+    assert subset.record.max_steps == 4 and subset.read("length").tolist() == [2] * 25 + [4]
+
+
+def test_what_an_imported_release_grew_by_can_be_painted_and_made_again(imported, tmp_path):
+    shutil.copytree(imported, tmp_path / "r")
+    more = {"tasks": "cheetah-run", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 3}
+    plan = prepare(make_plan(small_recipe(subsets=[more]), tmp_path / "r", pixels=False))
+    for _ in run_jobs(plan.jobs):
+        pass
+    finish(plan)
+    assert paint_release(tmp_path / "r").shards == 1
+    assert Regeneration(tmp_path / "r", ["cheetah-run"]).check().sound
+    request = Repainting(tmp_path / "r", tmp_path / "again", size=20)
+    assert [subset.name for subset in repaint(request).subsets] == ["cheetah-run/random/none"]
+    with pytest.raises(StoreError, match="was imported.*--only"):
+        Regeneration(tmp_path / "r").check()

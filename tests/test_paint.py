@@ -16,6 +16,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import write_release
 from dmcvb_gen.dataset.manifest import commit_path
+from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.generate import executors, paint
@@ -531,3 +532,54 @@ def test_another_painter_is_said_before_and_after(made, tmp_path):
     notes = result.stderr.splitlines()
     assert any("0.0.1 where the release was made" in note for note in notes)
     assert any("native's version is" in note and "thick in the manifest" in note for note in notes)
+
+
+def test_pictures_are_claimed_by_the_first_who_paints(made, tmp_path, monkeypatch):
+    """Another one asks for 48 pixels while the first shard is painted at the release's 32."""
+    shutil_copy(made / "light", tmp_path / "copy")
+    work = executors.run_job
+
+    def meanwhile(*arguments, **options):
+        monkeypatch.setattr(executors, "run_job", work)
+        with pytest.raises(StoreError, match="32 pixels a side"):
+            paint_release(tmp_path / "copy", config=paint.RenderConfig(overrides=paint.RenderOverrides(size=48)))
+        return work(*arguments, **options)
+
+    monkeypatch.setattr(executors, "run_job", meanwhile)
+    paint_release(tmp_path / "copy")
+    assert {s.record.size for s in open_release(tmp_path / "copy").subsets.values()} == {32}
+    assert verify(tmp_path / "copy").sound
+
+
+def test_regenerate_finds_pictures_of_another_size_under_their_own_digests(made, tmp_path):
+    """As two painters at two sizes left them: the digests are those of the files, the array is larger."""
+    for name, size in (("large", 40), ("small", None)):
+        shutil_copy(made / "light", tmp_path / name)
+        paint_release(tmp_path / name, config=paint.RenderConfig(overrides=paint.RenderOverrides(size=size)))
+    name = next(iter(open_release(tmp_path / "large").subsets))
+    [commit] = [c for shard, c in open_release(tmp_path / "small")[name].commits.items() if shard == 1]
+    for file in commit.files:
+        shutil.copy(tmp_path / "small" / file.path, tmp_path / "large" / file.path)
+    shutil.copy(tmp_path / "small" / commit_path(name, 1), tmp_path / "large" / commit_path(name, 1))
+    finish_release(tmp_path / "large", open_release(tmp_path / "large").manifest)
+    result = run("regenerate", tmp_path / "large", "--only", name)
+    assert result.exit_code == 1 and f"{name} shard 1" in result.output, result.output
+    assert "do not fit their array" in result.output
+
+
+def test_a_light_release_that_was_painted_grows_by_its_own_command(made, tmp_path):
+    shutil_copy(made / "light", tmp_path / "copy")
+    tiny = [{"3": "4"}.get(word, word) for word in RELEASES["walker" if "walker" in str(made) else "maze"]]
+    first, second = open_release(tmp_path / "copy").subsets
+    whole = ["rollout", *tiny, "--episodes", "2", "--out", tmp_path / "even", "--no-pixels"]
+    assert run(*whole).exit_code == 0  # of full shards, which can grow
+    grow = ["rollout", *tiny, "--out", tmp_path / "even", "--no-pixels"]
+    paint_release(tmp_path / "even", [first])
+    result = run(*grow)
+    assert result.exit_code == 0, result.output
+    release = open_release(tmp_path / "even")
+    assert release.manifest.complete and verify(tmp_path / "even").sound
+    assert not release[first].unpainted.any() and release[second].unpainted.all()
+    paint_release(tmp_path / "even", [second], (0, 1))
+    result = run(*[{"4": "6"}.get(word, word) for word in grow])
+    assert result.exit_code == 2 and f"dmcvb-gen paint {tmp_path / 'even'} --only {second}" in result.output

@@ -262,3 +262,15 @@ def test_a_missing_file_system_names_its_package(monkeypatch):
         dmcvb_gen.open("gs://bucket/name")
     with pytest.raises(StoreError, match="pip install huggingface_hub"):
         dmcvb_gen.open("hf://datasets/me/name")
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+@pytest.mark.parametrize("release", ["small_release", "small_mazes"])
+def test_a_batch_of_no_steps_is_an_empty_batch(release, in_memory, request):
+    subset = next(iter(dmcvb_gen.open(request.getfixturevalue(release)).subsets.values()))
+    source = subset.source(in_memory=in_memory)
+    batch, one = source.gather([]), source.gather([0])
+    assert {name: (value.shape[1:], value.dtype) for name, value in batch.items()} == {
+        name: (value.shape[1:], value.dtype) for name, value in one.items()
+    }
+    assert all(len(value) == 0 for value in batch.values())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner
+from PIL import Image
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
@@ -257,3 +258,27 @@ def test_a_manifest_alone_is_enough(tmp_path):
 @pytest.mark.parametrize("arguments", [[], ["r", "--manifest", __file__], ["--manifest", __file__]])
 def test_a_manifest_and_a_release_are_not_mixed_up(arguments):
     assert CliRunner().invoke(main, ["regenerate", *arguments]).exit_code == 2
+
+
+@pytest.mark.parametrize("more", [[], ["--check"], ["--only", "*/*/none"]])
+def test_a_manifests_file_is_no_release_to_repair(small_release, tmp_path, more):
+    shutil.copy(small_release / "manifest.json", tmp_path / "kept.json")
+    result = CliRunner().invoke(main, ["regenerate", str(tmp_path / "kept.json"), *more])
+    assert result.exit_code == 2 and "--manifest" in result.output and "--out" in result.output, result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["kept.json"]
+
+
+def test_lost_videos_are_put_back_and_named(tmp_path):
+    videos = tmp_path / "videos/train"
+    videos.mkdir(parents=True)
+    for number in range(2):
+        Image.fromarray(np.full((16, 16, 3), 90 * number, np.uint8)).save(videos / f"{number}.png")
+    pattern = LOCOMOTION | {"settings": "static", "episodes": 1, "max_steps": 3}
+    roll_out(small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "videos")), tmp_path / "r")
+    [folder] = (tmp_path / "r/backgrounds").iterdir()
+    shutil.rmtree(folder)
+    command = ["regenerate", str(tmp_path / "r"), "--backgrounds", str(tmp_path / "videos")]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0 and "2 other files put back" in result.output, result.output
+    assert "nothing" not in result.output and verify(tmp_path / "r").sound
+    assert "nothing is damaged" in CliRunner().invoke(main, command).output

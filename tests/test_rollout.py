@@ -418,3 +418,13 @@ def test_going_on_from_a_manifest_paints_where_it_was_begun(tmp_path, recipe):
     write_json(folder / "manifest.json", manifest.model_copy(update={"subsets": records}))
     assert {job.device for job in make_plan(None, folder).jobs} == {"cuda"}
     assert {job.device for job in make_plan(None, folder, device="cpu").jobs} == {"cpu"}
+
+
+@pytest.mark.parametrize("recipe", [small_recipe, maze_recipe])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_shards_that_do_not_fit_in_memory_are_refused_before_any_work(recipe, workers, tmp_path, monkeypatch):
+    monkeypatch.setattr("dmcvb_gen.generate.executors.free_memory", lambda: 10_000)
+    monkeypatch.setattr("dmcvb_gen.generate.engine.simulate", None)
+    with pytest.raises(StoreError, match="GB of memory.*--episodes-per-shard"):
+        roll_out(recipe(), tmp_path / "r", workers=workers)
+    assert not list((tmp_path / "r").rglob("c"))

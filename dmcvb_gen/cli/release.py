@@ -161,6 +161,7 @@ def regenerate(
                 "shards": [dataclasses.asdict(shard) for shard in outcome.shards],
                 "environment": outcome.environment,
                 "not_here": outcome.left,
+                "restored": outcome.restored,
             }
         )
     else:
@@ -174,7 +175,11 @@ def regenerate(
         made = pluralize(len(outcome.shards), "shards")
         left = f"; {outcome.left} more not here" if outcome.left else ""
         nothing = "none of these shards is here" if outcome.left else "nothing is damaged or missing"
-        click.echo(f"{out or path}: {made} made again{left}" if outcome.shards else f"{path}: {nothing}")
+        if outcome.restored:
+            files = pluralize(len(outcome.restored), "other files")
+            click.echo(f"{path}: {files} put back, e.g. {outcome.restored[0]}")
+        if outcome.shards or not outcome.restored:
+            click.echo(f"{out or path}: {made} made again{left}" if outcome.shards else f"{path}: {nothing}")
     context.exit(1 if not outcome.sound else 3 if outcome.left else 0)
 
 

@@ -79,7 +79,8 @@ def _check_same(old: Manifest, there: SubsetRecord, asked: Manifest, record: Sub
             refuse(field, one, other)
     for field in SubsetRecord.model_fields:
         one, other = _value(there, field), _value(record, field)
-        if field not in GROWS and one != other:
+        painted_since = field == "pixels" and there.pixels  # begun without pictures, and painted: it stays painted
+        if field not in GROWS and one != other and not painted_since:
             refuse(field, one, other)
 
 

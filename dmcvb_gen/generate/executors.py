@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 from collections import Counter
@@ -9,11 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.engine import JobResult, run_job
 from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.render import frame_count
 from dmcvb_gen.generate.site import leave
 from dmcvb_gen.parallel import Needs, Pool, ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.parallel.memory import free_memory
 from dmcvb_gen.tasks import get_task
 
 PROCESS_BYTES = 1 << 30
@@ -32,8 +35,10 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: ProgressCallback =
         those that are done (mazes end early).
 
     Raises:
-      StoreError: a worker was killed (often for memory); what was committed is safe.
+      StoreError: the shards need more memory than is free, or a worker was killed (often for memory); what was
+        committed is safe.
     """
+    check_memory(jobs, workers)
     kept = "what was committed is safe: run the same command again (fewer --episodes-per-shard need less memory)"
     alone = workers == 1 or len(jobs) <= 1 and isinstance(workers, int)
     with open_pool(workers, tick=tick, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
@@ -118,6 +123,29 @@ class _Expected:
         return sum(frame_count(record, count * record.max_steps, count) for record in job.subsets)
 
 
+def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
+    """Raises StoreError, before any work, if the shards in progress need more memory than this machine has free.
+
+    Ray is told what a job needs and finds it a place.
+    """
+    free = free_memory()
+    if not isinstance(workers, int) or not jobs or free is None:
+        return
+    largest, side_by_side = max(jobs, key=_memory), max(1, min(workers, len(jobs)))
+    needed = _memory(largest) - PROCESS_BYTES
+    if needed * side_by_side <= free:
+        return
+    record = largest.subsets[0]
+    cure = "use fewer --workers or a machine with more memory" if side_by_side > 1 else "use a machine with more memory"
+    if largest.stored is None:
+        cure = "use fewer --episodes-per-shard in a new release, or " + cure.removeprefix("use ")
+    raise StoreError(
+        f"a shard of {record.name} ({len(largest.episodes)} episodes of {record.max_steps} steps, {record.size} pixels "
+        f"a side) needs {needed / 1e9:.1f} GB of memory, {side_by_side} are made at once, and {free / 1e9:.1f} GB are "
+        f"free; {cure}"
+    )
+
+
 def needs_of(jobs: Sequence[Job]) -> Needs:
     """What a job takes at most."""
     cuda = any(job.device != "cpu" for job in jobs)
@@ -126,16 +154,9 @@ def needs_of(jobs: Sequence[Job]) -> Needs:
 
 def _memory(job: Job) -> int:
     """Bytes that a job holds at its height: all that was simulated, and two picture arrays of one setting."""
-    record = job.subsets[0]
+    record = max(job.subsets, key=lambda record: record.pixels)
     specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
     rows = len(job.episodes) * (record.max_steps + 1)
-    simulated = sum(_row_bytes(spec) for spec in specs if not spec.picture)
-    pictures = 2 * max((_row_bytes(spec) for spec in specs if spec.picture), default=0)
-    return PROCESS_BYTES + rows * (simulated + pictures)
-
-
-def _row_bytes(spec) -> int:
-    size = 8
-    for count in spec.shape:
-        size *= count
-    return size // 8 if spec.picture else size
+    simulated = sum(8 * math.prod(spec.shape) for spec in specs if not spec.picture)
+    pictures = [math.prod(spec.shape) for spec in specs if spec.picture] if record.pixels else []
+    return PROCESS_BYTES + rows * (simulated + 2 * max(pictures, default=0))

@@ -207,8 +207,8 @@ class RenderSession:
         """
         root, manifest, overrides = release.path, release.manifest, config.overrides
         old = {record.name: record for record in manifest.subsets}
-        asked = [record for name, record in old.items() if name in names]
-        if any(record.imported for record in asked):
+        asked = [record for name, record in old.items() if name in names and not record.imported]
+        if names and not asked:
             raise StoreError(f"{root} was imported and has no physics states to paint from")
         if overrides.goal and not any(get_task(record.task).goal_geoms for record in asked):
             raise DmcvbError("--goal is for ant-maze tasks, and none of them is selected; remove it")

@@ -23,6 +23,7 @@ from dmcvb_gen.dataset.index import (
 )
 from dmcvb_gen.dataset.manifest import (
     MANIFEST,
+    CommitRecord,
     FileRecord,
     Manifest,
     PolicyRecord,
@@ -116,9 +117,24 @@ def make_plan(
     shards = chosen_shards(grown, only, episodes)
     records = list({record.name: record for record in shards.values()}.values())
     done = site.commits(records) if there is not None else {}
+    _refuse_half_painted(there, records, done, site.place)
     jobs = part_of(make_jobs(grown, shards, site, None if site.slow else inputs, device), part)
     left = left_to_do(jobs, done)
     return Plan(site, manifest, inputs, left, _count(jobs) - _count(left))
+
+
+def _refuse_half_painted(
+    there: Manifest | None, records: Iterable[SubsetRecord], done: Mapping[str, Mapping[int, CommitRecord]], place: str
+) -> None:
+    """Raises StoreError for a subset that would grow although some of its shards have no pictures yet."""
+    old = {record.name: record.episodes for record in there.subsets} if there else {}
+    for record in records:
+        lacking = [shard for shard, commit in done.get(record.name, {}).items() if record.pixels and not commit.painted]
+        if lacking and record.episodes > old[record.name]:
+            raise StoreError(
+                f"{record.name} of {place} has pictures, but {len(lacking)} of its shards have none yet; before it "
+                f"grows, paint them: dmcvb-gen paint {place} --only {record.name}"
+            )
 
 
 def _check_goes_on(there: Manifest, site: Site, device: str | None, pixels: bool) -> None:

@@ -1,27 +1,26 @@
-"""Making a release's shards again from its manifest alone: to check them, to repair them, or beside.
+"""Make the shards of a release again from its manifest alone: to check them, to repair them, or into a new folder.
 
-`Regeneration.check` compares digests and says how far and why they differ; `repair` puts back what is damaged or
-missing and takes only shards that came out with the very bytes that the manifest promises; `remake` writes a release
-beside.
+`Regeneration.check` compares digests and reports how far and why they differ. `repair` replaces what is damaged or
+missing, with shards that have the very bytes that the manifest promises and no others. `remake` writes a new release.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import zarr
 
-from dmcvb_gen.dataset.index import ZARR_JSON, restore_index, restored_commit, trusted_index
+from dmcvb_gen.dataset.index import POLICIES, VIDEOS, ZARR_JSON, restore_index, restored_commit, trusted_index
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, environment
-from dmcvb_gen.dataset.pictures import SHOWN
+from dmcvb_gen.dataset.pictures import SHOWN, stored_pictures
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
-from dmcvb_gen.dataset.shards import chosen_shards, damage, read_commit
+from dmcvb_gen.dataset.shards import ShardKey, chosen_shards, damage, read_commit
 from dmcvb_gen.dataset.writer import (
     CREATED,
     commit_path,
@@ -51,7 +50,7 @@ from dmcvb_gen.generate.jobs import make_jobs, release_inputs
 from dmcvb_gen.generate.plan import copy_inputs, create_groups
 from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
-from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.remote import is_url, local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 
 
@@ -113,12 +112,14 @@ class Outcome:
     Attributes:
       shards: outcomes of all that were made.
       environment: what is another version or device than when the release was made.
-      left: shards of a release that is not complete which are not here, and were not looked at.
+      left: shards of an incomplete release that are not here and were not checked.
+      restored: paths of other files that were put back: metadata, policies, videos.
     """
 
     shards: tuple[ShardOutcome, ...]
     environment: dict[str, tuple[str, str]]
     left: int = 0
+    restored: tuple[str, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -176,60 +177,72 @@ class Regeneration:
     device: str | None = None
     workers: Workers = 1
 
-    def check(self, tick: ProgressCallback = ignore) -> Outcome:
-        """Make shards again and compare their digests with the release; the release is not changed.
+    def check(self, progress: ProgressCallback = ignore) -> Outcome:
+        """Make shards again and compare their digests with the release, which is not changed.
 
-        Of a part that was fetched, or a rollout that is not finished, the shards that are here are made.
+        If the release is not complete, the shards that are here are made.
 
         Raises:
-          DmcvbError: the shards cannot be made here (policy, backgrounds or renderer missing).
+          DmcvbError: the shards cannot be made here (policy, videos or renderer missing).
         """
-        root, manifest = load_manifest(self.root)
-        chosen, known = chosen_shards(manifest, self.only, self.episodes), _Known(root, manifest)
+        root, manifest = self._folder()
+        chosen, digests = chosen_shards(manifest, self.only, self.episodes), _Digests(root, manifest)
         here = {k: r for k, r in chosen.items() if manifest.complete or (root / commit_path(*k)).is_file()}
-        outcomes, held, shards = [], Held(known), here
-        with _Workshop(known, _unique(shards.values())) as folder:
-            for commit in self._make(manifest, shards, folder, tick):
-                record = shards[commit.subset, commit.shard]
-                promised = known.commit(record, commit.shard)
-                held.add(commit)
-                equal = known.agrees(commit) if promised is None else _agree(promised, commit)
-                was = known.damage(record, commit.shard)
+        check_makeable(manifest, _unique(here.values()))
+        outcomes = []
+        with _staging_folder(digests, _unique(here.values())) as folder:
+            for record, commit, was, equal in self._made(digests, here, folder, progress):
                 outcomes.append(_outcome(root, folder, record, commit, was, equal))
                 for file in commit.files:
                     (folder / file.path).unlink(missing_ok=True)  # a checked shard needs no room
-        outcomes = [
-            replace(outcome, equal=held.equal(shards[outcome.subset, outcome.shard]))
-            if outcome.equal is None
-            else outcome
-            for outcome in outcomes
-        ]
         return Outcome(tuple(outcomes), environment_diff(manifest), len(chosen) - len(here))
 
-    def repair(self, tick: ProgressCallback = ignore) -> Outcome:
-        """Make damaged and missing shards again, in place; sound ones are not touched.
+    def repair(self, progress: ProgressCallback = ignore) -> Outcome:
+        """Make damaged and missing shards again, in place; the others are not touched.
 
-        A shard is taken only if it has the bytes that its commit record (or the subset's digest) promises; where the
-        manifest promises nothing yet, because the release was never finished, it is taken as it is. Of a part that was
-        fetched, what was fetched is repaired, unless other shards are asked for.
+        A shard is replaced only by one that has the bytes that its commit record (or the subset's digest) promises. If
+        the manifest promises nothing yet, because the release was never finished, the new shard is taken. Of a part
+        that was fetched, what was fetched is repaired, unless other shards are asked for.
 
         Raises: see `check`.
         """
-        root, manifest = load_manifest(self.root)
-        wanted, known = self._wanted(manifest), _Known(root, manifest)
-        shards = {key: record for key, record in wanted.items() if known.damage(record, key[1]) is not None}
-        records = _unique(wanted.values())
-        with _Workshop(known, records) as folder:
+        root, manifest = self._folder()
+        wanted, digests = self._wanted(manifest), _Digests(root, manifest)
+        shards = {key: record for key, record in wanted.items() if digests.damage(record, key[1]) is not None}
+        records = [record for record in _unique(wanted.values()) if not record.imported]
+        check_makeable(manifest, records or _unique(wanted.values()))
+        outcomes, restored = [], []
+        with _staging_folder(digests, records) as folder:
             with storage_errors(root, "write to"):
                 for record in records:
-                    known.restore(folder, record)
-            outcomes = self._repair(known, shards, folder, tick)
+                    restored += digests.restore(folder, record)
+            for record, commit, was, equal in self._made(digests, shards, folder, progress):
+                taken = equal is not False
+                if taken:
+                    kept = digests.promised(record, commit.shard)
+                    _replace_shard(root, folder, kept or restored_commit(root, manifest, commit))
+                outcomes.append(_outcome(root, folder, record, commit, was, equal, repaired=taken))
         if not manifest.complete and any(outcome.repaired for outcome in outcomes):
             finish_together(root)
         elif manifest.complete:
+            before = _input_files(root)
             copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
+            restored += sorted(_input_files(root) - before)
             restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})
-        return Outcome(tuple(outcomes), environment_diff(manifest))
+        return Outcome(tuple(outcomes), environment_diff(manifest), restored=tuple(restored))
+
+    def _folder(self) -> tuple[Path, Manifest]:
+        """The release's folder and manifest.
+
+        Raises:
+          StoreError: it is a file, beside which anything may lie.
+        """
+        if not is_url(str(self.root)) and Path(self.root).is_file():
+            raise StoreError(
+                f"{self.root} is a file; give the folder of the release, or make a new one of a manifest alone: "
+                f"dmcvb-gen regenerate --manifest {self.root} --out FOLDER"
+            )
+        return load_manifest(self.root)
 
     def _wanted(self, manifest: Manifest) -> dict[tuple[str, int], SubsetRecord]:
         """The shards that should be here."""
@@ -245,34 +258,8 @@ class Regeneration:
                 wanted |= chosen_shards(manifest, entry.get("only", ()), tuple(span) if span else None)
         return wanted
 
-    def _repair(self, known: _Known, shards, folder, tick) -> list[ShardOutcome]:
-        root, manifest = known.root, known.manifest
-        outcomes, held = [], Held(known)
-        waiting: list[tuple[SubsetRecord, CommitRecord, str | None]] = []
-
-        def settle(record, commit, was, equal):
-            taken = equal is not False
-            if taken:
-                kept = known.commit(record, commit.shard)
-                _move_in(root, folder, kept or restored_commit(root, manifest, commit))
-            outcomes.append(_outcome(root, folder, record, commit, was, equal, repaired=taken))
-
-        for commit in self._make(manifest, shards, folder, tick):
-            record = shards[commit.subset, commit.shard]
-            was, promised = known.damage(record, commit.shard), known.commit(record, commit.shard)
-            equal = known.agrees(commit) if promised is None else _agree(promised, commit)
-            if equal is None and record.digest is not None:  # the subset's digest decides, once all are there
-                held.add(commit)
-                waiting.append((record, commit, was))
-            else:
-                settle(record, commit, was, equal)
-        verdicts = {record.name: held.equal(record) for record, _, _ in waiting}
-        for record, commit, was in waiting:
-            settle(record, commit, was, verdicts[record.name])
-        return outcomes
-
-    def remake(self, out: str | Path, tick: ProgressCallback = ignore) -> Outcome:
-        """Write a release beside, from the manifest of `root`; run again, it goes on where it stopped.
+    def remake(self, out: str | Path, progress: ProgressCallback = ignore) -> Outcome:
+        """Write a new release from the manifest of `root`; run again, it resumes.
 
         Args:
           out: folder of the new release.
@@ -285,38 +272,57 @@ class Regeneration:
             raise StoreError(f"--out {out} is the release itself; leave --out away to repair it in place")
         shards = chosen_shards(manifest, self.only, self.episodes)
         records = _unique(shards.values())
+        check_makeable(manifest, records)
         fresh = start_release(out, _unfinished(manifest))
         create_groups(out, fresh, records)
-        known = _Known(root, manifest)
+        digests = _Digests(root, manifest)
         for record in records:
-            known.take(out, record)
+            digests.copy_metadata(out, record)
         done = {record.name: read_commits(out, record) for record in records}
         todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
         commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
-        commits += self._make(manifest, todo, out, tick, copy=True)
-        finished = finish_release(out, fresh)
-        digests = {record.name: record.digest for record in finished.subsets}
+        commits += self._make(manifest, todo, out, progress, copy=True)
+        finished = {record.name: record.digest for record in finish_release(out, fresh).subsets}
         outcomes = []
         for commit in commits:
             record = shards[commit.subset, commit.shard]
-            promised = known.commit(record, commit.shard)
-            equal = known.agrees(commit) if promised is None else _agree(promised, commit)
-            if equal is None and record.digest and digests[record.name]:
-                equal = digests[record.name] == record.digest
+            equal = digests.equal(record, commit)
+            if equal is None and record.digest and finished[record.name]:
+                equal = finished[record.name] == record.digest
             outcomes.append(_outcome(root, out, record, commit, None, equal))
         return Outcome(tuple(outcomes), environment_diff(manifest))
 
-    def _make(self, manifest, shards, folder, tick, copy=False) -> Iterator[CommitRecord]:
-        """Make shards in `folder` (with the policies and videos that they come from, if they are to be copied)."""
-        check_makeable(manifest)
+    def _made(
+        self, digests: _Digests, shards: Mapping[ShardKey, SubsetRecord], folder: Path, progress: ProgressCallback
+    ) -> Iterator[tuple[SubsetRecord, CommitRecord, str | None, bool | None]]:
+        """Make shards in `folder`: (subset, commit record, what was wrong, whether the bytes are the promised ones).
+
+        Shards whose record and index are lost come last: with the others, they must give their subset's digest.
+        """
+        made: dict[ShardKey, CommitRecord] = {}
+        undecided = []
+        for commit in self._make(digests.manifest, shards, folder, progress):
+            record = shards[commit.subset, commit.shard]
+            made[commit.subset, commit.shard] = commit
+            was, equal = digests.damage(record, commit.shard), digests.equal(record, commit)
+            if equal is None and record.digest is not None:
+                undecided.append((record, commit, was))
+            else:
+                yield record, commit, was, equal
+        verdicts = {record.name: digests.subset_equal(record, made) for record, _, _ in undecided}
+        for record, commit, was in undecided:
+            yield record, commit, was, verdicts[record.name]
+
+    def _make(self, manifest, shards, folder, progress, copy=False) -> Iterator[CommitRecord]:
+        """Make shards in `folder`; `copy` puts the policies and videos that they are made from there, too."""
         root, _ = load_manifest(self.root)
         records = _unique(shards.values())
+        check_makeable(manifest, records)
         inputs = release_inputs(root, records, self.backgrounds)
         if copy:
             copy_inputs(folder, records, inputs)
-        for result in run_jobs(
-            make_jobs(manifest, shards, FolderSite(folder), inputs, self.device), self.workers, tick
-        ):
+        jobs = make_jobs(manifest, shards, FolderSite(folder), inputs, self.device)
+        for result in run_jobs(jobs, self.workers, progress):
             yield from result.commits
 
 
@@ -334,12 +340,16 @@ def _agree(promised: CommitRecord, made: CommitRecord) -> bool:
     )
 
 
-def check_makeable(manifest: Manifest) -> None:
-    """Raises StoreError for a release whose shards cannot be made from its manifest."""
-    if manifest.imported:
-        raise StoreError(f"{manifest.name} was imported, so there is nothing to make it from; import it again")
+def check_makeable(manifest: Manifest, records: Sequence[SubsetRecord]) -> None:
+    """Raises StoreError for subsets whose shards cannot be made from the manifest."""
+    for record in records:
+        if record.imported:
+            raise StoreError(
+                f"{record.name} was imported, so there is nothing to make it from; import it again, or choose other "
+                "subsets with --only"
+            )
     for entry in manifest.lineage:
-        if entry.get("labels"):
+        if entry.get("labels") and any(record.name in entry["subsets"] for record in records):
             raise StoreError(
                 f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "
                 "repaint that release again instead of regenerating this one"
@@ -353,29 +363,6 @@ def _unfinished(manifest: Manifest) -> Manifest:
     return manifest.model_copy(update=begun)
 
 
-class Held:
-    """Shards made again whose record and index are lost: with the others, they must give their subset's digest."""
-
-    def __init__(self, known: _Known):
-        self._known = known
-        self._commits: dict[tuple[str, int], CommitRecord] = {}
-
-    def add(self, commit: CommitRecord) -> None:
-        self._commits[commit.subset, commit.shard] = commit
-
-    def equal(self, record: SubsetRecord) -> bool | None:
-        """Whether the subset has its digest; None where it has none, or another shard is missing too."""
-        if record.digest is None:
-            return None
-        commits = {}
-        for shard in range(shard_count(record)):
-            commit = self._known.commit(record, shard) or self._commits.get((record.name, shard))
-            if commit is None:
-                return None
-            commits[shard] = commit
-        return subset_digest(commits) == record.digest
-
-
 def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardOutcome:
     differences = compare_shards(root, folder, record, commit.shard) if equal is False else None
     return ShardOutcome(
@@ -386,28 +373,62 @@ def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardO
 # -- files ----------------------------------------------------------------------------------------
 
 
-class _Known:
-    """Which files of a release are what they were: by its index; where that cannot be trusted, those that are JSON."""
+class _Digests:
+    """The digests that a release promises: by its index or, if that cannot be trusted, by the commit records."""
 
     def __init__(self, root: Path, manifest: Manifest):
         self.root, self.manifest, index = root, manifest, trusted_index(root, manifest)
         self._digests = {file.path: file.sha256 for file in index.files} if index else {}
 
-    def commit(self, record: SubsetRecord, shard: int) -> CommitRecord | None:
-        """A shard's record, None where it is missing, damaged or not what it was."""
-        return read_commit(self.root, record, shard, self._digests)
+    def promised(self, record: SubsetRecord, shard: int) -> CommitRecord | None:
+        """A shard's record; None if it is missing, damaged, not what it was, or of pictures that cannot be read."""
+        commit = read_commit(self.root, record, shard, self._digests)
+        return None if commit and self._wrong_pictures(record, commit) else commit
 
-    def agrees(self, commit: CommitRecord) -> bool | None:
-        """Whether a shard made again, whose record is lost, has the bytes that the index lists; None if it lists none.
+    def equal(self, record: SubsetRecord, commit: CommitRecord) -> bool | None:
+        """Whether a shard that was made again has the promised bytes; None if nothing promises any.
 
-        Pictures that a light release leaves out are not listed, and do not count.
+        Without its record, the index decides; it lists no pictures of a light release.
         """
+        promised = self.promised(record, commit.shard)
+        if promised is not None:
+            return _agree(promised, commit)
         made = [file for file in (*commit.files, *commit.pictures) if file.path in self._digests]
         return all(file.sha256 == self._digests[file.path] for file in made) if made else None
 
+    def subset_equal(self, record: SubsetRecord, made: Mapping[ShardKey, CommitRecord]) -> bool | None:
+        """Whether the shards here, with those made again, give the subset's digest; None if others are missing."""
+        commits = {}
+        for shard in range(shard_count(record)):
+            commit = self.promised(record, shard) or made.get((record.name, shard))
+            if commit is None:
+                return None
+            commits[shard] = commit
+        return subset_digest(commits) == record.digest
+
     def damage(self, record: SubsetRecord, shard: int) -> str | None:
-        """What is wrong with a shard, in words; None where every byte is as committed."""
-        return damage(self.root, record, shard, self._digests)
+        """What is wrong with a shard, in words; None if every byte is as committed and its pictures can be read."""
+        wrong = damage(self.root, record, shard, self._digests)
+        commit = None if wrong else read_commit(self.root, record, shard)
+        return wrong or (commit and self._wrong_pictures(record, commit))
+
+    def _wrong_pictures(self, record: SubsetRecord, commit: CommitRecord) -> str | None:
+        """Which pictures of a shard do not fit their array, e.g. because they have another size."""
+        first, folder = commit.episodes[0], subset_path(record.name)
+        for name in stored_pictures(record, bool(get_task(record.task).goal_geoms)) if commit.painted else ():
+            try:
+                group = zarr.open_group(str(self.root / folder), mode="r", use_consolidated=False)
+                array, path = find_array(group, name)
+            except Exception:  # damaged metadata are put back, they are no fault of the shard
+                continue
+            if not any(file.path.startswith(f"{folder}/{path}/c/") for file in commit.files):
+                continue  # black, or missing, which its digest tells
+            try:
+                array[first, :1]
+            except Exception:  # codecs raise anything
+                if self.sound(f"{folder}/{path}/{ZARR_JSON}"):
+                    return f"{folder}/{path} has pictures that do not fit their array"
+        return None
 
     def sound(self, path: str) -> bool:
         """Whether a file (a path in the release) can be used."""
@@ -418,7 +439,7 @@ class _Known:
             return False
         return path not in self._digests or sha256_bytes(data) == self._digests[path]
 
-    def take(self, folder: Path, record: SubsetRecord) -> None:
+    def copy_metadata(self, folder: Path, record: SubsetRecord) -> None:
         """Use the release's own array metadata in `folder`: codecs of today's code may not be the release's."""
         group = folder / subset_path(record.name)
         for target in sorted(group.rglob(ZARR_JSON), key=lambda file: len(file.parts)):
@@ -430,8 +451,9 @@ class _Known:
             zarr.consolidate_metadata(str(group))  # with what its arrays were given
             mark_created(folder, record)
 
-    def restore(self, folder: Path, record: SubsetRecord) -> None:
-        """Put back what is missing or damaged, from `folder`, where it was made or taken."""
+    def restore(self, folder: Path, record: SubsetRecord) -> list[str]:
+        """Put back metadata that are missing or damaged from `folder`; their paths in the release."""
+        restored = []
         for source in sorted((folder / subset_path(record.name)).rglob(ZARR_JSON)):
             path = source.relative_to(folder).as_posix()
             if self.sound(path):
@@ -439,7 +461,9 @@ class _Known:
             if path in self._digests and sha256_file(source) != self._digests[path]:
                 raise StoreError(f"{self.root / path} is damaged, and this version makes another; fetch it again")
             copy_file(source, self.root / path)
+            restored.append(path)
         mark_created(self.root, record)
+        return restored
 
     def _source(self, path: str) -> Path | None:
         """The file itself, or one of another subset with its digest."""
@@ -453,32 +477,30 @@ def _unique(records) -> list[SubsetRecord]:
     return list({record.name: record for record in records}.values())
 
 
-class _Workshop:
-    """A folder beside the data (same file system, so that files can be moved in) where shards are made."""
-
-    def __init__(self, known: _Known, records: Sequence[SubsetRecord]):
-        self._known, self._records = known, records
-
-    def __enter__(self) -> Path:
-        root = self._known.root
-        with contextlib.ExitStack() as stack:
-            try:
-                remove_partial(root, below=False)  # the workshop of a run that was killed
-                folder = stack.enter_context(folder_in_the_making(root, "regenerate"))
-            except OSError as error:
-                raise StoreError(f"cannot write to {root}: {error.strerror or error}; give --out") from None
-            create_groups(folder, self._known.manifest, self._records)
-            with storage_errors(self._known.root, "write to"):
-                for record in self._records:
-                    self._known.take(folder, record)
-            self._stack = stack.pop_all()
-        return folder
-
-    def __exit__(self, *_):
-        self._stack.close()
+@contextlib.contextmanager
+def _staging_folder(digests: _Digests, records: Sequence[SubsetRecord]) -> Iterator[Path]:
+    """A folder inside the release (on the same file system, so that files can be moved) to make shards in."""
+    root = digests.root
+    with contextlib.ExitStack() as stack:
+        try:
+            remove_partial(root, below=False)  # the folder of a run that was killed
+            folder = stack.enter_context(folder_in_the_making(root, "regenerate"))
+        except OSError as error:
+            raise StoreError(f"cannot write to {root}: {error.strerror or error}; give --out") from None
+        create_groups(folder, digests.manifest, records)
+        with storage_errors(root, "write to"):
+            for record in records:
+                digests.copy_metadata(folder, record)
+        yield folder
 
 
-def _move_in(root: Path, folder: Path, commit: CommitRecord) -> None:
+def _input_files(root: Path) -> set[str]:
+    """Paths of the policies and videos that a release has."""
+    folders = (root / POLICIES, root / VIDEOS)
+    return {path.relative_to(root).as_posix() for folder in folders for path in folder.rglob("*") if path.is_file()}
+
+
+def _replace_shard(root: Path, folder: Path, commit: CommitRecord) -> None:
     """Replace a shard's files, then its record: at no moment does a record stand for files that are not there."""
     record = root / commit_path(commit.subset, commit.shard)
     try:

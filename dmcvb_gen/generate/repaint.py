@@ -116,7 +116,8 @@ def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = 
     out = local_path(request.out)
     release, site = _source(request), FolderSite(out)
     pairs: dict[str, Repainted] = {}
-    for name in select(list(release.subsets), list(request.only)):
+    names = select(list(release.subsets), list(request.only))
+    for name in [name for name in names if not release[name].record.imported]:
         pair = _pair(release, release[name], request)
         taken = pairs.setdefault(pair.record.name, pair)
         if taken is not pair:
@@ -124,6 +125,8 @@ def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = 
                 f"{taken.source.name} and {name} would both become {pair.record.name}; "
                 f"choose one with --only, e.g. '*/*/{pair.source.setting}'"
             )
+    if not pairs:
+        raise StoreError(f"{request.root} was imported and has no physics states to paint from")
     _check_heard(request, [pair.record for pair in pairs.values()])
     new = _new_manifest(release, pairs, request)
     _check_out(out, new)
@@ -171,8 +174,6 @@ def _source(request: Repainting) -> Release:
         raise DmcvbError(f"unknown label {unknown[0]!r}; known: {', '.join(LABEL_TYPES)}")
     if not release.subsets:
         raise StoreError(f"{request.root} has no committed episodes yet; run the rollout first")
-    if release.manifest.imported:
-        raise StoreError(f"{request.root} was imported and has no physics states to paint from")
     if request.size is not None:
         check_size(request.size)
     if request.renderer:

@@ -205,7 +205,6 @@ class _Stage:
         truncated = active & (self.frame >= self.max_steps) & ~result.terminated
         return result.reward, result.terminated, truncated
 
-
     def _checked(self, actions: ArrayLike, active: np.ndarray) -> np.ndarray:
         """(place, action) float64."""
         wanted = (self.count, self.task.action_size)

@@ -231,7 +231,7 @@ def painted_release(release: Release, painting: Painting, missing: bool = False)
     Raises:
       StoreError: the release was imported, and not only missing pictures are to be painted.
     """
-    if release.manifest.imported and not missing:
+    if all(record.imported for record in release.manifest.subsets) and not missing:
         raise StoreError(f"{release.root} was imported and has no physics states to paint from; open it without paint")
     subsets = {
         name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)

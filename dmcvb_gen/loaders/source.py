@@ -16,11 +16,10 @@ import numpy as np
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.loaders.blocks import Block, check_count, choose, stack_channels
+from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
 SHARE_OF_MEMORY = 0.25
 """Of the free memory: what is held at most, if nobody says."""
-UNKNOWN_MEMORY = 4 * 2**30
-"""Bytes taken to be free where the system does not tell."""
 
 
 class StepSource:
@@ -62,7 +61,7 @@ class StepSource:
             size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3
             fresh = getattr(subset, "fresh", False)  # then each of a loader's workers paints and holds its own
             holders = 1 + (os.cpu_count() or 1) if fresh else 1
-            in_memory = size <= SHARE_OF_MEMORY * free_memory() / holders
+            in_memory = size <= SHARE_OF_MEMORY * (free_memory() or UNKNOWN_MEMORY) / holders
         self.in_memory = in_memory
         self._held: tuple[int, Block] | None = None
         self._reading = threading.Lock()  # of several threads, one reads
@@ -93,8 +92,10 @@ class StepSource:
         places = places % max(len(self), 1)
         if self.in_memory:
             return self.block.gather(places)
-        items = [self._read(int(place)) for place in places]
-        return {name: np.stack([item[name] for item in items]) for name in items[0]}
+        if not len(self):
+            raise IndexError("the source has no steps")
+        items = [self._read(int(place)) for place in (places if len(places) else [0])]
+        return {name: np.stack([item[name] for item in items])[: len(places)] for name in items[0]}
 
     @property
     def block(self) -> Block:
@@ -128,16 +129,3 @@ class StepSource:
                 values[f"{prefix}pixels"] = stack_channels(frames[np.maximum(rows, 0)])
         values |= {name: np.asarray(array(name)[episode, step]) for name in ("action", "reward", "discount")}
         return values | {"episode": np.asarray(episode), "step": np.asarray(step)}
-
-
-def free_memory() -> int:
-    """Bytes of main memory that are free, as far as the system tells."""
-    try:
-        with open("/proc/meminfo") as file:
-            facts = dict(line.split(":", 1) for line in file)
-        return int(facts["MemAvailable"].split()[0]) * 1024
-    except (OSError, KeyError, ValueError):
-        pass
-    if "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return UNKNOWN_MEMORY

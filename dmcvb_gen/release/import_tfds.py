@@ -1,4 +1,4 @@
-"""DMC-VB's published TFDS folders into a release: RLDS episodes in, a store of the same layout as ours out.
+"""Import DMC-VB's published TFDS folders (RLDS episodes) into a release of the usual layout.
 
 The published data hold pixels, states, actions and rewards, but neither physics states nor distractor labels: an
 imported release can be read, checked and trained on, but not repainted or regenerated. Nothing needs TensorFlow.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +17,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.dataset.manifest import IMPORTED, MANIFEST, Manifest, SubsetRecord, environment, local_manifest
+from dmcvb_gen.dataset.manifest import (
+    IMPORTED,
+    MANIFEST,
+    MAX_STEPS,
+    Manifest,
+    SubsetRecord,
+    environment,
+    local_manifest,
+)
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
 from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, array_specs
 from dmcvb_gen.dataset.writer import (
@@ -42,8 +49,8 @@ from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
-EPISODES_LOOKED_AT = 20
-"""For one that the time limit ended: of mazes, experts reach nearly all goals."""
+MAX_GOAL_PAIRS = 2**15
+"""Pairs of start and goal that the stored numbers (int16) can tell apart."""
 MISSING = ("physics", "exogenous/")
 """Arrays (by the beginnings of their names) that an imported subset has not."""
 
@@ -187,7 +194,9 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         if not count:
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
     family = get_task(task).family
-    fixed = setting == FIXED
+    pairs = _goal_pairs(folders) if setting == FIXED else []
+    goals = max(pairs, default=0) + 1
+    in_order = pairs == [pair for pair in range(goals) for _ in range(len(pairs) // goals)]
     try:
         size = int(pictures[views[0]]["shape"]["dimensions"][0])
         if not 0 < size <= MAX_SIZE:
@@ -209,18 +218,44 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         views=views,
         hidden_goal=hidden,
         max_steps=_time_limit(folders, get_task(task)),
-        fixed_goals=len(folders) if fixed else None,
-        episodes_per_goal=counts[0] if fixed and len(set(counts)) == 1 else None,  # else the episodes' labels say it
+        fixed_goals=goals if pairs else None,
+        episodes_per_goal=len(pairs) // goals if pairs and in_order else None,  # else the episodes' labels say it
     )
 
 
+def _examples(folders: tuple[Path, ...]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """(number of the folder, features) of all episodes, in their order."""
+    for number, folder in enumerate(folders):
+        for file in _files(folder):
+            for place in offsets(file):
+                yield number, read_example(file, *place)
+
+
 def _time_limit(folders: tuple[Path, ...], task: Task) -> int:
-    """Transitions at which the time limit ended the first episodes that it ended; the task's own if it ended none."""
-    places = ((file, *place) for folder in folders for file in _files(folder) for place in offsets(file))
-    examples = (read_example(file, *place) for file, *place in itertools.islice(places, EPISODES_LOOKED_AT))
-    cut = (values for values in examples if not np.any(values.get("steps/is_terminal", False)))
-    longest = max((len(values.get("steps/reward", ())) - 1 for values in cut), default=0)
-    return longest if 0 < longest <= task.max_steps else task.max_steps
+    """Transitions of the first episode that the time limit ended; if it ended none, at least the task's own limit.
+
+    Experts reach nearly all goals of mazes, so the first such episode may be a late one.
+    """
+    longest = task.max_steps
+    for _, values in _examples(folders):
+        length = len(values.get("steps/reward", ())) - 1
+        if 0 < length <= MAX_STEPS and not np.any(values.get("steps/is_terminal", False)):
+            return length
+        longest = max(longest, length)
+    return min(longest, MAX_STEPS)
+
+
+def _goal_pairs(folders: tuple[Path, ...]) -> list[int]:
+    """The pair of start and goal of each episode: DMC-VB has a folder a pair, our own exports name it."""
+    return [_goal_pair(values, folder, len(folders)) for folder, values in _examples(folders)]
+
+
+def _goal_pair(values: dict[str, Any], folder: int, folders: int) -> int:
+    named = values.get("goal_pair", ())
+    pair = int(named[0]) if folders == 1 and isinstance(named, np.ndarray) and len(named) == 1 else folder
+    if not 0 <= pair < MAX_GOAL_PAIRS:
+        raise StoreError(f"an episode has goal pair {pair}, expected 0 to {MAX_GOAL_PAIRS - 1}; export it again")
+    return pair
 
 
 def _step_features(path: Path) -> dict[str, Any]:
@@ -318,8 +353,10 @@ def _import_subset(source: _Source, out: Path, tick: ProgressCallback) -> None:
         }
         for row, (goal, file, *place) in enumerate(places):
             one = {name: array[row : row + 1] for name, array in arrays.items()}
-            _fill(one, read_example(file, *place), record, file)
-            arrays["goal_pair"][row] = goal if record.setting == FIXED else -1
+            values = read_example(file, *place)
+            _fill(one, values, record, file)
+            fixed = record.setting == FIXED
+            arrays["goal_pair"][row] = _goal_pair(values, goal, len(source.folders)) if fixed else -1
             tick(1)
         write_shard(out, record, shard, arrays.items(), arrays["length"])
 

@@ -33,7 +33,8 @@ def write(source: Source, folder: Path) -> None:
     the state's parts once more under the names and types of DMC-VB's own data set (observation/velocity, ...;
     float64, numbers without an axis where dm_control gives such); the views of mazes have its names alone
     (observation/lowres_top_camera, ...). So its loader takes the folder. The last step of an episode holds the last
-    observation; its action is zeros and means nothing (RLDS).
+    observation; its action is zeros and means nothing (RLDS). An episode has its `episode_index` and, of fixed goals,
+    its `goal_pair`.
     """
     subset, version = source.subset, source.manifest.version
     name = subset.name.replace("/", "_").replace("-", "_").replace(".", "_")
@@ -112,7 +113,8 @@ def _features(source: Source) -> dict[str, Any]:
         "pythonClassName": f"{_FEATURES}.dataset_feature.Dataset",
         "sequence": {"feature": _dict(step), "length": "-1"},
     }
-    return _dict({"steps": steps, "episode_index": _tensor("int64")})
+    episode = {"steps": steps, "episode_index": _tensor("int64")}
+    return _dict(episode | ({"goal_pair": _tensor("int64")} if subset.record.fixed_goals else {}))
 
 
 def _picture_name(source: Source, view: str) -> str:
@@ -135,6 +137,8 @@ def _example(source: Source, episode: ExportEpisode) -> dict[str, np.ndarray | l
     }
     for name, part in get_task(task).state_slices.items():
         values[f"steps/observation/{state_feature(task, name)}"] = episode.state[:, part]
+    if source.subset.record.fixed_goals:
+        values["goal_pair"] = source.subset.read("goal_pair", [episode.index])
     return values | {
         "steps/observation/state": episode.state,
         "steps/action": padded(episode.action, 0),
