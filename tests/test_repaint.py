@@ -59,7 +59,7 @@ def test_a_repainted_subset_has_the_bytes_of_a_rolled_out_one(small_release, dyn
 def test_two_processes_paint_the_same_bytes_as_one(small_release, dynamic, tmp_path):
     ticks = []
     request = Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic")
-    repaint(request, workers=2, tick=ticks.append)
+    repaint(request, workers=2, progress=ticks.append)
     name = "walker-walk/random/dynamic"
     assert len(list((dynamic / "commits").rglob("*.json"))) > 1  # else one process does it all
     assert shard_bytes(tmp_path / "r", name) == shard_bytes(dynamic, name) != {}

@@ -374,7 +374,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
     from dmcvb_gen.release.import_tfds import import_tfds
 
     with ProgressBar(as_json, unit=" episodes") as bar:
-        given = dict(task=task, level=level, setting=setting, name=name, partial=partial, tick=bar)
+        given = dict(task=task, level=level, setting=setting, name=name, partial=partial, progress=bar)
         manifest = import_tfds(folder, out, **given)
     if as_json:
         return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})

@@ -176,7 +176,7 @@ def inputs_of(job: Job, record: SubsetRecord) -> Inputs:
 
 
 def shard_arrays(
-    job: Job, record: SubsetRecord, episodes: Episodes, tick: ProgressCallback = ignore
+    job: Job, record: SubsetRecord, episodes: Episodes, progress: ProgressCallback = ignore
 ) -> Iterator[tuple[str, np.ndarray]]:
     """The arrays of a shard, made one at a time: pictures, labels, states, depth and segmentation.
 
@@ -191,9 +191,9 @@ def shard_arrays(
     physics = episodes.physics[:, : len_rows(labels)]
     if record.pixels:
         pictures = stored_pictures(record, bool(task.goal_geoms))
-        yield from paint(task, renderer, physics, labels, length, rows, tick, pictures)
+        yield from paint(task, renderer, physics, labels, length, rows, progress, pictures)
     else:
-        tick(int((length + 1).sum()))
+        progress(int((length + 1).sum()))
     if job.in_place:
         return
     yield from label_arrays(labels, length, rows)

@@ -1,4 +1,4 @@
-"""How long and how big: a plan in, steps, bytes and core-hours out, from short measurements on this machine.
+"""Estimate the steps, bytes and core-hours of a plan from short measurements on this machine.
 
 What is measured once serves all that it is true of: episodes of a task and level for all settings that show them (a
 maze's fixed goals are drawn as its random ones are), pictures of a task, level and kind of distractor. The mazes, whose
@@ -194,12 +194,12 @@ def measurements(plan: Plan) -> int:
     return len({_trajectory(record) for record in records}) + len({_painting_key(record) for record in records})
 
 
-def estimate(plan: Plan, workers: int = 1, tick: ProgressCallback = ignore) -> Estimate:
+def estimate(plan: Plan, workers: int = 1, progress: ProgressCallback = ignore) -> Estimate:
     """Measure what a plan is made of for a moment and extrapolate.
 
     Args:
       workers: processes that measure side by side, as they will work; no more than there are cores.
-      tick: told 1 after each measurement; see `measurements`.
+      progress: called with 1 after each measurement; see `measurements`.
 
     Raises:
       StoreError: a worker was killed.
@@ -210,7 +210,7 @@ def estimate(plan: Plan, workers: int = 1, tick: ProgressCallback = ignore) -> E
     lengths: dict[tuple, list[int]] = {}
     seconds: dict[tuple, float] = {}
     paintings: dict[tuple, tuple[float, float]] = {}
-    for part in in_order(_measure, _pieces(plan, cores // workers), workers, tick):
+    for part in in_order(_measure, _pieces(plan, cores // workers), workers, progress):
         lengths |= part.lengths
         seconds |= part.seconds
         paintings |= part.paintings

@@ -1,4 +1,4 @@
-"""Doing many jobs: in this process, in worker processes or on a Ray cluster; the data do not depend on which."""
+"""Run many jobs: in this process, in worker processes or on a Ray cluster. The data do not depend on which."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from dmcvb_gen.parallel.memory import free_memory
 from dmcvb_gen.tasks import get_task
 
 PROCESS_BYTES = 1 << 30
-"""Memory of a worker before it holds any episode: libraries, models, a renderer's buffers."""
+"""Memory that a worker takes before it holds any episode: libraries, models, a renderer's buffers."""
 GPU_SHARE = 0.25
-"""Of a GPU, for a worker that paints there; the rest of its time it simulates."""
+"""Share of a GPU for a worker that renders there; it spends the rest of its time simulating."""
 
 
-def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: ProgressCallback = ignore) -> Iterator[JobResult]:
-    """Run jobs and give their results as they come.
+def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallback = ignore) -> Iterator[JobResult]:
+    """Run jobs and yield their results as they finish.
 
     Args:
       workers: processes, each with physics on one core; 1 works in this process, with physics on all cores; or a Ray
         cluster.
-      tick: told how many frames were painted since the last call; it expects full episodes at first, and then such as
-        those that are done (mazes end early).
+      progress: called with the number of frames rendered since the last call. The expected number is that of full
+        episodes at first, and follows the finished ones (mazes end early).
 
     Raises:
       StoreError: the shards need more memory than is free, or a worker was killed (often for memory); what was
@@ -41,15 +41,15 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, tick: ProgressCallback =
     check_memory(jobs, workers)
     kept = "what was committed is safe: run the same command again (fewer --episodes-per-shard need less memory)"
     alone = workers == 1 or len(jobs) <= 1 and isinstance(workers, int)
-    with open_pool(workers, tick=tick, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
+    with open_pool(workers, tick=progress, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
         for job in jobs:
             pool.submit(job, run_job, job, os.cpu_count() or 1 if alone else 1)
         expected = _Expected(jobs)
-        expect(tick, expected.frames)
+        expect(progress, expected.frames)
         try:
             for job, result in pool.results():
                 expected.done(job, result)
-                expect(tick, expected.frames)
+                expect(progress, expected.frames)
                 yield result
         finally:
             for site in {job.site for job in jobs}:
@@ -88,7 +88,7 @@ def run_arriving(
 
 
 class _Expected:
-    """How many frames jobs paint, all in all: full episodes where none is known, then such as those that are done."""
+    """How many frames jobs render in all: of full episodes at first, then in proportion to the finished ones."""
 
     def __init__(self, jobs: Sequence[Job]):
         self._open: Counter = Counter()
@@ -98,7 +98,7 @@ class _Expected:
             self._open[self._kind(job)] += self._planned(job)
 
     def done(self, job: Job, result: JobResult) -> None:
-        """A job ended: others of its task and level end as early."""
+        """Count a finished job: others of its task and level are taken to end as early."""
         kind, planned, episodes = self._kind(job), self._planned(job), len(job.episodes) * len(job.subsets)
         self._open[kind] -= planned
         self._ended[kind] += planned
@@ -147,13 +147,13 @@ def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
 
 
 def needs_of(jobs: Sequence[Job]) -> Needs:
-    """What a job takes at most."""
+    """What the largest job takes at most."""
     cuda = any(job.device != "cpu" for job in jobs)
     return Needs(memory=max(map(_memory, jobs), default=0), gpus=GPU_SHARE if cuda else 0)
 
 
 def _memory(job: Job) -> int:
-    """Bytes that a job holds at its height: all that was simulated, and two picture arrays of one setting."""
+    """Bytes that a job holds at its peak: all states, and two picture arrays of one subset."""
     record = max(job.subsets, key=lambda record: record.pixels)
     specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
     rows = len(job.episodes) * (record.max_steps + 1)

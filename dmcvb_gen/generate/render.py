@@ -1,6 +1,6 @@
-"""From states to stored pictures: physics states and a subset's record in, labels and picture arrays out.
+"""Render stored arrays: the pictures and labels of episodes, from their physics states and their subset's record.
 
-What a rollout, a repaint, a check and a reader that paints on read have in common.
+The engine, the checks and the readers that render on demand share it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 PAINT_FRAMES = 2004
-"""Frames painted between two ticks of the progress bar."""
+"""Frames rendered between two calls of the progress callback."""
 LABEL_FRAMES = 512
 """Frames of depth and segmentation that are rendered at once."""
 SIMULATION_STREAMS = ("initial_state", "policy")
-"""Streams of an episode that the simulation uses; the others are the distractors'."""
+"""Random streams of an episode that the simulation uses; the others are for distractors."""
 
 
 def check_renderer(name: str) -> None:
@@ -44,13 +44,13 @@ def check_renderer(name: str) -> None:
 def renderer_for(
     record: SubsetRecord, backgrounds: str, split: str | None = None, device: str = "cpu", **overrides: Any
 ) -> tuple[Renderer, Any]:
-    """The renderer of a subset (and its backgrounds, None where the setting shows none).
+    """The renderer of a subset, and its videos (None if its distractor shows none).
 
     Args:
       backgrounds: "builtin" or a folder of videos.
       split: "train" or "val" videos; the record's by default.
       device: "cpu" or "cuda".
-      overrides: name and samples, where not the record's.
+      overrides: `name` and `samples`, instead of the record's.
     """
     task, setting = get_task(record.task), distractor_of(record.task, record.setting)
     videos = None if setting.kind == "none" else load_backgrounds(backgrounds, split or record.split)
@@ -69,7 +69,7 @@ def renderer_for(
 
 
 class RendererCache:
-    """Renderers by what decides them, so that the shards of a subset share one; one at a time, they are large."""
+    """Keeps the last renderer, which is large, so that the shards of a subset share it."""
 
     def __init__(self):
         self._made: dict[tuple, tuple[Renderer, Any]] = {}
@@ -113,7 +113,7 @@ def distractor_state_of(
       episodes: (episode,) indices in the subset.
       physics: (episode, row, physics) float64.
       length: (episode,) transitions of each.
-      backgrounds: the videos, None where the setting shows none.
+      backgrounds: the videos, None if the distractor shows none.
     """
     task = get_task(record.task)
     rows = int(length.max()) + 1
@@ -131,7 +131,7 @@ def distractor_state_of(
 
 
 def frame_count(record: SubsetRecord, steps: int, episodes: int) -> int:
-    """How many frames a tick is told of for some episodes of a subset: of each view, where it has pictures."""
+    """How many frames the progress callback is told for some episodes of a subset: one a step and stored view."""
     return (steps + episodes) * (len(record.views) if record.pixels else 1)
 
 
@@ -142,7 +142,7 @@ def paint(
     exogenous: DistractorState,
     length: np.ndarray,
     rows: int,
-    tick: ProgressCallback = ignore,
+    progress: ProgressCallback = ignore,
     arrays: Collection[str] | None = None,
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Pictures of episodes, one array at a time.
@@ -175,7 +175,7 @@ def paint(
                     painted = paint_them(physics[e, r], exogenous[e, r], views=[view])
                     picture[e, r] = (painted[0] if both else painted)[:, 0]
                     without_goal += [(e, r, painted[1][:, 0])] if both else []
-            tick(len(frames))
+            progress(len(frames))
         if arrays is None or name in arrays:
             yield name, picture
         if not hides:
@@ -192,7 +192,7 @@ def paint(
 
 
 def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: DistractorState) -> np.ndarray:
-    """Indices of the frames in which the goal (or its shadow) may change a pixel; the others share their pictures."""
+    """Indices of the frames in which the goal or its shadow may change a pixel; in all others both pictures are equal."""
     if not hasattr(task, "goal_in_sight"):
         return np.arange(len(physics))
     return np.flatnonzero(task.goal_in_sight(view, physics, exogenous))

@@ -1,8 +1,8 @@
-"""New pixels for a release: its physics states in, a release with another distractor, size or renderer out.
+"""Write a release with the episodes of another one and new pictures: another distractor, size or renderer.
 
-Nothing is simulated: actions, rewards, states and physics are copied. A subset whose distractor or split changes draws
-its labels from the same random streams as a rollout would, so that with shared trajectories the repainted subset has
-the very bytes that rolling it out would have given.
+Nothing is simulated: actions, rewards, states and physics are copied. If the distractor or split of a subset changes,
+its labels are drawn from the same random streams as a rollout's. With shared trajectories, the repainted subset then
+has the very bytes that rolling it out would give.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from dmcvb_gen.tasks.base import Task
 
 @dataclass(frozen=True)
 class Repainting:
-    """A new release to be painted from another one's episodes; what is None stays as each subset has it.
+    """Describe a new release with another one's episodes; None keeps what each subset has.
 
     Attributes:
       root, out: folders of the source and of the new release.
@@ -100,12 +100,12 @@ def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec
     return tuple(ArraySpec(name, LABEL_TYPES[label], (size, size), ("height", "width")) for label, name in names)
 
 
-def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = ignore) -> Manifest:
-    """Write a release with new pictures of the episodes of another; run again, it goes on where it stopped.
+def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallback = ignore) -> Manifest:
+    """Write a release with new pictures of the episodes of another one. Run again, it resumes.
 
     Args:
       workers: processes, or a Ray cluster that sees the same folders.
-      tick: told how many frames were painted since the last call.
+      progress: called with the number of frames rendered since the last call.
 
     Returns:
       The finished manifest.
@@ -142,7 +142,7 @@ def repaint(request: Repainting, workers: Workers = 1, tick: ProgressCallback = 
     copy_inputs(out, [pair.record for pair in pairs.values()], inputs)
     sources = {name: Stored(pair.source, new_labels=not pair.keeps_labels) for name, pair in pairs.items()}
     jobs = make_jobs(manifest, todo, site, inputs, request.device, sources, tuple(request.labels))
-    for _ in run_jobs(jobs, workers, tick):
+    for _ in run_jobs(jobs, workers, progress):
         pass
     return finish_together(out)
 

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -63,16 +63,30 @@ def imported_specs(record: SubsetRecord) -> tuple[ArraySpec, ...]:
     return tuple(spec for spec in specs if picture_of(spec.name) is None or spec.name in shown)
 
 
+class Place(NamedTuple):
+    """Where an episode lies: the number of its folder, its file, and its bytes there."""
+
+    folder: int
+    file: Path
+    offset: int
+    length: int
+
+    def read(self) -> dict[str, Any]:
+        """The features of the episode; see `read_example`."""
+        return read_example(self.file, self.offset, self.length)
+
+
 @dataclass(frozen=True)
 class _Source:
-    """The folders of a subset, and what it will be; fixed goals have a folder a goal."""
+    """The record of a subset, its folders, and its episodes; DMC-VB has a folder for each fixed goal."""
 
     record: SubsetRecord
     folders: tuple[Path, ...]
+    episodes: tuple[Place, ...]
 
     @property
     def files(self) -> list[str]:
-        """Names of its files in the order of their episodes; of fixed goals, with the folder's place before."""
+        """Names of its files in the order of their episodes, after the number of their folder."""
         return [f"{goal}/{file.name}" for goal, folder in enumerate(self.folders) for file in _files(folder)]
 
 
@@ -85,9 +99,9 @@ def import_tfds(
     setting: str | None = None,
     name: str = "dmc-vb-original",
     partial: bool = False,
-    tick: ProgressCallback = ignore,
+    progress: ProgressCallback = ignore,
 ) -> Manifest:
-    """Import subsets, of locomotion and of mazes; run again, it goes on where it stopped.
+    """Import subsets of locomotion and of mazes. Run again, it resumes.
 
     Episodes are numbered by the order of their files. Where files that were missing come between those that were
     imported, the numbers would be others, and `out` is refused; where they come after, the subset grows.
@@ -98,7 +112,7 @@ def import_tfds(
       task, level, setting: what a single folder holds, where its path does not say it.
       name: of the new release.
       partial: take the files that are there, though their names say that there are more (`-00003-of-00100`).
-      tick: told 1 for each episode.
+      progress: called with 1 for each episode.
 
     Raises:
       StoreError: no TFDS folder is there, it is damaged, lacks files or has other features, or `out` cannot be used.
@@ -136,9 +150,9 @@ def import_tfds(
         ),
     )
     manifest = start_release(out, manifest)
-    expect(tick, sum(_episodes_to_come(source.record, out) for source in sources))
+    expect(progress, sum(_episodes_to_come(source.record, out) for source in sources))
     for source in sources:
-        _import_subset(source, out, tick)
+        _import_subset(source, out, progress)
     return finish_release(out, manifest)
 
 
@@ -155,7 +169,13 @@ def _sources(found: list[Path], task, level, setting) -> list[_Source]:
             raise StoreError(f"{members[1][0]} and {members[0][0]} are both {name}; import one of them")
         members.sort(key=lambda member: member[1][3] or 0)
         folders = tuple(path for path, _ in members)
-        sources.append(_Source(_record(name, members[0][1][:3], folders), folders))
+        places = tuple(
+            Place(goal, file, *place)
+            for goal, path in enumerate(folders)
+            for file in _files(path)
+            for place in offsets(file)
+        )
+        sources.append(_Source(_record(name, members[0][1][:3], folders, places), folders, places))
     return sources
 
 
@@ -177,7 +197,9 @@ def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | No
     return task, level, setting, guess[3]
 
 
-def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -> SubsetRecord:
+def _record(
+    name: str, facts: tuple[str, str, str], folders: tuple[Path, ...], places: tuple[Place, ...]
+) -> SubsetRecord:
     task, level, setting = facts
     hidden = hides_goal(setting)
     features = _step_features(folders[0])
@@ -189,12 +211,11 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
     if not views:
         wanted = picture_feature(task, get_task(task).views[0], hidden)
         raise StoreError(f"{folders[0]}/features.json has no picture observation/{wanted}; it is no {name} of DMC-VB")
-    counts = [sum(1 for file in _files(path) for _ in offsets(file)) for path in folders]
-    for path, count in zip(folders, counts, strict=True):
-        if not count:
+    for number, path in enumerate(folders):
+        if not any(place.folder == number for place in places):
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
     family = get_task(task).family
-    pairs = _goal_pairs(folders) if setting == FIXED else []
+    pairs = [_goal_pair(place, place.read(), len(folders)) for place in places] if setting == FIXED else []
     goals = max(pairs, default=0) + 1
     in_order = pairs == [pair for pair in range(goals) for _ in range(len(pairs) // goals)]
     try:
@@ -210,34 +231,26 @@ def _record(name: str, facts: tuple[str, str, str], folders: tuple[Path, ...]) -
         task=task,
         level=level,
         setting=setting,
-        episodes=sum(counts),
-        episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD[family], sum(counts)),
+        episodes=len(places),
+        episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD[family], len(places)),
         size=size,
         renderer={"name": IMPORTED},
         family=family,
         views=views,
         hidden_goal=hidden,
-        max_steps=_time_limit(folders, get_task(task)),
+        max_steps=_time_limit(places, get_task(task)),
         fixed_goals=goals if pairs else None,
         episodes_per_goal=len(pairs) // goals if pairs and in_order else None,  # else the episodes' labels say it
     )
 
 
-def _examples(folders: tuple[Path, ...]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """(number of the folder, features) of all episodes, in their order."""
-    for number, folder in enumerate(folders):
-        for file in _files(folder):
-            for place in offsets(file):
-                yield number, read_example(file, *place)
-
-
-def _time_limit(folders: tuple[Path, ...], task: Task) -> int:
+def _time_limit(places: tuple[Place, ...], task: Task) -> int:
     """Transitions of the first episode that the time limit ended; if it ended none, at least the task's own limit.
 
     Experts reach nearly all goals of mazes, so the first such episode may be a late one.
     """
     longest = task.max_steps
-    for _, values in _examples(folders):
+    for values in map(Place.read, places):
         length = len(values.get("steps/reward", ())) - 1
         if 0 < length <= MAX_STEPS and not np.any(values.get("steps/is_terminal", False)):
             return length
@@ -245,14 +258,10 @@ def _time_limit(folders: tuple[Path, ...], task: Task) -> int:
     return min(longest, MAX_STEPS)
 
 
-def _goal_pairs(folders: tuple[Path, ...]) -> list[int]:
-    """The pair of start and goal of each episode: DMC-VB has a folder a pair, our own exports name it."""
-    return [_goal_pair(values, folder, len(folders)) for folder, values in _examples(folders)]
-
-
-def _goal_pair(values: dict[str, Any], folder: int, folders: int) -> int:
+def _goal_pair(place: Place, values: dict[str, Any], folders: int) -> int:
+    """The pair of start and goal of an episode: DMC-VB has a folder for each pair, our own exports name it."""
     named = values.get("goal_pair", ())
-    pair = int(named[0]) if folders == 1 and isinstance(named, np.ndarray) and len(named) == 1 else folder
+    pair = int(named[0]) if folders == 1 and isinstance(named, np.ndarray) and len(named) == 1 else place.folder
     if not 0 <= pair < MAX_GOAL_PAIRS:
         raise StoreError(f"an episode has goal pair {pair}, expected 0 to {MAX_GOAL_PAIRS - 1}; export it again")
     return pair
@@ -322,7 +331,7 @@ def _episodes_to_come(record: SubsetRecord, out: Path) -> int:
     return record.episodes - sum(commit.episode_count for commit in read_commits(out, record).values())
 
 
-def _import_subset(source: _Source, out: Path, tick: ProgressCallback) -> None:
+def _import_subset(source: _Source, out: Path, progress: ProgressCallback) -> None:
     record = source.record
     task = get_task(record.task)
     rows = record.max_steps + 1
@@ -337,27 +346,18 @@ def _import_subset(source: _Source, out: Path, tick: ProgressCallback) -> None:
     attributes["views"] = list(record.views)
     create_subset(out, record, specs, rows, attributes)
     done = read_commits(out, record)
-    records = (
-        (goal, file, *place)
-        for goal, folder in enumerate(source.folders)
-        for file in _files(folder)
-        for place in offsets(file)
-    )
-    for shard in range(shard_count(record)):
-        places = [next(records) for _ in range(*shard_episodes(record, shard))]
-        if shard in done:
-            continue
+    for shard in sorted(set(range(shard_count(record))) - set(done)):
+        places = source.episodes[slice(*shard_episodes(record, shard))]
         arrays = {
             spec.name: np.zeros((len(places), *([rows] if spec.steps else []), *spec.shape), spec.dtype)
             for spec in specs
         }
-        for row, (goal, file, *place) in enumerate(places):
+        for row, place in enumerate(places):
             one = {name: array[row : row + 1] for name, array in arrays.items()}
-            values = read_example(file, *place)
-            _fill(one, values, record, file)
-            fixed = record.setting == FIXED
-            arrays["goal_pair"][row] = _goal_pair(values, goal, len(source.folders)) if fixed else -1
-            tick(1)
+            values, fixed = place.read(), record.setting == FIXED
+            _fill(one, values, record, place.file)
+            arrays["goal_pair"][row] = _goal_pair(place, values, len(source.folders)) if fixed else -1
+            progress(1)
         write_shard(out, record, shard, arrays.items(), arrays["length"])
 
 
