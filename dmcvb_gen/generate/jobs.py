@@ -7,6 +7,7 @@ another machine make the same bytes.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,11 +19,10 @@ from dmcvb_gen.dataset.shards import ShardKey
 from dmcvb_gen.dataset.writer import shard_episodes
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RecipeError, StoreError
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.recipe import Recipe, make_recipe
 from dmcvb_gen.names import FIXED, LOCOMOTION, family_of
 from dmcvb_gen.policies.bundled import resolve_policies
-from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.tasks import get_task
 
 if TYPE_CHECKING:
     from dmcvb_gen.generate.site import Site
@@ -33,7 +33,7 @@ BUILTIN = "builtin"
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a subset is made from, as it is found on this machine.
+    """The files that a subset is made from, on this machine.
 
     Attributes:
       policies: files of the behaviour policies, in the record's order; none for uniform random actions.
@@ -151,7 +151,7 @@ def part_of(jobs: Sequence[Job], part: tuple[int, int]) -> tuple[Job, ...]:
 
 
 def left_to_do(jobs: Iterable[Job], done: Mapping[str, Collection[int]]) -> tuple[Job, ...]:
-    """Jobs without the subsets whose shard is committed already; none where that is all of them.
+    """The jobs that are left, without the subsets whose shard is committed already.
 
     Args:
       done: subset -> shards.
@@ -165,7 +165,7 @@ def left_to_do(jobs: Iterable[Job], done: Mapping[str, Collection[int]]) -> tupl
 
 
 def _trajectory(manifest: Manifest, record: SubsetRecord) -> tuple:
-    """What decides the episodes of a subset, the names of its streams first."""
+    """All that decides the episodes of a subset, the names of its random streams first."""
     policies = tuple(policy.digest for policy in record.policies)
     size = (record.episodes, record.episodes_per_shard, record.max_steps)
     goals = (record.fixed_goals, record.episodes_per_goal)
@@ -220,26 +220,28 @@ def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:
     Raises:
       StoreError: neither is there.
     """
-    task, found = get_task(record.task), []
+    found = []
     for policy in record.policies:
         candidates = [root / policy.path] if policy.path else []
-        try:
+        with contextlib.suppress(DmcvbError):  # the release's own copy is enough
             candidates += resolve_policies(record.task, record.level)
-        except DmcvbError:
-            pass  # the release's own copy is enough
-        for path in candidates:
-            try:
-                if Path(path).is_file() and load_policy(path, task).digest == policy.digest:
-                    found.append(str(path))
-                    break
-            except DmcvbError:
-                continue
+        same = (str(path) for path in candidates if _digest(path) == policy.digest)
+        if (path := next(same, None)) is not None:
+            found.append(path)
         else:
             raise StoreError(
                 f"policy {policy.name} of {record.name} (digest {policy.digest[:12]}) is neither in the release nor "
                 f"bundled with this dmcvb-gen; put its file at {policy.path}"
             )
     return tuple(found)
+
+
+def _digest(path: Path) -> str | None:
+    """The digest of a policy file, None if it cannot be read."""
+    try:
+        return sha256_file(path)
+    except OSError:
+        return None
 
 
 def background_source(root: Path, record: SubsetRecord, moved: str | None = None) -> str:

@@ -1,4 +1,4 @@
-"""From a recipe to work: checks everything that can be wrong, then lists the jobs; no episode is made here."""
+"""Plan a rollout: validate the recipe, list the jobs, create the release, and finish it. No episode is made here."""
 
 from __future__ import annotations
 
@@ -221,12 +221,8 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
 def _policy_record(path: Path, task: Task) -> PolicyRecord:
     policy = load_policy(path, task)
     header = policy.header.without_local_paths().model_dump(mode="json")
-    return PolicyRecord(name=path.stem, digest=policy.digest, path=policy_path(path), header=header)
-
-
-def policy_path(file: str | Path) -> str:
-    """Where a release keeps its copy of a policy file."""
-    return f"{POLICIES}{sha256_file(file)[:16]}.safetensors"
+    copy = f"{POLICIES}{policy.digest[:16]}.safetensors"
+    return PolicyRecord(name=path.stem, digest=policy.digest, path=copy, header=header)
 
 
 def painting_facts(record: SubsetRecord, backgrounds: str, device: str) -> dict[str, Any]:

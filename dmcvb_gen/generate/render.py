@@ -192,7 +192,7 @@ def paint(
 
 
 def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: DistractorState) -> np.ndarray:
-    """Indices of the frames in which the goal or its shadow may change a pixel; in all others both pictures are equal."""
+    """Indices of the frames in which the goal or its shadow may change a pixel; in the others it is unseen."""
     if not hasattr(task, "goal_in_sight"):
         return np.arange(len(physics))
     return np.flatnonzero(task.goal_in_sight(view, physics, exogenous))
