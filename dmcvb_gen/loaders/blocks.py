@@ -7,6 +7,7 @@ shuffled order, holds `buffer` of them in memory, and mixes their steps.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -43,7 +44,7 @@ def choose(subset: Subset, episodes: Iterable[int] | None) -> np.ndarray:
 def stack_channels(frames: np.ndarray) -> np.ndarray:
     """(..., stack, view, height, width, 3) -> (..., stack * view * 3, height, width), oldest frame first."""
     moved = np.moveaxis(frames, -1, -3)
-    return moved.reshape(*moved.shape[:-5], -1, *moved.shape[-2:])
+    return moved.reshape(*moved.shape[:-5], math.prod(moved.shape[-5:-2]), *moved.shape[-2:])
 
 
 class Block:
