@@ -198,7 +198,7 @@ def test_beside_it_makes_an_equal_release(small_release, tmp_path):
     outcome = Regeneration(small_release, ["*/*/none"]).remake(tmp_path / "beside")
     assert outcome.sound and all(shard.equal for shard in outcome.shards)
     assert list(open_release(tmp_path / "beside").subsets) == ["walker-walk/random/none"]
-    with pytest.raises(StoreError, match="leave --out away"):
+    with pytest.raises(StoreError, match="remove --out"):
         Regeneration(small_release).remake(small_release)
 
 

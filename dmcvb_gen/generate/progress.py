@@ -1,4 +1,4 @@
-"""How far a release is: a site in, shards done and late, rates and the time left out, from the commit records alone."""
+"""Report how much of a release is done, from its commit records alone: shards, rates, and the time that is left."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class SubsetProgress:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """How far a release is.
+class ReleaseProgress:
+    """How much of a release is done.
 
     Attributes:
       done, total: shards.
@@ -60,8 +60,8 @@ class Progress:
         return dataclasses.asdict(self) | {"done": self.done, "late": self.late, "total": self.total}
 
 
-def progress_of(site: Site) -> Progress:
-    """How far the release at a site is.
+def progress_of(site: Site) -> ReleaseProgress:
+    """How much of the release at a site is done.
 
     Raises:
       StoreError: there is none.
@@ -93,7 +93,7 @@ def progress_of(site: Site) -> Progress:
     done, total = sum(subset.done for subset in subsets), sum(subset.total for subset in subsets)
     left = (total - done) * (sum(steps) / max(done, 1)) / rate if rate else None
     silence = max(0.0, time.time() - max(times)) if times else None
-    return Progress(manifest.name, subsets, int(sum(steps)), rate, silence, left, manifest.complete)
+    return ReleaseProgress(manifest.name, subsets, int(sum(steps)), rate, silence, left, manifest.complete)
 
 
 def _rate(times: np.ndarray, steps: np.ndarray) -> float | None:

@@ -65,14 +65,14 @@ class ArrayDifference:
 
 @dataclass(frozen=True)
 class ShardOutcome:
-    """What became of one shard.
+    """The result for one shard.
 
     Attributes:
       was: what was wrong with the released files, None if nothing.
-      equal: whether it came out with the promised bytes; None if the manifest promises none.
+      equal: whether the new shard has the promised bytes; None if the manifest promises none.
       repaired: whether it was put into the release.
-      differences: where it came out otherwise and both can be read; empty if only the compression differs.
-      compared: whether both could be read.
+      differences: of the values, if the bytes differ; empty if only the compression differs.
+      compared: whether both shards could be read.
     """
 
     subset: str
@@ -107,11 +107,11 @@ class ShardOutcome:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a release.
+    """The result for a release.
 
     Attributes:
-      shards: outcomes of all that were made.
-      environment: what is another version or device than when the release was made.
+      shards: results of all shards that were made.
+      environment: versions and devices that differ from those that made the release: name -> (there, here).
       left: shards of an incomplete release that are not here and were not checked.
       restored: paths of other files that were put back: metadata, policies, videos.
     """
@@ -128,7 +128,7 @@ class Outcome:
 
 
 def environment_diff(manifest: Manifest) -> dict[str, tuple[str, str]]:
-    """What of this machine is in none of the environments that made the release: name -> (there, here)."""
+    """How this machine differs from all environments that made the release: name -> (there, here)."""
     here = environment()
     return {
         name: (" or ".join(sorted({old.get(name, "unknown") for old in manifest.environments})) or "unknown", value)
@@ -139,7 +139,7 @@ def environment_diff(manifest: Manifest) -> dict[str, tuple[str, str]]:
 
 
 def compare_shards(one: Path, other: Path, record: SubsetRecord, shard: int) -> tuple[ArrayDifference, ...] | None:
-    """Differences of a shard's values in two releases, None where one of them cannot be read."""
+    """Differences of a shard's values in two releases, None if one of them cannot be read."""
     first, last = shard_episodes(record, shard)
     found = []
     try:
@@ -160,13 +160,13 @@ def compare_shards(one: Path, other: Path, record: SubsetRecord, shard: int) -> 
 
 @dataclass(frozen=True)
 class Regeneration:
-    """Which shards of a release to make again, and how.
+    """Choose the shards of a release to make again, and how.
 
     Attributes:
       root: the release's folder.
       only, episodes: subset patterns and (first, last + 1): the shards that hold any of them; all by default.
-      backgrounds: where the videos are now, if they moved.
-      device: paint there instead of where the manifest says.
+      backgrounds: folder of the videos, if they are not in the release.
+      device: render there instead of on the manifest's device.
       workers: processes, or a Ray cluster that sees the same folders.
     """
 
@@ -269,7 +269,7 @@ class Regeneration:
         root, manifest = load_manifest(self.root)
         out = local_path(out)
         if out.resolve() == root.resolve():
-            raise StoreError(f"--out {out} is the release itself; leave --out away to repair it in place")
+            raise StoreError(f"--out {out} is the release itself; remove --out to repair it in place")
         shards = chosen_shards(manifest, self.only, self.episodes)
         records = _unique(shards.values())
         check_makeable(manifest, records)

@@ -36,7 +36,7 @@ DEFAULT_CACHE = 1_000_000_000
 
 @dataclass(frozen=True)
 class Painting:
-    """How pictures are painted on reading.
+    """How pictures are rendered when they are read.
 
     Attributes:
       distractors: "stored" or "resample".
@@ -56,7 +56,7 @@ class Painting:
 
 
 class PaintedArray:
-    """A picture array that is painted as it is indexed; see `store.reader.StoredArray`."""
+    """A picture array that is rendered when it is indexed; see `store.reader.StoredArray`."""
 
     def __init__(self, subset: PaintedSubset, name: str):
         self._subset, self.name = subset, name
@@ -78,7 +78,7 @@ class PaintedArray:
 
 
 class PaintedSubset(SubsetReader):
-    """A subset whose pictures are painted when they are read; `set_epoch` draws other distractors, if they are fresh.
+    """A subset whose pictures are rendered when they are read. With fresh distractors, each epoch shows others.
 
     Attributes:
       epoch: of the distractors; 0 at the start.
