@@ -1,6 +1,6 @@
-"""Rollouts that take a moment: a painter that is only arithmetic, for many faults an hour.
+"""A renderer that is only arithmetic, for rollouts that take a moment: many faults an hour.
 
-What is painted does not matter to a campaign of faults; that the same state gives the same picture does.
+A campaign of faults needs the same picture for the same state, whatever it shows.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from dmcvb_gen.rendering.base import Renderer, check_frames
 
 
-class RenderConfig(Renderer):
+class TinyRenderer(Renderer):
     """Pictures whose every byte follows from the bytes of the state, the labels and the view."""
 
     def __init__(self, name, task, size):
@@ -35,6 +35,6 @@ class RenderConfig(Renderer):
 
 def shrink() -> None:
     """Have this process (and those that are forked from it) paint so."""
-    from dmcvb_gen.generate import painting
+    from dmcvb_gen.generate import render
 
-    painting.make_renderer = lambda name, task, size, **settings: RenderConfig(name, task, size)
+    render.make_renderer = lambda name, task, size, **settings: TinyRenderer(name, task, size)
