@@ -43,6 +43,8 @@ def cure(module: str) -> str | None:
     for extra, modules in EXTRAS.items():
         if top in modules:
             return f"this needs {package}, which is not installed: pip install {package} (or the extra [{extra}])"
+    if top == "labmaze":
+        return "mazes need labmaze, which has wheels for Python 3.11 and 3.12 only: use one of these, or another task"
     if top in SIMULATOR or top in _PACKAGES:
         return f"this needs {package}, which is not installed: pip install {package} (a whole install brings it)"
     return None

@@ -1,15 +1,62 @@
-"""Pages that the documentation makes of the code: one for each command of `dmcvb-gen`, and their index."""
+"""Pages that the site makes from the code: one for each command, their index, and the table of export formats."""
 
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import click
 import mkdocs_gen_files
 
-from dmcvb_gen.cli import COMMANDS
+from dmcvb_gen.cli import COMMANDS, main
+from dmcvb_gen.release.export.registry import format_table
 
-with mkdocs_gen_files.open("cli/index.md", "w") as index:
-    index.write("# Commands\n\n")
-    for name, (target, summary) in COMMANDS.items():
-        index.write(f"- [`dmcvb-gen {name}`]({name}.md): {summary}\n")
-        module, attribute = target.split(":")
+DOCS = Path(__file__).resolve().parents[1]
+
+
+def cell(text: str) -> str:
+    """Text for a cell of a Markdown table."""
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def help_text(command: click.Command) -> str:
+    """A command's help as Markdown: a paragraph that starts with \\b is an example and keeps its lines."""
+    paragraphs = []
+    for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
+        example = paragraph.startswith("\b")
+        paragraphs.append(f"```text\n{paragraph.strip(chr(8)).strip()}\n```" if example else paragraph)
+    return "\n\n".join(paragraphs)
+
+
+def option_table(command: click.Command, context: click.Context) -> str:
+    """Every option with its help, as `--help` prints them."""
+    records = [parameter.get_help_record(context) for parameter in command.get_params(context)]
+    rows = [f"| `{cell(names)}` | {cell(text)} |" for names, text in filter(None, records)]
+    return "\n".join(["| option | |", "|---|---|", *rows])
+
+
+def command_page(name: str, command: click.Command) -> str:
+    context = click.Context(command, info_name=f"dmcvb-gen {name}")
+    usage = " ".join(command.collect_usage_pieces(context))
+    return (
+        f"# dmcvb-gen {name}\n\n```text\ndmcvb-gen {name} {usage}\n```\n\n{help_text(command)}\n\n"
+        f"## Options\n\n{option_table(command, context)}\n"
+    )
+
+
+def write_pages() -> None:
+    group = click.Context(main, info_name="dmcvb-gen")
+    lines = ["# Commands", ""]
+    for name in main.list_commands(group):
+        command = main.get_command(group, name)
+        assert command is not None
+        lines.append(f"- [`dmcvb-gen {name}`]({name}.md): {COMMANDS[name][1]}")
         with mkdocs_gen_files.open(f"cli/{name}.md", "w") as page:
-            page.write(f"# dmcvb-gen {name}\n\n")
-            page.write(f"::: mkdocs-click\n    :module: dmcvb_gen.cli.{module}\n    :command: {attribute}\n")
-            page.write(f"    :prog_name: dmcvb-gen {name}\n    :depth: 1\n    :style: table\n")
+            page.write(command_page(name, command))
+    with mkdocs_gen_files.open("cli/index.md", "w") as index:
+        index.write("\n".join(lines) + "\n")
+    with mkdocs_gen_files.open("exports.md", "w") as page:
+        page.write((DOCS / "exports.md").read_text().replace("<!-- formats -->", format_table()))
+
+
+write_pages()
