@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from dmcvb_gen.cli import COMMANDS
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -85,7 +87,8 @@ def test_what_a_page_does_not_run_is_set_up_or_layout(page):
             assert all(line.startswith(SET_UP) for line in commands), f"{page.name}:{block.line}"
 
 
-def test_the_site_builds_without_a_warning(tmp_path):
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_shows_every_command(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
         cwd=ROOT,
@@ -93,6 +96,13 @@ def test_the_site_builds_without_a_warning(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
+    site = tmp_path / "site"
+    pages = {path.parent.name: path.read_text() for path in (site / "cli").rglob("index.html")}
+    assert set(COMMANDS) <= set(pages)
+    assert not any("Sentinel" in page or "UNSET" in page for page in pages.values())
+    assert re.search(r"<code>[^<]*dmcvb-gen view releases/demo\n[^<]*dmcvb-gen view", pages["view"])  # lines are kept
+    assert "hdf5" in (site / "exports/index.html").read_text().split("leaves out")[1]
+    assert "max_steps" in (site / "reading/index.html").read_text()  # of the environments
 
 
 def test_links_and_pictures_are_there_where_the_site_is_not_built():

@@ -25,6 +25,8 @@ HISTOGRAM_LINES, CURVE_LINES = 6, 6
 """Lines of a figure at most. More stand in further ones: laying a figure out takes time that grows with the square of
 its axes, and beyond 65,536 pixels it cannot be drawn.
 """
+FEW_RETURNS = 20
+"""Fewer episodes are drawn as a mark each: bars would look like a distribution."""
 NAME_BREAK = 26
 """Characters of a subset's name beyond which it stands on two lines."""
 
@@ -61,11 +63,16 @@ def _return_figure(release: Release, known: Mapping[str, np.ndarray]) -> Figure:
     for index, (name, returns) in enumerate(known.items()):
         axis = figure.add_subplot(lines, columns, index + 1)
         subset = release.subsets[name]
-        axis.hist(returns, bins=30, color="#4477aa")
+        few = len(returns) < FEW_RETURNS
+        if few:
+            axis.plot(returns, np.full(len(returns), 0.5), "|", color="#4477aa", markersize=14, markeredgewidth=2)
+            axis.set_ylim(-0.25, 1)
+        else:
+            axis.hist(returns, bins=30, color="#4477aa")
+            axis.yaxis.set_major_locator(MaxNLocator(integer=True))
         shown = name if len(name) <= NAME_BREAK else name.replace("/", "\n", 1)
         axis.set_title(shown, fontsize=9)
-        axis.set(xlabel="return", ylabel="episodes")
-        axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.set(xlabel="return", ylabel="a mark an episode" if few else "episodes")
         paper = None if subset.setting == FIXED else paper_returns(subset.task, subset.level)
         if paper:
             low = -0.12 * axis.get_ylim()[1]
@@ -74,6 +81,8 @@ def _return_figure(release: Release, known: Mapping[str, np.ndarray]) -> Figure:
             axis.plot([paper["median"]], [low], "|", color="black", markersize=9)
             axis.set_yticks([tick for tick in axis.get_yticks() if tick >= 0])
             axis.set_title(f"{shown}\nbelow: the paper's range, quartiles, median", fontsize=8)
+        if few:
+            axis.set_yticks([])
     return figure
 
 

@@ -448,7 +448,7 @@ def info(path, options, as_json):
 @click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets.")
 @click.option("--out", type=OutPath(path_type=Path), help="Folder of the files.  [default: PATH/preview]")
 @click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes of each subset.")
-@click.option("--scale", type=click.IntRange(1, 8), default=2, show_default=True, help="Enlarge the pictures.")
+@click.option("--scale", type=click.IntRange(1, 8), help="Enlarge the images.  [default: 2; videos of 512 pixels]")
 @click.option("--frames", type=click.IntRange(1), default=200, show_default=True, help="Of the video, 20 a second.")
 @click.option("--episode", type=click.IntRange(0), help="The one in the video.  [default: the first of each subset]")
 @click.option(

@@ -1,4 +1,4 @@
-"""A look at a release: episodes in, a contact sheet (PNG) and a video out."""
+"""Write a contact sheet (PNG) and a video of a release's episodes."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
 VIDEO_FRAMES, VIDEO_FPS = 200, 20
+SHEET_SCALE, VIDEO_SIDE = 2, 512
+"""Enlargement on the contact sheet; pixels that the shorter side of a video has at least."""
 RAMP, RAMP_PLACES = ((60, 20, 90), (30, 145, 140), (250, 230, 40)), (0.0, 0.5, 1.0)
 """Colors of distances to a goal, from the farthest to the nearest."""
+MAP = "distance to the goal, and the path so far"
 FORMATS = ("mp4", "webp", "gif")
 LABEL_HEIGHT = 14
 
@@ -91,17 +94,21 @@ def _has_map(subset: Subset) -> bool:
 
 
 def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
-    """Evenly spaced frames of one episode side by side, a row a view, under a caption; (h, w, 3) uint8."""
+    """Evenly spaced frames of one episode side by side under a caption, a row a view; (h, w, 3) uint8.
+
+    If there are several views, each row has its name above it.
+    """
     length = int(subset.read("length", [episode])[0])
     steps = np.linspace(0, length, columns).round().astype(int)
-    rows = []
-    for name in shown(subset).arrays:
+    pictures, rows = shown(subset), []
+    for view, name in zip(pictures.views, pictures.arrays, strict=True):
         frames = subset.episode(episode, [name, "length"])[name][steps]
-        rows.append(np.concatenate(list(_enlarge(frames, scale)), axis=1))
+        rows.append((view, np.concatenate(list(_enlarge(frames, scale)), axis=1)))
     if _has_map(subset):
         drawn = _map(subset, subset.episode(episode, ["state", _top(subset)]), steps, scale)
-        rows.append(np.concatenate(list(drawn), axis=1))
-    picture = np.concatenate(rows)
+        rows.append((MAP, np.concatenate(list(drawn), axis=1)))
+    named = [part for view, row in rows for part in (_label(view, row.shape[1]), row)]
+    picture = np.concatenate(named if len(rows) > 1 else [rows[0][1]])
     value = float(subset.read("return", [episode])[0])
     caption = f"{subset.name}  episode {episode}  {length} steps  return {value:.1f}"
     return np.concatenate([_label(caption, picture.shape[1]), picture])
@@ -122,31 +129,42 @@ def contact_sheet(
 
 
 def video_frames(
-    subsets: Sequence[Subset], scale: int = 2, frames: int = VIDEO_FRAMES, episode: int | None = None
+    subsets: Sequence[Subset], scale: int | None = None, frames: int = VIDEO_FRAMES, episode: int | None = None
 ) -> np.ndarray:
-    """An episode of every subset side by side, the first by default; (frame, height, width, 3) uint8."""
-    columns = []
-    for subset in subsets:
-        shown_one = int(subset.episodes[0]) if episode is None else episode
-        values = subset.episode(shown_one, ["state", *shown(subset).arrays])
-        views = [values[name] for name in shown(subset).arrays]
-        steps = np.minimum(np.arange(frames), len(views[0]) - 1)
-        rows = [_enlarge(view[steps], scale) for view in views]
-        if _has_map(subset):
-            rows.append(_map(subset, values, steps, scale))
-        picture = np.concatenate(rows, axis=1)
-        label = _label(_fitting(subset.name, picture.shape[2]), picture.shape[2])
-        columns.append(np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1))
-    per_row = min(len(columns), int(np.ceil(np.sqrt(len(columns) * 1.5))))
-    height = max(column.shape[1] for column in columns)
-    width = max(column.shape[2] for column in columns)
-    columns = [
-        np.pad(c, ((0, 0), (0, height - c.shape[1]), (0, width - c.shape[2]), (0, 0)), constant_values=255)
-        for c in columns
+    """An episode of every subset side by side, the first by default; (frame, height, width, 3) uint8.
+
+    Args:
+      scale: enlargement of the images; by default the smallest with `VIDEO_SIDE` pixels on the shorter side.
+    """
+    if scale is None:
+        height, width = _grid([_subset_frames(subset, 1, 1, episode) for subset in subsets]).shape[1:3]
+        scale = -(-VIDEO_SIDE // min(height, width))
+    return _grid([_subset_frames(subset, scale, frames, episode) for subset in subsets])
+
+
+def _subset_frames(subset: Subset, scale: int, frames: int, episode: int | None) -> np.ndarray:
+    """(frame, height, width, 3): the views of one episode in a grid, under the subset's name."""
+    pictures = shown(subset)
+    values = subset.episode(int(subset.episodes[0]) if episode is None else episode, ["state", *pictures.arrays])
+    steps = np.minimum(np.arange(frames), len(values[pictures.arrays[0]]) - 1)
+    views = [_enlarge(values[name][steps], scale) for name in pictures.arrays]
+    if _has_map(subset):
+        views.append(_map(subset, values, steps, scale))
+    picture = _grid(views)
+    label = _label(_fitting(subset.name, picture.shape[2]), picture.shape[2])
+    return np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1)
+
+
+def _grid(videos: Sequence[np.ndarray]) -> np.ndarray:
+    """Videos (frame, height, width, 3) in rows, somewhat wider than high; gaps are white."""
+    columns = min(len(videos), int(np.ceil(np.sqrt(len(videos) * 1.5))))
+    height, width = (max(video.shape[axis] for video in videos) for axis in (1, 2))
+    whole = [
+        np.pad(v, ((0, 0), (0, height - v.shape[1]), (0, width - v.shape[2]), (0, 0)), constant_values=255)
+        for v in videos
     ]
-    while len(columns) % per_row:
-        columns.append(np.full_like(columns[0], 255))
-    rows = [np.concatenate(columns[i : i + per_row], axis=2) for i in range(0, len(columns), per_row)]
+    whole += [np.full_like(whole[0], 255)] * (-len(whole) % columns)
+    rows = [np.concatenate(whole[i : i + columns], axis=2) for i in range(0, len(whole), columns)]
     return np.concatenate(rows, axis=1)
 
 
@@ -156,7 +174,7 @@ def write_preview(
     *,
     only: Sequence[str] = (),
     episodes: int = 4,
-    scale: int = 2,
+    scale: int | None = None,
     frames: int = VIDEO_FRAMES,
     episode: int | None = None,
     video: str | None = None,
@@ -166,10 +184,11 @@ def write_preview(
     Args:
       out: folder of the files; `<release>/preview` by default.
       only: subset patterns.
-      episodes: of each subset on the sheet.
-      frames: of the video, 20 a second.
-      episode: that the video shows of each subset; the first by default.
-      video: "mp4", "webp" or "gif"; by default mp4 where imageio-ffmpeg is installed, else webp.
+      episodes: number of episodes of each subset on the sheet.
+      scale: enlargement of the images; by default 2 on the sheet, and in the video what makes it 512 pixels or more.
+      frames: number of frames of the video, which has 20 a second.
+      episode: which episode of each subset the video shows; the first by default.
+      video: "mp4", "webp" or "gif"; by default mp4 if imageio-ffmpeg is installed, else webp.
 
     Returns:
       The files.
@@ -191,7 +210,7 @@ def write_preview(
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         sheet = folder / "contact_sheet.png"
-        Image.fromarray(contact_sheet(subsets, episodes, scale=scale)).save(sheet)
+        Image.fromarray(contact_sheet(subsets, episodes, scale=scale or SHEET_SCALE)).save(sheet)
         moving = folder / f"preview.{kind}"
         (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames, episode))
     return [sheet, moving]

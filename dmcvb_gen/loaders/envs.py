@@ -305,7 +305,9 @@ class DistractedVectorEnv(VectorEnv):
     Place i behaves, to the last bit of state and reward, as a `DistractedEnv` that was reset with that place's seed.
 
     Args:
-      task, distractor, options: see `Scene`.
+      task: see `Scene`.
+      distractor: see `Scene`.
+      options: see `Scene`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 20}

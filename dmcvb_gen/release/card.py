@@ -41,6 +41,8 @@ PLOT, SHEET = f"{CARD_FOLDER}/returns.png", f"{CARD_FOLDER}/contact_sheet.png"
 STATES = f"{CARD_FOLDER}/states.json"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Hugging Face's size categories; a row is a step."""
+FEW_RETURNS = 20
+"""Episodes of a task and level below which the plot shows each one."""
 CITATION = """@inproceedings{ortiz2024dmcvb,
   title     = {{DMC-VB}: A Benchmark for Representation Learning for Control with Visual Distractors},
   author    = {Ortiz, Joseph and Dedieu, Antoine and Lehrach, Wolfgang and Guntupalli, J. Swaroop and
@@ -204,11 +206,6 @@ def _sheet(release: Release) -> np.ndarray:
 # -- text -----------------------------------------------------------------------------------------
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    return lines + ["| " + " | ".join(map(str, row)) + " |" for row in rows]
-
-
 def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
     tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
     held = "pixels and states"
@@ -245,128 +242,57 @@ def header(manifest: Manifest, steps: int, table: dict[str, Any]) -> str:
 def card_text(
     release: Release, facts: dict[str, Any], summary: str, limits: Sequence[str], table: dict[str, Any]
 ) -> str:
-    """The text of README.md."""
+    """The text of README.md, from the template data/card.md.jinja."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     manifest = release.manifest
-    first = next(iter(release.subsets.values()))
-    lines = [header(manifest, facts["steps"], table), "", f"# {manifest.name} {manifest.version}", "", summary, ""]
-    lines += [f"![First episode of every subset]({SHEET})", "", "## Composition", "", *_composition(facts), ""]
-    lines += ["## Arrays", "", *_arrays(release), ""]
-    lines += ["## Returns", "", *_returns(facts), ""]
-    lines += ["## Levels and states", "", *_levels(release), ""]
-    lines += ["## Distractors", "", *_distractors(manifest), "", "## How it was made", "", *_making(manifest), ""]
-    lines += ["## Known limits", "", *(f"- {limit}" for limit in limits), ""]
-    lines += ["## Load it", "", *_loading(manifest, first.name), ""]
-    lines += [*_checking(manifest), "", "## License and citation", ""]
-    lines += [
-        f"Data: {manifest.license}. Authors: {', '.join(manifest.authors) or 'not named'}. "
-        "The benchmark that this data follows:"
-    ]
-    return "\n".join([*lines, "", "```bibtex", CITATION, "```", ""])
-
-
-def _checking(manifest: Manifest) -> list[str]:
-    again = [] if manifest.imported else ["simulates and paints everything again"]
-    lines = ["## Check it, make it again" if again else "## Check it", "", "```bash"]
-    lines += [f"dmcvb-gen verify {manifest.name}", f"# digest {manifest.digest or 'not finished'}"]
-    return [*lines, *(f"dmcvb-gen regenerate {manifest.name} --check      # {what}" for what in again), "```"]
-
-
-def _composition(facts: dict[str, Any]) -> list[str]:
-    rows = [
-        (
-            f"`{s['name']}`",
-            f"{s['episodes']:,}" + ("" if s["complete"] else f" of {s['episodes_planned']:,}"),
-            f"{s['steps']:,}",
-            f"{s['size']} x {s['size']}",
-            f"{s['bytes'] / 1e6:.1f} MB",
-            f"`{(s['digest'] or 'not complete')[:12]}`",
+    loader = PackageLoader("dmcvb_gen.release", "data")
+    rules = dict(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined)
+    return (
+        Environment(loader=loader, **rules)
+        .get_template("card.md.jinja")
+        .render(
+            manifest=manifest,
+            facts=facts,
+            summary=summary,
+            limits=limits,
+            header=header(manifest, facts["steps"], table),
+            arrays=_arrays(release),
+            statistics=STATISTICS,
+            levels=level_statistics(release),
+            level_episodes=STATISTICS_EPISODES,
+            distractors=_distractors(manifest),
+            has_mazes=any(record.family == ANT_MAZE for record in manifest.subsets),
+            making=_making(manifest),
+            policies=_policies(manifest),
+            first=next(iter(release.subsets)),
+            sheet=SHEET,
+            plot=PLOT,
+            states=STATES,
+            table=TABLE,
+            citation=CITATION,
         )
-        for s in facts["subsets"]
-    ]
-    table = _table(("subset", "episodes", "steps", "pixels", "size", "digest"), rows)
-    return [*table, "", "Names are task/level/distractor. A step is two control steps with the same action."]
+    )
 
 
-def _arrays(release: Release) -> list[str]:
-    """A table of arrays for each kind of subset, that is, for all subsets with the same ones."""
+def _arrays(release: Release) -> dict[tuple, list[str]]:
+    """Rows (name, type, dimensions, sizes) of the table of arrays -> the subsets that have these arrays."""
     kinds: dict[tuple, list[str]] = {}
     for name, subset in release.subsets.items():
         arrays = [(array, subset.array(array)) for array in subset.arrays]
-        rows = tuple((stored_name(n), str(a.dtype), " x ".join(a.dimensions), _sizes(a.shape)) for n, a in arrays)
-        kinds.setdefault(rows, []).append(name)
-    lines = []
-    for rows, names in kinds.items():
-        if len(kinds) > 1:
-            lines += [f"{', '.join(f'`{name}`' for name in names)}:", ""]
-        shown = [(f"`{name}`", *facts) for name, *facts in rows]
-        lines += [*_table(("array", "type", "dimensions", "sizes past the episodes"), shown), ""]
-    rows_are = (
-        "Row t of an episode holds observation t, the action taken there and the reward it earned; row `length` holds "
-        "the last observation alone."
-    )
-    if not release.manifest.imported:
-        rows_are += " `exogenous/` are the distractors' labels: every picture is a function of `physics` and these."
-    return [*lines, rows_are]
-
-
-def _sizes(shape: Sequence[int]) -> str:
-    return " x ".join(map(str, shape[1:]))
-
-
-def _returns(facts: dict[str, Any]) -> list[str]:
-    rows = []
-    for subset in facts["subsets"]:
-        rows.append((f"`{subset['name']}`", *(f"{subset['returns'][key]:.1f}" for key in STATISTICS)))
-        if subset["paper"]:
-            rows.append(("DMC-VB paper", *(f"{subset['paper'][key]:.1f}" for key in STATISTICS)))
-    text = "Episode returns, with those of the DMC-VB paper's data where it has the same task and level."
-    return [text, "", f"![Returns]({PLOT})", "", *_table(("subset", *STATISTICS), rows)]
-
-
-def _levels(release: Release) -> list[str]:
-    """How the policies of each level move."""
-    rows = [
-        (
-            f"`{level.task}/{level.level}`",
-            level.episodes,
-            f"{level.speed:.2f}",
-            "" if level.height is None else f"{level.height:.2f}",
-            "" if level.success is None else f"{level.success:.0%}",
+        rows = tuple(
+            (stored_name(n), str(a.dtype), " x ".join(a.dimensions), " x ".join(map(str, a.shape[1:])))
+            for n, a in arrays
         )
-        for level in level_statistics(release)
-    ]
-    table = _table(("level", "episodes", "speed, m/s", "height, m", "at the goal"), rows)
-    told = f"Mean and standard deviation of every number of the states are in `{STATES}`; both over up to "
-    return [
-        *table,
-        "",
-        f"{told}{STATISTICS_EPISODES} episodes of a level. Heights are of the body, humanoid's of the head.",
-    ]
-
-
-def _loading(manifest: Manifest, name: str) -> list[str]:
-    return [
-        "```python",
-        "import dmcvb_gen",
-        "",
-        f'subset = dmcvb_gen.open("{manifest.name}")["{name}"]  # a folder or URL',
-        "episode = subset.episode(0)                    # numpy arrays by name",
-        "data = subset.xarray()                         # lazy xarray.Dataset",
-        'stacks = subset.torch("steps", stack=3)        # torch Dataset of 3-frame stacks',
-        "for batch in subset.batches(256): ...          # shuffled numpy batches",
-        "```",
-        "",
-        f"`{TABLE}` has a row an episode: return, length, seed, policy, first frame; `datasets.load_dataset` reads it.",
-        "",
-        f'or with plain zarr or xarray: `xarray.open_zarr("{manifest.name}/{name}.zarr")` (Zarr format 3, '
-        "consolidated metadata).",
-    ]
+        kinds.setdefault(rows, []).append(name)
+    return kinds
 
 
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 
 
-def _distractors(manifest: Manifest) -> list[str]:
+def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
+    """Rows (setting, scale, camera, colors, background) of the table of distractors; none for mazes alone."""
     settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
         if record.family != ANT_MAZE:
@@ -387,11 +313,7 @@ def _distractors(manifest: Manifest) -> list[str]:
         videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
         sky = f"{videos}; " + (f"a frame every {background.TICKS_A_FRAME} ticks" if moving else "one frame an episode")
         rows.append((name, f"s = {s:g}", place, paint, sky))
-    lines = _table(("setting", "scale", "camera", "colors", "background"), rows) if rows else []
-    if any(record.family == ANT_MAZE for record in manifest.subsets):
-        label = "" if manifest.imported else " (label `exogenous/style`)"
-        lines += ["", f"Mazes vary in the style of walls and floor, drawn for each episode{label}."]
-    return lines + ["", "A tick is a control step, two in a step. Distractors never touch physics or rewards."]
+    return rows
 
 
 def _making(manifest: Manifest) -> list[str]:
@@ -412,12 +334,17 @@ def _making(manifest: Manifest) -> list[str]:
         lines.append(f"Environment {number + 1}: {where}.")
     for entry in manifest.lineage:
         lines.append(f"Derived: {entry.get('kind')} from {entry.get('from')}.")
+    return lines
+
+
+def _policies(manifest: Manifest) -> list[tuple[str, str, str]]:
+    """Rows (task, level, policies) of the table of behaviour policies."""
     rows = []
-    for record in {(r.task, r.level): r for r in records}.values():
+    for record in {(r.task, r.level): r for r in manifest.subsets}.values():
         policies = ", ".join(f"{policy.name} `{policy.digest[:12]}`" for policy in record.policies)
         unnamed = "those of the imported data" if record.imported else "uniform random actions"
         rows.append((record.task, record.level, policies or unnamed))
-    return [*lines, "", *_table(("task", "level", "behaviour policies"), rows)]
+    return rows
 
 
 def trained(algorithms: Iterable[str]) -> str:
@@ -459,15 +386,22 @@ def _limits(release: Release) -> list[str]:
 
 
 def plot_returns(release: Release, path: Path) -> None:
-    """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each."""
+    """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each.
+
+    Fewer than `FEW_RETURNS` episodes are a mark each instead of a box.
+    """
     from matplotlib.figure import Figure
 
     groups: dict[tuple[str, str, bool], list[np.ndarray]] = {}
     for subset in release.subsets.values():
         groups.setdefault((subset.task, subset.level, subset.setting == FIXED), []).append(subset.returns)
     boxes, labels, shades = [], [], []
+    marks: dict[int, np.ndarray] = {}
     for (task, level, fixed), values in groups.items():
-        low, p25, median, p75, high = np.quantile(np.concatenate(values), (0, 0.25, 0.5, 0.75, 1))
+        returns = np.concatenate(values)
+        low, p25, median, p75, high = np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))
+        if len(returns) < FEW_RETURNS:
+            marks[len(boxes)] = returns
         boxes.append(dict(whislo=low, q1=p25, med=median, q3=p75, whishi=high, fliers=[]))
         labels.append(f"{task} {level}" + (f" {FIXED}" if fixed else ""))
         shades.append("tab:blue")
@@ -483,6 +417,11 @@ def plot_returns(release: Release, path: Path) -> None:
     drawn = axes.bxp(boxes, positions=places, orientation="horizontal", patch_artist=True, widths=0.6)
     for patch, shade in zip(drawn["boxes"], shades, strict=True):
         patch.set_facecolor(shade)
+    for row, returns in marks.items():
+        whiskers = (*drawn["whiskers"][2 * row : 2 * row + 2], *drawn["caps"][2 * row : 2 * row + 2])
+        for part in (drawn["boxes"][row], drawn["medians"][row], *whiskers):
+            part.set_visible(False)
+        axes.plot(returns, np.full(len(returns), places[row]), "|", color="tab:blue", markersize=12, markeredgewidth=2)
     axes.set_yticks(places, labels)
-    axes.set_xlabel("episode return (minimum, quartiles, maximum)")
+    axes.set_xlabel("episode return (minimum, quartiles, maximum" + ("; few episodes: a mark each)" if marks else ")"))
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})

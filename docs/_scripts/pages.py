@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import inspect
 from pathlib import Path
 
@@ -15,8 +16,8 @@ DOCS = Path(__file__).resolve().parents[1]
 
 
 def cell(text: str) -> str:
-    """Text for a cell of a Markdown table."""
-    return " ".join(text.split()).replace("|", "\\|")
+    """Text for a cell of a Markdown table, in which nothing is a link or ends the cell."""
+    return html.escape(" ".join(text.split()), quote=False).replace("|", "&#124;").replace("[", "&#91;")
 
 
 def help_text(command: click.Command) -> str:
@@ -31,7 +32,7 @@ def help_text(command: click.Command) -> str:
 def option_table(command: click.Command, context: click.Context) -> str:
     """Every option with its help, as `--help` prints them."""
     records = [parameter.get_help_record(context) for parameter in command.get_params(context)]
-    rows = [f"| `{cell(names)}` | {cell(text)} |" for names, text in filter(None, records)]
+    rows = [f"| <code>{cell(names)}</code> | {cell(text)} |" for names, text in filter(None, records)]
     return "\n".join(["| option | |", "|---|---|", *rows])
 
 

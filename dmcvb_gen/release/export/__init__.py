@@ -76,9 +76,10 @@ def export(
       The folders.
 
     Raises:
-      UnknownNameError: no such format or subset. DmcvbError: its package is not installed, or an option is not for
-      this format. StoreError: a subset is not whole (or lacks some of `episodes`), it is damaged, there is something
-      else at `out` already, or it cannot be written.
+      UnknownNameError: no such format or subset.
+      DmcvbError: a package is not installed, or an option is not for this format.
+      StoreError: a subset is damaged or not whole (or lacks some of `episodes`), something else lies at `out`, or it
+        cannot be written.
     """
     kind, out = get_format(to), Path(local_path(out)).absolute()
     options = {name: True for name, given in (("video", video),) if given}
