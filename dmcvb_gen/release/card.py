@@ -1,6 +1,6 @@
-"""A release's card: README.md, croissant.json, pictures, a table of episodes; filled from the manifest and the data.
+"""Write and check a release's card: README.md, croissant.json, pictures and a table of episodes.
 
-`check_card` fills them again and compares, so a card cannot come to disagree with its data unnoticed.
+Everything in a card comes from the manifest and the data. `check_card` writes it again and compares.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
 PLOT, SHEET = f"{CARD_FOLDER}/returns.png", f"{CARD_FOLDER}/contact_sheet.png"
 STATES = f"{CARD_FOLDER}/states.json"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
-"""Hugging Face's size categories; a row is a step."""
+"""Hugging Face's size categories, counted in steps."""
 FEW_RETURNS = 20
 """Episodes of a task and level below which the plot shows each one."""
 CITATION = """@inproceedings{ortiz2024dmcvb,
@@ -57,8 +57,8 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     """Write README.md, croissant.json, pictures, the table of episodes, and a CHANGELOG.md if there is none.
 
     Args:
-      out: another folder for them, instead of the release.
-      url: where the release is (or will be) published; by default what the card that is there says.
+      out: folder of these files; the release by default.
+      url: where the release is (or will be) published; by default the place that the existing card names.
 
     Raises:
       StoreError: there is no release, it has no episodes, or the folder cannot be written.
@@ -70,7 +70,7 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     published = Publication(page_of(url) if url else told.url, told.date)
     try:
         for place in (folder, folder / CARD_FOLDER):
-            remove_partial(place, below=False)  # of a writer that was killed
+            remove_partial(place, below=False)  # left by a killed writer
         with replacing(folder / TABLE) as part:
             write_table(release, part)
         texts = _texts(release, folder / TABLE, published)
@@ -91,7 +91,7 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
 
 
 def _told(folder: Path, manifest: Manifest) -> Publication:
-    """Where and when this version was published, as the card that is there says; today and nowhere if none is."""
+    """Place and day of publication from the existing card of this version; no place and today if there is none."""
     try:
         known = json.loads((folder / CROISSANT).read_text())
     except (OSError, ValueError):
@@ -104,9 +104,10 @@ def _told(folder: Path, manifest: Manifest) -> Publication:
 
 
 def check_card(root: str | Path) -> list[str]:
-    """What of a release's card is missing or does not fit its data, in words; empty when all is well.
+    """List what is missing in a release's card or does not fit its data; empty if the card is right.
 
-    Of a part that was fetched, whose card is that of the whole release, what is here is compared (`left_unchecked`).
+    If only a part of the release was fetched, the card describes the whole release, and only the part is compared
+    (see `left_unchecked`).
 
     Raises:
       StoreError: there is no release, or it has no episodes.
@@ -133,13 +134,13 @@ def check_card(root: str | Path) -> list[str]:
 
 
 def left_unchecked(root: str | Path) -> int:
-    """How many episodes a release's card speaks of that are not here, because a part of it was fetched."""
+    """Number of episodes in the card that are not here, because only a part of the release was fetched."""
     release = open_release(root)
     return sum(planned - here for here, planned in release.shortfalls.values()) if _is_of_the_whole(release) else 0
 
 
 def _is_of_the_whole(release: Release) -> bool:
-    """Whether a part was fetched, and the card that came with it is that of the whole release."""
+    """Whether only a part of the release was fetched, with the card of the whole."""
     try:
         text = (release.path / README).read_text(errors="replace")
     except OSError:
@@ -150,7 +151,7 @@ def _is_of_the_whole(release: Release) -> bool:
 
 
 def _check_digests(release: Release) -> list[str]:
-    """Subsets of a part whose digest the card of the whole says otherwise than the manifest."""
+    """List the subsets whose digest in the card differs from the manifest."""
     text = (release.path / README).read_text(errors="replace")
     rows = {row.split("`")[1]: row for row in text.splitlines() if row.startswith("| `") and row.count("`") == 4}
     return [
@@ -167,11 +168,11 @@ def _check_changelog(release: Release) -> list[str]:
 
 
 def _shows(path: Path, pixels: np.ndarray) -> bool:
-    """Whether a file is the picture of these pixels; its size is compared before it is decoded."""
+    """Whether a file is the picture of these pixels; compare sizes before decoding."""
     try:
         with Image.open(path) as picture:
             return picture.size == pixels.shape[1::-1] and np.array_equal(np.asarray(picture), pixels)
-    except Exception:  # decoders raise many kinds; none is that picture
+    except Exception:  # decoders raise many kinds of errors
         return False
 
 
@@ -198,7 +199,7 @@ def _texts(release: Release, table: Path, published: Publication) -> dict[str, s
 
 
 def _sheet(release: Release) -> np.ndarray:
-    """A strip of the first episode of each subset, painted where it has no pictures."""
+    """A strip of the first episode of each subset, rendered if it has no stored pictures."""
     chosen = painted_release(release, Painting(cache_bytes=0), missing=True)
     return contact_sheet([s for s in chosen.subsets.values() if s.pixel_arrays], episodes=1, scale=1)
 
@@ -226,7 +227,7 @@ def header(manifest: Manifest, steps: int, table: dict[str, Any]) -> str:
     """The YAML header that the Hugging Face Hub reads.
 
     Args:
-      table: what it says of the table of episodes, see `episode_table.header_facts`.
+      table: facts about the table of episodes, see `episode_table.header_facts`.
     """
     category = next((name for limit, name in SIZES if steps < limit), "n>10M")
     facts = {
@@ -348,7 +349,7 @@ def _policies(manifest: Manifest) -> list[tuple[str, str, str]]:
 
 
 def trained(algorithms: Iterable[str]) -> str:
-    """A sentence, without its full stop, of how behaviour policies came to be."""
+    """A sentence, without its full stop, that says how behaviour policies were trained."""
     return f"Behaviour policies were trained {' and '.join(origin_of(name) for name in sorted(algorithms))}"
 
 

@@ -1,4 +1,4 @@
-"""Croissant metadata (mlcommons.org/croissant, 1.1, with its RAI terms) of a release, for searches and loaders."""
+"""Write a release's Croissant metadata (mlcommons.org/croissant, version 1.1, with its RAI terms)."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Publication:
     """Where and when a release is published.
 
     Attributes:
-      url: its page, None where it is not known.
+      url: its page; None if it is not known.
       date: e.g. "2026-11-22".
     """
 
@@ -75,7 +75,7 @@ class Publication:
 
 
 def page_of(url: str) -> str:
-    """The page that shows what lies at a URL: of the Hub's data sets their own, else the URL."""
+    """The web page of a URL: on the Hub the page of the data set, else the URL itself."""
     if on_the_hub(url):
         repository, folder, _ = parse_hub_url(url)
         page = f"https://huggingface.co/datasets/{repository}"
@@ -98,9 +98,9 @@ def croissant(
       facts: of `describe_release`.
       summary: the description.
       citation: BibTeX.
-      limits: what is known to be wanting, a sentence each.
-      table: of the episodes, see `release.episode_table`.
-      published: where and when.
+      limits: known limits, a sentence each.
+      table: file of the table of episodes, see `release.episode_table`.
+      published: place and date of publication.
     """
     manifest = release.manifest
     return {
@@ -126,7 +126,7 @@ def croissant(
 
 
 def _responsible(manifest: Manifest, limits: Sequence[str]) -> dict[str, Any]:
-    """What Croissant's vocabulary for responsible AI asks."""
+    """Answers to Croissant's vocabulary for responsible AI."""
     return {
         "rai:hasSyntheticData": True,
         **_collection(manifest),
@@ -150,7 +150,7 @@ def _responsible(manifest: Manifest, limits: Sequence[str]) -> dict[str, Any]:
 
 
 def _collection(manifest: Manifest) -> dict[str, Any]:
-    """How the data came to be, and what of that is kept."""
+    """How the data were collected, and which raw data are kept."""
     tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
     if manifest.imported:
         return {
@@ -169,7 +169,7 @@ def _collection(manifest: Manifest) -> dict[str, Any]:
 
 
 def _provenance(manifest: Manifest) -> dict[str, Any]:
-    """What made it, and from what."""
+    """The program that made the data, and its inputs."""
     activity: dict[str, Any] = {
         "@type": "prov:Activity",
         "prov:label": "import published episodes"
@@ -189,7 +189,7 @@ def _provenance(manifest: Manifest) -> dict[str, Any]:
 
 
 def _files(release: Release, table: Path) -> list[dict[str, Any]]:
-    """Every kind of file: manifest, index of all digests, groups, the table, and the shards as one set."""
+    """Files of the release: manifest, Zarr groups, the table of episodes, and all shards as one set."""
     root = release.path
     files = [
         _file(root / MANIFEST, MANIFEST, "application/json", "Recipe, versions, policies, digests of the release.")
@@ -211,7 +211,7 @@ def _files(release: Release, table: Path) -> list[dict[str, Any]]:
 
 
 def _subsets(release: Release, facts: dict[str, Any]) -> dict[str, Any]:
-    """The record set of what a release is composed of, its rows inside."""
+    """The record set of subsets, with its rows."""
     rows = []
     for subset in facts["subsets"]:
         record = release[subset["name"]].record

@@ -1,7 +1,7 @@
-"""A table of a release's episodes for whoever browses it: a release in, one Parquet file out, a row an episode.
+"""Write a Parquet table with one row for each episode of a release.
 
-The viewer of the Hugging Face Hub shows it and `datasets.load_dataset` reads it: its schema says that the first frames
-are pictures, and the card's header says the same (`header_facts`).
+The viewer of the Hugging Face Hub shows it, and `datasets.load_dataset` reads it. The schema and the card's header
+(`header_facts`) say that the first frames are pictures.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from dmcvb_gen.generate.render import renderer_for
 TABLE = f"{CARD_FOLDER}/episodes.parquet"
 CONFIG = "episodes"
 FRAME = 64
-"""Pixels a side of a first frame, at most."""
+"""Largest width and height of a first frame in pixels."""
 ROWS = 500
-"""Episodes that are held at a time, and in one group of the file."""
+"""Episodes that are in memory at a time, and in one row group of the file."""
 PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 """How `datasets` stores a picture."""
 COLUMNS = {
@@ -42,11 +42,11 @@ COLUMNS = {
     "terminated": (pa.bool_(), "whether the task ended it, and not the time limit"),
     "first_frame": (PICTURE, "the first observation's first view"),
 }
-"""Column -> (type, what it is)."""
+"""Column -> (type, meaning)."""
 
 
 def write_table(release: Release, path: Path) -> None:
-    """Write the table; the first frames of episodes without pictures are painted.
+    """Write the table; render the first frames of episodes without stored pictures.
 
     Raises:
       StoreError: something cannot be read or written.
@@ -59,10 +59,10 @@ def write_table(release: Release, path: Path) -> None:
 
 
 def table_problem(release: Release, path: Path, part: bool = False) -> str | None:
-    """What of a table does not fit its release, pictures aside; None when all is well.
+    """Say what in a table does not fit its release, apart from the pictures; None if it fits.
 
     Args:
-      part: the table is of the whole release and some episodes are here: their rows are compared.
+      part: only a part of the release is here; compare only the rows of these episodes.
     """
     if not path.is_file():
         return "is missing"
@@ -83,7 +83,7 @@ def table_problem(release: Release, path: Path, part: bool = False) -> str | Non
 
 
 def _rows_of(table: pa.Table, wanted: pa.Table) -> pa.Table:
-    """The rows of a table that speak of the same episodes as another one, in that one's order."""
+    """The rows of a table for the episodes of another table, in the order of that table."""
 
     def keys(table: pa.Table) -> list[tuple[str, int]]:
         return list(zip(table["subset"].to_pylist(), table["episode"].to_pylist(), strict=True))
@@ -125,7 +125,7 @@ def _schema() -> pa.Schema:
 
 
 def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
-    """Every column but the pictures."""
+    """All columns except the pictures."""
     policies = [policy.name for policy in subset.record.policies] or ["random"]
     values = {name: subset.read(name, episodes) for name in ("return", "length", "terminated")}
     seeds: Any
@@ -155,13 +155,13 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
 
 
 def _pictures(subset: Subset) -> Pictures:
-    """Those that agents learn from, the first of which is shown; the overhead view where there is no other."""
+    """The views that agents learn from; the overhead view if there is no other."""
     pictures = training_pictures(subset)
     return pictures if pictures.views else shown(subset)
 
 
 def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
-    """First frames, painted from the stored physics states and labels."""
+    """First frames, rendered from the stored physics states and labels."""
     pictures = _pictures(subset)
     renderer, _ = renderer_for(subset.record, background_source(Path(subset.root), subset.record))
     try:

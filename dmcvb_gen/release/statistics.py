@@ -1,4 +1,4 @@
-"""What a release's numbers are like: a release in; mean and spread of every state number, how levels move, out."""
+"""Statistics of a release: mean and spread of every state number, and how the policies of each level move."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
 EPISODES = 20
-"""First episodes of a task and level that are looked at: states take no more of the memory, however large a release."""
+"""Number of first episodes of a task and level that are read, so that memory does not grow with the release."""
 HEIGHTS = ("height", "head_height", "body_height")
-"""State fields that say how high a body is, where a task has one."""
+"""State fields with the height of the body; a task has one of them or none."""
 POSITION, VELOCITY = "walker_position", "velocity"
-"""State fields of where a root is (mazes), and of all joints' velocities, MuJoCo's qvel (the others)."""
+"""State fields with the position of the root (mazes), and the velocities of all joints, MuJoCo's qvel (other tasks)."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class StateStatistics:
     """Every number of a task's state, over all levels.
 
     Attributes:
-      steps: observations they are taken over.
+      steps: number of observations.
       mean, std: (state,) float64.
-      fields: field -> its place in them.
+      fields: field -> its columns.
     """
 
     task: str
@@ -44,7 +44,7 @@ class LevelStatistics:
 
     Attributes:
       speed: mean horizontal speed of the root, m/s.
-      height: mean height of body or head, meters; None where the state has none.
+      height: mean height of body or head in meters; None if the state has none.
       success: share of episodes that reached their goal; None for tasks without one.
     """
 
@@ -72,7 +72,7 @@ def _episodes(subset: Subset, name: str) -> Iterable[np.ndarray]:
 
 
 def state_statistics(release: Release) -> list[StateStatistics]:
-    """Of every task of a release, in its order."""
+    """Statistics of the states of every task of a release, in its order."""
     tasks: dict[str, list[np.ndarray]] = {}
     for (task, _), subset in _trajectories(release).items():
         tasks.setdefault(task, []).extend(np.asarray(rows, np.float64) for rows in _episodes(subset, "state"))
@@ -99,12 +99,12 @@ def states_json(release: Release) -> str:
 
 
 def _rounded(values: np.ndarray) -> list[float]:
-    """To five digits: the order of a sum may differ between machines, and shows behind them."""
+    """Round to five digits, because the order of a sum, and so the last digits, may differ between machines."""
     return [float(f"{value:.5g}") for value in values]
 
 
 def level_statistics(release: Release) -> list[LevelStatistics]:
-    """Of every task and level of a release, in its order."""
+    """Statistics of every task and level of a release, in its order."""
     out = []
     for (name, level), subset in _trajectories(release).items():
         task = get_task(name)
@@ -119,7 +119,7 @@ def level_statistics(release: Release) -> list[LevelStatistics]:
 
 
 def _speed(task: Task, subset: Subset) -> float:
-    """Mean horizontal speed of the root over all steps, m/s; by the states where there are no physics states."""
+    """Mean horizontal speed of the root over all steps in m/s; from the states if there are no physics states."""
     (position, velocity), states = _root_columns(task.model), task.state_slices
     if "physics" in subset.arrays:
         moved = _moved(subset, "physics", 1 + position)  # time comes first

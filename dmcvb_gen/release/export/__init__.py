@@ -1,4 +1,4 @@
-"""Export: a release's subsets in the layouts that other people's code reads, a folder a subset."""
+"""Export a release's subsets in the formats that other programs read, one folder for each subset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dmcvb_gen.release.export.registry import all_formats, get_format
 from dmcvb_gen.storage.remote import local_path, storage_errors
 
 STAMP = ".dmcvb-gen.json"
-"""File in each export: what it was made from, so that the same command goes on where it was stopped."""
+"""File in each export that says what it was made from, so that the same command can resume."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def export(
     storage_options: dict | None = None,
     tick: ProgressCallback = ignore,
 ) -> list[Path]:
-    """Write subsets in another format; each is there whole, or not at all. Run again, it goes on where it stopped.
+    """Write subsets in another format. Each is complete or absent, and the same call resumes an interrupted one.
 
     Args:
       path: a release, here or at a URL.
@@ -70,7 +70,7 @@ def export(
       merge: lerobot: all subsets as the tasks of one data set, `out` itself.
       video: lerobot: pictures as mp4 (smaller, with losses) and not as PNG.
       workers: processes (or a Ray cluster that sees the same folders), a subset each.
-      tick: told 1 for each episode.
+      tick: called with 1 for each episode.
 
     Returns:
       The folders.

@@ -1,4 +1,4 @@
-"""What the exporters write from: the chosen episodes of a subset, one at a time."""
+"""What exporters read: the chosen episodes of a subset, one at a time."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ExportEpisode:
 
 @dataclass(frozen=True)
 class Source:
-    """The chosen episodes of a subset, and what is known of them."""
+    """The chosen episodes of a subset, with its facts."""
 
     release: ReleaseReader
     subset: SubsetReader
@@ -79,7 +79,7 @@ class Source:
 
     @property
     def pictures(self) -> Pictures:
-        """What the subset shows: its views in their order, the goal left out where its setting hides it."""
+        """The views that the subset shows, in the task's order; without the goal if its setting hides it."""
         return shown(self.subset)
 
     @property

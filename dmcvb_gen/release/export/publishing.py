@@ -1,4 +1,4 @@
-"""An export's folder to a URL, every file checked; to the Hub in one commit, with the tag that LeRobot looks for."""
+"""Publish an export: check every file; on the Hub make one commit with the tag that LeRobot looks for."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def publish_export(
     """Put an export at a URL; run again after an interruption, it goes on.
 
     Args:
-      folder: what `export` wrote: a subset's folder, or (but for LeRobot on the Hub) a folder of several.
+      folder: what `export` wrote: a subset's folder, or a folder of several (except for LeRobot on the Hub).
       url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL.
       options: of fsspec. api: a `huggingface_hub.HfApi`, for tests.
-      tick: told 1 for each file.
+      tick: called with 1 for each file.
 
     Raises:
       StoreError: there is no export, access is refused, or a file could not be moved.

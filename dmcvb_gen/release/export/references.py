@@ -1,4 +1,4 @@
-"""What a score of a task is measured against: a release and a subset in; the returns of random and of expert out."""
+"""Reference returns for normalized scores: those of random actions and of the expert."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.tasks import get_task
 
 RANDOM_EPISODES, SEED, NAMES = 10, 0, ("reference",)
-"""Episodes of uniform actions that are simulated where the release has none of its own."""
+"""Episodes of uniform actions that are simulated if the release has none of its own."""
 
 
 def reference_returns(release: ReleaseReader, record: SubsetRecord) -> dict[str, float]:

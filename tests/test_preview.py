@@ -1,0 +1,34 @@
+"""The preview: a video large enough to see, rows of a maze's sheet with names, one grid for any number of views."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.generate.preview import LABEL_HEIGHT, VIDEO_SIDE, episode_strip, video_frames
+
+
+@pytest.mark.parametrize("release", ["small_release", "maze_release"])
+def test_the_video_has_512_pixels_on_its_shorter_side_and_shows_the_stored_frames(release, request):
+    subset = next(iter(open_release(request.getfixturevalue(release)).subsets.values()))
+    video = video_frames([subset], frames=2)
+    assert len(video) == 2 and VIDEO_SIDE <= min(video.shape[1:3]) < VIDEO_SIDE + 200
+    array = subset.pixel_arrays[0] if release == "small_release" else "pixels/top"
+    stored = subset.episode(int(subset.episodes[0]), [array])[array][1]
+    columns = 1 if release == "small_release" else 3  # four views and the map: three in a row
+    scale = video.shape[2] // (columns * stored.shape[1])
+    first = video[1, LABEL_HEIGHT:, : stored.shape[1] * scale][: stored.shape[0] * scale]
+    np.testing.assert_array_equal(first[::scale, ::scale], stored)
+
+
+def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
+    maze = next(iter(open_release(maze_release).subsets.values()))
+    walker = next(iter(open_release(small_release).subsets.values()))
+    rows = len(maze.record.views) + 1  # and the map
+    strip = episode_strip(maze, 0, columns=20, scale=2)
+    assert strip.shape[0] == LABEL_HEIGHT + rows * (LABEL_HEIGHT + 32)
+    for row in range(rows):
+        label = strip[LABEL_HEIGHT + row * (LABEL_HEIGHT + 32) :][:LABEL_HEIGHT]
+        assert set(np.unique(label)) == {0, 255}  # black on white
+    assert episode_strip(walker, 0, columns=20, scale=2).shape[0] == LABEL_HEIGHT + 32
