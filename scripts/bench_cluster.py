@@ -26,8 +26,8 @@ from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe
 from dmcvb_gen.generate.site import site_of
-from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.parallel import Ray
+from dmcvb_gen.spec import is_maze
 from dmcvb_gen.storage.remote import file_system
 
 TASKS = {"walker": ("walker-walk", "dynamic"), "maze": ("ant-maze-empty7x7", "hidden")}
@@ -166,7 +166,7 @@ def planned_jobs(maze_steps: float) -> dict[str, list[float]]:
     recipe, steps = load_recipe("dmcvb-v1"), {"locomotion": [], "mazes": []}
     shared: dict[tuple, int] = {}
     for request in expand(recipe):
-        maze = family_of(request.task) == ANT_MAZE
+        maze = is_maze(request.task)
         key = (request.task, request.level, request.setting if maze else "", request.episodes)
         shared[key] = shared.get(key, 0) + 1
         if shared[key] > 1:

@@ -28,12 +28,12 @@ from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.loaders.painted import open_painted
 from dmcvb_gen.loaders.release import open_for_reading
-from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.release.fetch import fetch, fetch_and_paint
+from dmcvb_gen.spec import is_maze
 
 PIECE = 64 * 1024
 """Bytes that the slow server sends between two looks at the clock."""
-SETTINGS = {ANT_MAZE: ["visible"]}
+MAZE_SETTINGS, SETTINGS = ["visible"], ["none", "static", "dynamic"]
 
 
 def make(folder: Path, tasks: list[str], settings: list[str], episodes: int, per_shard: int) -> Path:
@@ -64,7 +64,7 @@ def bytes_of(subset: Subset) -> tuple[float, float]:
 def bytes_table(options) -> None:
     print(f"{'subset':44} {'with':>8} {'without':>8} {'share':>6}   bytes a step")
     for task in options.tasks:
-        settings = SETTINGS.get(family_of(task), ["none", "static", "dynamic"])
+        settings = MAZE_SETTINGS if is_maze(task) else SETTINGS
         with tempfile.TemporaryDirectory() as folder:
             release = open_release(make(Path(folder), [task], settings, options.episodes, options.episodes))
             for name, subset in release.subsets.items():

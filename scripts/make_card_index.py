@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
-from dmcvb_gen.names import family_of
 
 CARDS = Path(__file__).parents[1] / "dataset_cards"
 HEAD = """# Data set cards
@@ -33,7 +32,7 @@ def row(folder: Path) -> str:
     """A release's line of the table."""
     manifest = Manifest.model_validate_json((folder / MANIFEST).read_bytes())
     episodes = sum(subset.episodes for subset in manifest.subsets)
-    families = sorted({family_of(subset.task) for subset in manifest.subsets})
+    families = sorted({subset.family for subset in manifest.subsets})
     tasks = len({subset.task for subset in manifest.subsets})
     report = f" ([report]({folder.name}/report.md))" if (folder / "report.md").exists() else ""
     return (

@@ -12,11 +12,11 @@ import sys
 import numpy as np
 
 from dmcvb_gen.distractors import load_backgrounds, sample_distractors
-from dmcvb_gen.names import LOCOMOTION, distractor_of
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.spec import LOCOMOTION, parse_setting
 from dmcvb_gen.tasks import get_task
 
 EPISODES = 2
@@ -51,7 +51,7 @@ def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
             for name in STREAMS
             if name not in ("initial_state", "policy")
         }
-        distractors = distractor_of(task_id, setting)
+        distractors = parse_setting(task_id, setting)[0]
         backgrounds = load_backgrounds("builtin", "train") if distractors.kind != "none" else None
         labels = sample_distractors(task, distractors, physics, streams, backgrounds, split="train")
         found[f"labels {setting}"] = digest(*(value for _, value in labels.items()))

@@ -25,8 +25,8 @@ from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.progress import progress_of
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.generate.site import FolderSite, UploadQueue, site_of, staging_folder_of
-from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.parallel import Ray
+from dmcvb_gen.spec import ANT_MAZE
 from tests.conftest import TINY_MAZE, roll_out
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ks_2samp, kstest
 
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import Distractor, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
@@ -39,7 +39,7 @@ def generators(episodes, seed=0):
 def labels(task, setting, physics, episodes=None, seed=0):
     episodes = range(len(physics)) if episodes is None else episodes
     backgrounds = load_backgrounds("builtin", "train")
-    return sample_distractors(task, DistractorSetting.parse(setting), physics, generators(episodes, seed), backgrounds)
+    return sample_distractors(task, Distractor.parse(setting), physics, generators(episodes, seed), backgrounds)
 
 
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
@@ -112,7 +112,7 @@ def test_static_varies_between_episodes_and_never_within_one():
 
 
 def test_roll_has_the_steps_and_limits_it_should():
-    setting = DistractorSetting("dynamic", "hard")
+    setting = Distractor("dynamic", "hard")
     rngs = [np.random.default_rng(i) for i in range(3000)]
     bounds = camera_range(np.array([0.0, -4.0, 2.0]), setting)
     _, roll = camera_walk(bounds, setting, 3, rngs)
@@ -128,7 +128,7 @@ def test_roll_has_the_steps_and_limits_it_should():
 
 
 def test_camera_speeds_are_those_of_a_capped_random_walk():
-    setting, count = DistractorSetting("dynamic", "medium"), 2000
+    setting, count = Distractor("dynamic", "medium"), 2000
     anywhere = CameraRange(np.array([1e-3, 0.0, -np.pi]), np.array([1e3, np.pi, np.pi]), 3.0, 1.0)
     offset, _ = camera_walk(anywhere, setting, 16, [np.random.default_rng(i) for i in range(count)])
     steps = np.linalg.norm(np.diff(offset, axis=1), axis=-1)
@@ -146,7 +146,7 @@ def test_camera_speeds_are_those_of_a_capped_random_walk():
 
 
 def test_the_camera_does_not_stick_to_the_ends_of_its_ranges():
-    setting = DistractorSetting("dynamic", "medium")
+    setting = Distractor("dynamic", "medium")
     bounds = camera_range(np.array([0.0, -2.0, 1.2]), setting)
     offset, roll = camera_walk(bounds, setting, 501, [np.random.default_rng(i) for i in range(40)])
     place = spherical(offset)
@@ -225,4 +225,4 @@ def test_look_at_without_roll_keeps_the_horizon_level():
 @pytest.mark.parametrize("name", ["dynamik", "static_extreme"])
 def test_an_unknown_setting_is_refused(name):
     with pytest.raises(UnknownNameError, match="Known"):
-        DistractorSetting.parse(name)
+        Distractor.parse(name)

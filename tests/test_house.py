@@ -17,7 +17,8 @@ ROOT = Path(dmcvb_gen.__file__).parent
 FLOORS = (
     (
         "version",
-        "names",
+        "spec",
+        "text",
         "seeding",
         "extras",
         "errors",
@@ -171,6 +172,6 @@ def _plain(package: str) -> str:
 
 
 def test_reading_a_store_needs_no_simulator():
-    code = "import sys, dmcvb_gen.dataset, dmcvb_gen.names; print([m for m in ('mujoco', 'torch') if m in sys.modules])"
+    code = "import sys, dmcvb_gen.dataset, dmcvb_gen.spec; print([m for m in ('mujoco', 'torch') if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"

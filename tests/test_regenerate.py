@@ -149,7 +149,7 @@ def test_a_commit_record_that_is_not_what_it_was_is_put_back(copy, field, change
 
 
 def test_a_release_keeps_its_own_codecs_when_the_code_has_new_ones(copy, monkeypatch):
-    monkeypatch.setattr("dmcvb_gen.dataset.writer.picture_layout_for", lambda setting: "zstd-9")
+    monkeypatch.setattr("dmcvb_gen.dataset.writer.picture_layout_for", lambda camera_moves: "zstd-9")
     assert Regeneration(copy, [NAME], (2, 3)).check().sound
 
 

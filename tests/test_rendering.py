@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import Distractor, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.rendering import available_renderers, make_renderer, warp
 from dmcvb_gen.rendering.opengl import unavailable
@@ -20,7 +20,7 @@ LARGEST_DIFFERENCE = {"none": 8.0, "static": 8.0, "dynamic": 8.0}
 
 
 def frames_of(task_id, setting_name, count=FRAMES):
-    task, setting = get_task(task_id), DistractorSetting.parse(setting_name)
+    task, setting = get_task(task_id), Distractor.parse(setting_name)
     batch = task.batch(2)
     batch.reset([np.random.default_rng(i) for i in range(2)])
     rng, rows = np.random.default_rng(3), []

@@ -12,11 +12,11 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import MAZE_TRAINED_LEVELS as MAZE_LEVELS
 from dmcvb_gen.policies.bundled import level_files
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import read_header, save_policy
+from dmcvb_gen.spec import MAZE_TRAINED_LEVELS as MAZE_LEVELS
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.pruning import LIMIT, prunable_checkpoints
 from dmcvb_gen.training.run_log import COLUMNS

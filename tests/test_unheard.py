@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import main
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import expand
-from dmcvb_gen.names import LEVELS
+from dmcvb_gen.spec import LEVELS
 from tests.conftest import small_recipe
 
 MAZE, WALKER = "ant-maze-empty7x7", "walker-walk"

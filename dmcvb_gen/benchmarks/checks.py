@@ -21,11 +21,11 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import background_source
 from dmcvb_gen.generate.paint import render_differences
 from dmcvb_gen.loaders.painted import PaintedSubset
-from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import get_task
 
 STANDARD_ERRORS = 4.0
@@ -96,7 +96,7 @@ def check_paper_returns(subset: Subset) -> Iterator[Issue]:
     paper, expert = paper_returns(subset.task, subset.level), paper_returns(subset.task, "expert")
     if not paper or not len(subset.returns) or not _comparable(subset):
         return
-    if get_task(subset.task).family == ANT_MAZE:
+    if subset.record.goal_mode is not None:
         scale = abs(paper_returns(subset.task, "medium")["mean"] - expert["mean"])
     else:
         scale = PAPER_SHARE * expert["mean"]
@@ -110,7 +110,7 @@ def check_labels(subset: Subset) -> Iterator[Issue]:
     """The distractors' labels are what the setting's name says; imported data have none."""
     if subset.record.imported:
         return
-    task, kind = get_task(subset.task), distractor_of(subset.task, subset.setting).kind
+    task, kind = get_task(subset.task), subset.record.distractor.kind
     looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]
     own = task.material_colors.astype(np.float32)
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]

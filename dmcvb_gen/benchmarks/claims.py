@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import DISTRACTOR_KINDS
+from dmcvb_gen.spec import DISTRACTOR_KINDS
 
 ERRORS = 2.0
 """Standard errors from which on a difference counts."""

@@ -21,9 +21,9 @@ from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backg
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.jobs import video_source
 from dmcvb_gen.generate.recipe import RendererChoice, check_size
-from dmcvb_gen.names import FIXED, distractor_of, hides_goal, normalize_setting
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.spec import GoalMode, SubsetSpec, parse_setting
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -94,7 +94,7 @@ def protocol(
     facts: dict[str, Any] = {"steps": evaluation_steps(get_task(subset.task), max_steps), "goals": pair}
     if pictures:
         facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
-        if distractor_of(subset.task, subset.setting).kind != "none":
+        if subset.record.distractor.kind != "none":
             facts["backgrounds"] = load_backgrounds(video_source(subset.root, subset.record, backgrounds), SPLIT).digest
     return facts
 
@@ -144,12 +144,12 @@ class EvaluationScene:
         task, slash, setting = where.partition("/")
         if not slash or not setting:
             raise DmcvbError(f"{where!r} names no evaluation; give TASK/SETTING, e.g. walker-walk/dynamic")
-        setting = normalize_setting(task, setting)
-        if setting == FIXED:
+        spec = SubsetSpec.parse(task, "random", setting)
+        if spec.goal is GoalMode.FIXED:
             raise DmcvbError(f"{where}: goals are fixed by a release's episodes; use `validate --benchmark b3`")
         views = [view for view in get_task(task).views if view not in NOT_TRAINED_ON]
         check_size(options.get("size", cls.size))
-        return cls(task, setting, Pictures(tuple(views), hides_goal(setting)), **options)
+        return cls(task, spec.setting, Pictures(tuple(views), spec.hides_goal), **options)
 
 
 def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
@@ -200,7 +200,7 @@ class Evaluator:
     ):
         scene = EvaluationScene.of(where, backgrounds) if isinstance(where, Subset) else where
         self.scene, self.task = scene, get_task(scene.task)
-        self.setting = distractor_of(scene.task, scene.setting)
+        self.setting = parse_setting(scene.task, scene.setting)[0]
         self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
         self.steps = evaluation_steps(self.task, max_steps)
         self.device, self.normalization, self.stack = device, normalization, stack

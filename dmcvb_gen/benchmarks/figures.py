@@ -15,8 +15,8 @@ from matplotlib.ticker import MaxNLocator
 from dmcvb_gen.benchmarks.checks import known_returns
 from dmcvb_gen.benchmarks.suites import Cell
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.names import FIXED, task_folder
 from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.spec import FIXED, task_folder
 
 DPI = 110
 COLUMNS = 3

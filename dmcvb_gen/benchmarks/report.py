@@ -28,10 +28,11 @@ from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
-from dmcvb_gen.names import ANT_MAZE, DISTRACTOR_KINDS, FIXED, VISIBLE, family_of, pluralize, task_folder
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_returns, paper_task
 from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, VISIBLE, is_maze, task_folder
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import pluralize
 from dmcvb_gen.version import __version__
 
 CHECKS = {
@@ -173,7 +174,7 @@ def _is_reference(other: Cell, cell: Cell) -> bool:
 
 
 def _whole_setting(cell: Cell) -> str:
-    return VISIBLE if family_of(cell.task) == ANT_MAZE else DISTRACTOR_KINDS[0]
+    return VISIBLE if is_maze(cell.task) else DISTRACTOR_KINDS[0]
 
 
 # -- the page -------------------------------------------------------------------------------------

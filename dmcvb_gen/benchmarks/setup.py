@@ -29,7 +29,7 @@ from dmcvb_gen.benchmarks.suites import Cell, Part, slug
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, PaintedSubset, Painting, painted_release
-from dmcvb_gen.names import ANT_MAZE, family_of
+from dmcvb_gen.spec import is_maze
 
 RESULT_VERSION = 3
 
@@ -148,7 +148,7 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
             pictures=not work.agent.sees_state,
             max_steps=setup.profile.episode_steps,
         )
-        if family_of(work.task) == ANT_MAZE:
+        if is_maze(work.task):
             facts["speed"] = "straight"  # results of before measured the data's along the path
         if work.agent.own:
             facts["own"] = OwnAgent.load(work.agent.own).digest

@@ -20,7 +20,7 @@ from dmcvb_gen.agents.data import part_count
 from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.names import (
+from dmcvb_gen.spec import (
     ANT_MAZE,
     DISTRACTOR_KINDS,
     FIXED,
@@ -28,7 +28,7 @@ from dmcvb_gen.names import (
     LEVELS,
     MAZE_TRAINED_LEVELS,
     VISIBLE,
-    family_of,
+    is_maze,
     subset_name,
 )
 
@@ -232,7 +232,7 @@ class _Shelf:
         count = max(counts, default=DEFAULT_EPISODES)
         rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
         out = f"--out releases/{slug(benchmark)}"
-        if family_of(task) != ANT_MAZE:
+        if not is_maze(task):
             return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count} {out}"
         goals = [setting for setting in settings if setting != FIXED]
         lines = [f"{rollout} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}"] if goals else []
@@ -243,7 +243,7 @@ class _Shelf:
 def _b1(shelf: _Shelf, agents: list[Agent]):
     agents = agents or [parse_agent(name) for name in B1_AGENTS]
     for task in shelf.tasks:
-        if family_of(task) == ANT_MAZE:
+        if is_maze(task):
             settings = [VISIBLE]
             others = [(level,) for level in shelf.levels(task, VISIBLE) if level not in MAZE_TRAINED_LEVELS]
             sets = [*((level,) for level in MAZE_TRAINED_LEVELS), *others]
@@ -265,7 +265,7 @@ def _b1(shelf: _Shelf, agents: list[Agent]):
 def _b2(shelf: _Shelf, agents: list[Agent]):
     encoders = [agent for agent in agents or map(parse_agent, B2_AGENTS) if agent.pretrain]
     bc, reference = parse_agent("bc"), parse_agent("bc")
-    for task in [task for task in shelf.tasks if family_of(task) != ANT_MAZE]:
+    for task in [task for task in shelf.tasks if not is_maze(task)]:
         full = shelf.parts(task, ["expert"], "none")
         if full:
             yield Cell("b2", task, "none", reference, full)  # scores are shares of this one
@@ -283,7 +283,7 @@ def _b2(shelf: _Shelf, agents: list[Agent]):
 
 def _b3(shelf: _Shelf, agents: list[Agent]):
     encoders = [agent for agent in agents or map(parse_agent, B3_AGENTS) if agent.pretrain]
-    mazes = [task for task in shelf.tasks if family_of(task) == ANT_MAZE]
+    mazes = [task for task in shelf.tasks if is_maze(task)]
     for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
         for level in shelf.levels(task, FIXED) or [B3_LEVEL]:
             fixed, hidden = shelf.find(task, [level], FIXED), shelf.parts(task, [level], HIDDEN)
@@ -305,7 +305,7 @@ def _distinct_shares(episodes: int) -> list[float]:
 def _ablations(shelf: _Shelf, agents: list[Agent]):
     agents = agents or [parse_agent(name) for name in ABLATION_AGENTS]
     for task in shelf.tasks:
-        for setting in [VISIBLE] if family_of(task) == ANT_MAZE else shelf.settings(task):
+        for setting in [VISIBLE] if is_maze(task) else shelf.settings(task):
             parts = shelf.parts(task, ["expert"], setting)
             if not parts:
                 continue

@@ -22,9 +22,9 @@ from dmcvb_gen.dataset import Release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError
 from dmcvb_gen.generate.jobs import video_source
-from dmcvb_gen.names import ANT_MAZE, select
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import local_path
 
 STATE_BC_SHARE = 0.9
@@ -213,7 +213,7 @@ def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | N
     learned = dict.fromkeys(part.subset for cell in cells if not cell.agent.sees_state for part in cell.policy)
     found = []
     for record in (release.subsets[name].record for name in learned):
-        what, seen = "maze style", record.family == ANT_MAZE and record.split == SPLIT
+        what, seen = "maze style", record.goal_mode is not None and record.split == SPLIT
         if record.backgrounds:
             with contextlib.suppress(BackgroundError):  # what is not there fails in the cells
                 shown = load_backgrounds(video_source(release.path, record, backgrounds), SPLIT).digest

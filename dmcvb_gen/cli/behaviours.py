@@ -138,13 +138,13 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
     """
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.generate.info import return_statistics
-    from dmcvb_gen.names import ANT_MAZE, family_of
     from dmcvb_gen.policies.actor import random_policy
     from dmcvb_gen.policies.bundled import bundled_levels, levels_of, resolve_policies
     from dmcvb_gen.policies.evaluation import maze_scores, running_speed, walked_paths
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.policies.policy_file import load_policy, read_header
     from dmcvb_gen.policies.simulate import simulate
+    from dmcvb_gen.spec import is_maze
     from dmcvb_gen.tasks import get_task, task_ids
     from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
 
@@ -154,7 +154,7 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
         files = [path for level in named for path in resolve_policies("", level, behaviour)]
         tasks = tasks or sorted({read_header(path).task for path in files})
     tasks, rows = tasks or [task_id for task_id in task_ids() if bundled_levels(task_id)], []
-    if pictures and not any(family_of(task_id) == ANT_MAZE for task_id in tasks):
+    if pictures and not any(is_maze(task_id) for task_id in tasks):
         raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(tasks)} is none; leave it out")
     for task_id in tasks:
         task, panels = get_task(task_id), {}

@@ -34,7 +34,7 @@ def show_maze(layout, start, goal, out, as_json):
     dmcvb-gen show-maze my_maze.txt --start 1,1 --goal 3,5 --out my_maze.png
     """
     from dmcvb_gen.errors import UnknownNameError
-    from dmcvb_gen.names import MazeName
+    from dmcvb_gen.spec import MazeName
     from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, get_layout, load_layout, make_layout
     from dmcvb_gen.tasks.ant_maze.picture import save_maze_picture
 

@@ -21,7 +21,8 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.cli.unused_options import given_options, refuse
-from dmcvb_gen.names import DIFFICULTIES, LABEL_TYPES, SPLITS, pluralize
+from dmcvb_gen.spec import DIFFICULTIES, LABEL_TYPES, SPLITS
+from dmcvb_gen.text import pluralize
 
 
 @click.command()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import click
 
-from dmcvb_gen.names import GOAL_PICTURES, pluralize
+from dmcvb_gen.spec import GOAL_PICTURES
+from dmcvb_gen.text import pluralize
 
 _OPTIONS = (
     click.option("--size", type=click.IntRange(1), help="Pixels a side.  [default: the manifest's]"),

@@ -23,19 +23,18 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.cli.unused_options import check_exclusive_options, check_maze_options, given_options, is_given, rewarded
-from dmcvb_gen.names import (
-    ANT_MAZE,
+from dmcvb_gen.spec import (
     DIFFICULTIES,
     FIXED,
     REWARDS,
     SPLITS,
-    DistractorSetting,
+    Distractor,
     MazeName,
-    family_of,
-    pluralize,
+    is_maze,
     task_folder,
 )
 from dmcvb_gen.storage.remote import is_url, public
+from dmcvb_gen.text import pluralize
 
 
 def _out_default(name: str) -> str:
@@ -249,7 +248,7 @@ def _changed_recipe(recipe, tasks, options, given):
     for name, cure in NOT_WITH_RECIPE.items():
         if name in given:
             raise click.UsageError(f"--recipe takes no {cure} instead.")
-    settings = [DistractorSetting.parse(name).name for name in options["settings"]] + list(options["goals"])
+    settings = [Distractor.parse(name).name for name in options["settings"]] + list(options["goals"])
     if tasks or options["levels"] or settings:
         recipe = narrow(recipe, tasks, options["levels"], settings)
     changes = {name: options[name] for name in given & _OVERRIDES}
@@ -286,15 +285,15 @@ def _recipe_from_options(tasks, options, given):
     from dmcvb_gen.generate.recipe import single_recipe
 
     levels = options["levels"] or ("random",)
-    if len({family_of(task) for task in tasks}) > 1:
+    if len({is_maze(task) for task in tasks}) > 1:
         raise click.UsageError("Mazes and locomotion tasks take different settings; roll them out by a --recipe.")
     check_maze_options(tasks, options, given)
     tasks = tuple(rewarded(task, options["reward"]) for task in tasks)
-    if family_of(tasks[0]) == ANT_MAZE:
+    if is_maze(tasks[0]):
         settings = tuple(dict.fromkeys([*options["goals"], *([FIXED] if options["fixed_goals"] else [])]))
     else:
         difficulty = options["difficulty"]
-        settings = [name if "_" in name else DistractorSetting(name, difficulty).name for name in options["settings"]]
+        settings = [name if "_" in name else Distractor(name, difficulty).name for name in options["settings"]]
     subset_fields = {name: options[name] for name in ("steps", "episodes_per_shard", "max_steps")}
     subset_fields["episodes"] = options["episodes"] or (None if options["steps"] else 20)
     subset_fields["deterministic"] = not options["sample"]

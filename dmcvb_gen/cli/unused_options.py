@@ -8,7 +8,7 @@ from __future__ import annotations
 import click
 from click.core import ParameterSource
 
-from dmcvb_gen.names import ANT_MAZE, FIXED, MazeName, family_of
+from dmcvb_gen.spec import FIXED, MazeName, is_maze
 from dmcvb_gen.storage.remote import is_url
 
 
@@ -73,7 +73,7 @@ def check_maze_options(tasks: tuple[str, ...], options: dict, given: set[str]) -
     Raises:
       click.UsageError: one of them would go unheard.
     """
-    if all(family_of(task) == ANT_MAZE for task in tasks):
+    if all(is_maze(task) for task in tasks):
         if options["settings"]:
             raise click.UsageError("Mazes vary in style, not by --distractor; use --goal visible|hidden.")
         if "difficulty" in given:

@@ -11,7 +11,7 @@ import click
 from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
 from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
 from dmcvb_gen.cli.unused_options import given_options, refuse
-from dmcvb_gen.names import pluralize
+from dmcvb_gen.text import pluralize
 
 TRAINING = (
     *("benchmarks", "agents", "own", "profile", "scale", "seed"),
@@ -109,7 +109,7 @@ def validate(
 
 def _show_score(cell, facts, profile) -> None:
     """A cell's score, as soon as it is there."""
-    from dmcvb_gen.names import task_folder
+    from dmcvb_gen.spec import task_folder
 
     if "error" in facts:
         return  # told at the end, where it is not overlooked

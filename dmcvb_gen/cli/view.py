@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from dmcvb_gen.cli.common import OutPath, ProgressBar, format_bytes, json_option, print_json, remote_option
-from dmcvb_gen.names import pluralize
+from dmcvb_gen.text import pluralize
 
 HOST = "127.0.0.1"
 

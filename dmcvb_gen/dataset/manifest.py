@@ -15,7 +15,7 @@ from dmcvb_gen.dataset.schema import SCHEMA_VERSION
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
-from dmcvb_gen.names import ANT_MAZE, FIXED, LOCOMOTION, family_of, hides_goal
+from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, LOCOMOTION, Distractor, GoalMode, SubsetSpec, is_maze
 from dmcvb_gen.storage.remote import storage_errors
 from dmcvb_gen.version import __version__
 
@@ -145,6 +145,25 @@ class SubsetRecord(_Model):
         if source is not None and not Path(str(source)).is_absolute():  # absolute: in releases of version 1, only read
             check_relative_path(str(source))
         return backgrounds
+
+    @property
+    def spec(self) -> SubsetSpec:
+        """Its typed identity.
+
+        Raises:
+          UnknownNameError: the manifest names a level or setting that does not exist.
+        """
+        return SubsetSpec.parse(self.task, self.level, self.setting)
+
+    @property
+    def distractor(self) -> Distractor:
+        """The distractor of its images; "none" for mazes."""
+        return self.spec.distractor
+
+    @property
+    def goal_mode(self) -> GoalMode | None:
+        """How a maze treats its goal; None for tasks without one."""
+        return self.spec.goal
 
     @property
     def imported(self) -> bool:
@@ -370,9 +389,9 @@ def _upgraded(data: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(old, dict):
             return data
         facts: dict[str, Any] = {"split": (old.get("backgrounds") or {}).get("split") or recipe.get("split", "train")}
-        if family_of(str(old.get("task"))) == ANT_MAZE:
+        if is_maze(str(old.get("task"))):
             facts |= {"family": ANT_MAZE, "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 1200}
-            facts["hidden_goal"] = hides_goal(str(old.get("setting")))
+            facts["hidden_goal"] = old.get("setting") in (HIDDEN, FIXED)
             if old.get("setting") == FIXED:
                 facts |= _goal_pairs_of_version_1(old, patterns)
         upgraded.append(facts | old)

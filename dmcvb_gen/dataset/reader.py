@@ -27,8 +27,8 @@ from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.writer import read_commits
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.names import pluralize
 from dmcvb_gen.storage.remote import file_system, is_url, public, storage_errors
+from dmcvb_gen.text import pluralize
 
 MAX_STEP_BYTES = 2**20
 """Bytes of a step that is no picture, at most."""

@@ -37,7 +37,6 @@ import zarr
 from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
 from dmcvb_gen.dataset.pictures import picture_arrays, stored_pictures
-from dmcvb_gen.names import setting_moves
 
 if TYPE_CHECKING:
     from dmcvb_gen.dataset.manifest import SubsetRecord
@@ -195,13 +194,13 @@ def picture_codecs(layout: str) -> dict[str, Any]:
     return layouts[layout]
 
 
-def picture_layout_for(setting: str) -> str:
-    """The codec layout of a setting's pictures, as measured with scripts/bench_store.py.
+def picture_layout_for(camera_moves: bool) -> str:
+    """The codec layout of a subset's images, as measured with scripts/bench_store.py.
 
-    Moving pictures are smaller as differences of neighboring pixels, a color channel at a time; where the camera
-    stands still, zstd finds the repeated rows by itself, and is faster to read.
+    Images of a moving camera are smaller as differences of neighboring pixels, one color channel at a time. If the
+    camera stands still, zstd finds the repeated rows by itself, and is faster to read.
     """
-    return "channel-delta-zstd" if setting_moves(setting) else "zstd"
+    return "channel-delta-zstd" if camera_moves else "zstd"
 
 
 def create_arrays(

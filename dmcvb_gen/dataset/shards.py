@@ -17,7 +17,7 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes, sha256_file
-from dmcvb_gen.names import select
+from dmcvb_gen.spec import select
 
 ShardKey = tuple[str, int]
 """(subset, shard)."""

@@ -37,7 +37,7 @@ from dmcvb_gen.dataset.manifest import environment as this_environment
 from dmcvb_gen.dataset.schema import SCHEMA_VERSION, ArraySpec, create_arrays, picture_layout_for, stored_name
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, copy_file, parse_json, remove_partial, sha256_file
-from dmcvb_gen.names import LABEL_TYPES
+from dmcvb_gen.spec import LABEL_TYPES
 from dmcvb_gen.storage.remote import storage_errors
 
 LOCK, LOCK_SECONDS = ".lock", 60.0
@@ -115,7 +115,7 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
       StoreError: the folder cannot be written.
     """
     path = root / subset_path(subset.name)
-    shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
+    shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.spec.camera_moves))
     with storage_errors(path, "write to"):
         if not (path / CREATED).exists():
             # File by file, each whole: of two who begin at the same time, none may clear away what the other wrote.
@@ -167,7 +167,7 @@ def add_arrays(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], r
       StoreError: the folder cannot be written.
     """
     path = root / subset_path(subset.name)
-    shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.setting))
+    shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.spec.camera_moves))
     with storage_errors(path, "write to"):
         _write_metadata(path, specs, attributes, shape, keep=False)
         mark_created(root, subset)

@@ -12,7 +12,7 @@ import numpy as np
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors.background import background_walk
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
-from dmcvb_gen.distractors.base import KINDS, SCALES, DistractorSetting, floor_alpha_for
+from dmcvb_gen.distractors.base import KINDS, SCALES, Distractor, floor_alpha_for
 from dmcvb_gen.distractors.camera import camera_range, camera_walk, look_at, nominal_target
 from dmcvb_gen.distractors.color import color_walk
 from dmcvb_gen.tasks.base import Task
@@ -33,7 +33,7 @@ class DistractorSampler:
     def __init__(
         self,
         task: Task,
-        setting: DistractorSetting,
+        setting: Distractor,
         frames: int,
         generators: Mapping[str, Sequence[np.random.Generator]],
         backgrounds: Backgrounds | None,
@@ -105,7 +105,7 @@ def _draw(rng: np.random.Generator, choices: Sequence[int]) -> int:
 
 def sample_distractors(
     task: Task,
-    setting: DistractorSetting,
+    setting: Distractor,
     physics: np.ndarray,
     generators: Mapping[str, Sequence[np.random.Generator]],
     backgrounds: Backgrounds | None = None,
@@ -130,7 +130,7 @@ __all__ = [
     "KINDS",
     "SCALES",
     "Backgrounds",
-    "DistractorSetting",
+    "Distractor",
     "DistractorSampler",
     "floor_alpha_for",
     "load_backgrounds",

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dmcvb_gen.names import DIFFICULTY_SCALES as SCALES
-from dmcvb_gen.names import DISTRACTOR_KINDS as KINDS
-from dmcvb_gen.names import DistractorSetting
+from dmcvb_gen.spec import DIFFICULTY_SCALES as SCALES
+from dmcvb_gen.spec import DISTRACTOR_KINDS as KINDS
+from dmcvb_gen.spec import Distractor
 from dmcvb_gen.tasks.base import Task
 
-__all__ = ["KINDS", "SCALES", "DistractorSetting", "floor_alpha_for"]
+__all__ = ["KINDS", "SCALES", "Distractor", "floor_alpha_for"]
 
 
-def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
+def floor_alpha_for(task: Task, setting: Distractor) -> float:
     """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
 
     Walker and cheetah 1.0, reacher 0.0, otherwise 0.3 (Distracting Control Suite); untouched without distractors.

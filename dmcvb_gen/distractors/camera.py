@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import DistractorSetting
+from dmcvb_gen.distractors.base import Distractor
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
 VELOCITY_STD = 0.1  # of a tick's change of velocity, times s and r0 / 4, meters a tick
@@ -50,7 +50,7 @@ def cartesian(coordinates: np.ndarray) -> np.ndarray:
     return np.stack([flat * cos_azimuth, flat * sin_azimuth, radius * cos_polar], axis=-1)
 
 
-def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
+def camera_range(offset: np.ndarray, setting: Distractor) -> CameraRange:
     """The ranges around a nominal camera.
 
     Args:
@@ -64,7 +64,7 @@ def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
 
 
 def camera_walk(
-    bounds: CameraRange, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
+    bounds: CameraRange, setting: Distractor, frames: int, generators: Sequence[np.random.Generator]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the camera's walk, relative to the agent.
 

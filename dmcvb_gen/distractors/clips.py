@@ -20,7 +20,7 @@ from dmcvb_gen.distractors.backgrounds import FRAME_SIZE
 from dmcvb_gen.distractors.textures import FLOORS, surroundings, texture
 from dmcvb_gen.errors import BackgroundError
 from dmcvb_gen.files import replacing, write_text
-from dmcvb_gen.names import SPLITS
+from dmcvb_gen.spec import SPLITS
 from dmcvb_gen.storage.remote import local_path
 
 GENERATOR = 2

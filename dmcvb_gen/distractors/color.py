@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import DistractorSetting
+from dmcvb_gen.distractors.base import Distractor
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
 STEP_STD = 0.03
@@ -15,7 +15,7 @@ STEP_STD = 0.03
 
 
 def color_walk(
-    own: np.ndarray, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
+    own: np.ndarray, setting: Distractor, frames: int, generators: Sequence[np.random.Generator]
 ) -> np.ndarray:
     """Draw the colors of all materials.
 

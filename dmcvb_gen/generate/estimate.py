@@ -27,8 +27,8 @@ from dmcvb_gen.generate.engine import Episodes, inputs_of, shard_arrays, simulat
 from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.plan import Plan
 from dmcvb_gen.generate.render import distractor_state_of, renderers
-from dmcvb_gen.names import ANT_MAZE, LOCOMOTION, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, ignore, in_order
+from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
@@ -97,7 +97,7 @@ def _trajectory(record: SubsetRecord) -> tuple:
 
 def _alike(record: SubsetRecord) -> tuple:
     """Whose episodes' lengths are taken together: those of the level's mazes."""
-    return _trajectory(record) if record.family == LOCOMOTION else (ANT_MAZE, *_trajectory(record)[1:])
+    return _trajectory(record) if record.goal_mode is None else (ANT_MAZE, *_trajectory(record)[1:])
 
 
 def _simulate(job: Job, count: int, threads: int) -> tuple[Episodes, float]:
@@ -125,7 +125,7 @@ def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, flo
     first = Episodes(timed.index[:1], timed.physics[:1, :2], length[:1] * 0 + 1, {}, labels[episode, row][:1, :2])
     for _ in shard_arrays(job, record, first):
         pass  # kernels are compiled and buffers made
-    specs, layout = subset_specs(EpisodeShape.of(task), record), picture_layout_for(record.setting)
+    specs, layout = subset_specs(EpisodeShape.of(task), record), picture_layout_for(record.spec.camera_moves)
     with tempfile.TemporaryDirectory() as folder:
         group = zarr.create_group(folder)
         create_arrays(group, specs, len(runs), chunk, len(runs), layout)
@@ -245,9 +245,9 @@ def _extrapolate(plan: Plan, rates: dict[str, Rate]) -> Estimate:
 
 def _painting_key(record: SubsetRecord) -> tuple:
     """What decides the cost of a frame; the same for all mazes."""
-    if record.family == ANT_MAZE:
+    if record.goal_mode is not None:
         return (ANT_MAZE, record.level, "", "")
-    setting = distractor_of(record.task, record.setting)
+    setting = record.distractor
     return (record.task, setting.kind, setting.difficulty, record.level)
 
 

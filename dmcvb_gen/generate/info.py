@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.names import DIFFICULTIES, DISTRACTOR_KINDS, FIXED, GOAL_MODES, LEVELS
 from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_KINDS, FIXED, GOAL_MODES, LEVELS
 from dmcvb_gen.version import __version__
 
 

@@ -21,8 +21,8 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.recipe import Recipe, make_recipe
-from dmcvb_gen.names import FIXED, LOCOMOTION, family_of
 from dmcvb_gen.policies.bundled import resolve_policies
+from dmcvb_gen.spec import FIXED, is_maze
 
 if TYPE_CHECKING:
     from dmcvb_gen.generate.site import Site
@@ -178,7 +178,7 @@ def trajectory_names(trajectories: str, record: SubsetRecord) -> tuple[str, ...]
     Args:
       trajectories: the recipe's "shared" or "independent".
     """
-    shared = trajectories == "shared" and family_of(record.task) == LOCOMOTION  # maze subsets have both pictures
+    shared = trajectories == "shared" and not is_maze(record.task)  # maze subsets have both pictures
     return (record.task, record.level) if shared else (record.task, record.level, record.setting)
 
 

@@ -41,8 +41,8 @@ from dmcvb_gen.generate.recipe import check_size
 from dmcvb_gen.generate.regenerate import environment_diff
 from dmcvb_gen.generate.render import frame_count
 from dmcvb_gen.generate.site import FolderSite
-from dmcvb_gen.names import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.spec import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 

@@ -42,10 +42,10 @@ from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs,
 from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.generate.render import check_renderer, renderer_for
 from dmcvb_gen.generate.site import CONNECTIONS, BucketSite, FolderSite, Site
-from dmcvb_gen.names import SPLITS, distractor_of, hides_goal
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.spec import SPLITS
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
@@ -173,7 +173,7 @@ def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[
     for request in requests:
         files = request.level != "random" and resolve_policies(request.task, request.level, request.policy) or []
         record = _record(recipe, request, files)
-        look = (record.task, distractor_of(record.task, record.setting))
+        look = (record.task, record.distractor)
         if look not in painted:
             painted[look] = painting_facts(record, recipe.backgrounds, device)
         records[request.name] = record.model_copy(update=painted[look] | {"pixels": pixels})
@@ -210,7 +210,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
         renderer={"name": recipe.renderer.backend, "samples": recipe.renderer.samples},
         family=task.family,
         views=tuple(task.views),
-        hidden_goal=bool(task.goal_geoms) and hides_goal(request.setting),
+        hidden_goal=bool(task.goal_geoms) and request.spec.hides_goal,
         max_steps=request.max_steps,
         fixed_goals=goals,
         episodes_per_goal=per_goal,

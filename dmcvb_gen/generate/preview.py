@@ -13,7 +13,7 @@ from dmcvb_gen.dataset import Subset, open_release
 from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.extras import installed
-from dmcvb_gen.names import ANT_MAZE, select
+from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import local_path, storage_errors
 
 SHEET_COLUMNS = 10
@@ -90,7 +90,7 @@ def _fitting(name: str, width: int) -> str:
 
 
 def _has_map(subset: Subset) -> bool:
-    return subset.record.family == ANT_MAZE and "top" in shown(subset).views
+    return subset.record.goal_mode is not None and "top" in shown(subset).views
 
 
 def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:

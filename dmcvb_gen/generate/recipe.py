@@ -25,7 +25,8 @@ import pydantic
 from dmcvb_gen.dataset.manifest import MAX_EPISODES, MAX_SHARDS
 from dmcvb_gen.errors import RecipeError, UnknownNameError
 from dmcvb_gen.files import read_yaml
-from dmcvb_gen.names import (
+from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
+from dmcvb_gen.spec import (
     ANT_MAZE,
     DISTRACTOR_KINDS,
     FAMILIES,
@@ -33,14 +34,11 @@ from dmcvb_gen.names import (
     GOAL_MODES,
     LOCOMOTION,
     VISIBLE,
-    DistractorSetting,
-    check_level,
-    distractor_of,
-    family_of,
-    normalize_setting,
-    subset_name,
+    Distractor,
+    SubsetSpec,
+    is_maze,
+    parse_setting,
 )
-from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -138,6 +136,11 @@ class SubsetRequest(_Model):
     deterministic: bool = False
     episodes_per_goal: int | None = None
 
+    @property
+    def spec(self) -> SubsetSpec:
+        """Its typed identity."""
+        return SubsetSpec.parse(self.task, self.level, self.setting)
+
 
 def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     """All subsets that a recipe asks for, in its order.
@@ -151,13 +154,11 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
         for task_id in pattern.tasks:
             task = get_task(task_id)
             for level in pattern.levels:
-                check_level(level)
-                for given in pattern.settings:
-                    setting = normalize_setting(task_id, given)
-                    name = subset_name(task_id, level, setting)
-                    if name in requests:
-                        raise RecipeError(f"recipe {recipe.name!r} asks for {name} twice; keep one of the entries")
-                    requests[name] = _request(pattern, task, name, level, setting)
+                for setting in pattern.settings:
+                    spec = SubsetSpec.parse(task_id, level, setting)
+                    if spec.name in requests:
+                        raise RecipeError(f"recipe {recipe.name!r} asks for {spec.name} twice; keep one of the entries")
+                    requests[spec.name] = _request(pattern, task, spec)
     unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
     if unused:
         raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
@@ -169,7 +170,8 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     return tuple(requests.values())
 
 
-def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting: str) -> SubsetRequest:
+def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequest:
+    name, level, setting = spec.name, spec.level.value, spec.setting
     per_goal, max_steps = None, pattern.max_steps or task.max_steps
     if setting == FIXED:
         episodes, per_goal = pattern.fixed_goals * pattern.episodes_per_goal, pattern.episodes_per_goal
@@ -179,7 +181,7 @@ def _request(pattern: SubsetPattern, task: Task, name: str, level: str, setting:
         episodes = pattern.episodes
     elif pattern.steps is None:
         raise RecipeError(f"{name}: say how much: episodes: N (or steps: N)")
-    elif task.family == ANT_MAZE:
+    elif spec.goal is not None:
         raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
     else:
         episodes = -(-pattern.steps // max_steps)
@@ -225,7 +227,7 @@ def narrow(
     for field, given in wanted.items():
         known = {value for pattern in recipe.subsets for value in getattr(pattern, field)}
         if field == "settings":
-            known |= {DistractorSetting.parse(value).name for value in known - set(GOAL_MODES)}
+            known |= {Distractor.parse(value).name for value in known - set(GOAL_MODES)}
         for value in given:
             if value not in known:
                 raise UnknownNameError(f"{field[:-1]} of recipe {recipe.name}", value, known)
@@ -246,7 +248,7 @@ def narrow(
 
 def _canonical(setting: str) -> str:
     """ "dynamic_medium" -> "dynamic"; what is no distractor stays."""
-    return DistractorSetting.parse(setting).name if setting.split("_")[0] in DISTRACTOR_KINDS else setting
+    return Distractor.parse(setting).name if setting.split("_")[0] in DISTRACTOR_KINDS else setting
 
 
 SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps")
@@ -325,7 +327,7 @@ def single_recipe(
     """
     patterns = []
     for family in FAMILIES:
-        chosen = [task for task in tasks if family_of(task) == family]
+        chosen = [task for task in tasks if is_maze(task) == (family == ANT_MAZE)]
         if not chosen:
             continue
         default = "none" if family == LOCOMOTION else VISIBLE
@@ -342,13 +344,13 @@ def check_heard(recipe: Recipe, given: Collection[str]) -> None:
       given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".
     """
     subsets = [(t, level, s) for p in recipe.subsets for t in p.tasks for level in p.levels for s in p.settings]
-    videos = any(distractor_of(task, setting).kind != "none" for task, _, setting in subsets)
-    families = {family_of(task) for task, _, _ in subsets}
+    videos = any(parse_setting(task, setting)[0].kind != "none" for task, _, setting in subsets)
+    mazes = {is_maze(task) for task, _, _ in subsets}
     cures = {
         "backgrounds": (videos, "no subset shows videos; ask for --distractor static or dynamic"),
-        "split": (videos or ANT_MAZE in families, "no subset shows videos; ask for --distractor static or dynamic"),
+        "split": (videos or True in mazes, "no subset shows videos; ask for --distractor static or dynamic"),
         "sample": (any(level != "random" for _, level, _ in subsets), "level random is always drawn; ask for another"),
-        "independent": (LOCOMOTION in families, "subsets of mazes always have their own episodes"),
+        "independent": (False in mazes, "subsets of mazes always have their own episodes"),
     }
     for name, (heard, cure) in cures.items():
         if name in given and not heard:

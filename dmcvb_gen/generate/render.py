@@ -16,11 +16,11 @@ from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.names import LABEL_TYPES, distractor_of
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.spec import LABEL_TYPES
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -52,7 +52,7 @@ def renderer_for(
       device: "cpu" or "cuda".
       overrides: `name` and `samples`, instead of the record's.
     """
-    task, setting = get_task(record.task), distractor_of(record.task, record.setting)
+    task, setting = get_task(record.task), record.distractor
     videos = None if setting.kind == "none" else load_backgrounds(backgrounds, split or record.split)
     choice = {"name": record.renderer["name"], "samples": record.renderer.get("samples")} | overrides
     name = choice.pop("name")
@@ -76,7 +76,7 @@ class RendererCache:
 
     def get(self, record: SubsetRecord, backgrounds: str, device: str) -> tuple[Renderer, Any]:
         """As `renderer_for`."""
-        setting = distractor_of(record.task, record.setting)
+        setting = record.distractor
         key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
         key += (backgrounds, record.split, device)
         if key not in self._made:
@@ -126,7 +126,7 @@ def distractor_state_of(
         for name in STREAMS
         if name not in SIMULATION_STREAMS
     }
-    setting = distractor_of(record.task, record.setting)
+    setting = record.distractor
     return sample_distractors(task, setting, padded, generators, backgrounds, split=record.split)
 
 

@@ -38,8 +38,8 @@ from dmcvb_gen.generate.render import (
     check_renderer,
 )
 from dmcvb_gen.generate.site import FolderSite
-from dmcvb_gen.names import ANT_MAZE, LABEL_TYPES, DistractorSetting, distractor_of, family_of, select
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.spec import LABEL_TYPES, Distractor, is_maze, select
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -90,7 +90,7 @@ class Repainted:
         """Whether the distractor, the videos and the styles are those of the source."""
         old, new = self.source.record, self.record
         videos = [(record.backgrounds or {}).get("digest") for record in (old, new)]
-        styles = [record.split if record.family == ANT_MAZE else "" for record in (old, new)]
+        styles = [record.split if record.goal_mode is not None else "" for record in (old, new)]
         return old.setting == new.setting and videos[0] == videos[1] and styles[0] == styles[1]
 
 
@@ -149,7 +149,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
 
 def _check_heard(request: Repainting, records: Sequence[SubsetRecord]) -> None:
     """Refuse options of distractors that none of the new subsets has."""
-    kinds = {distractor_of(record.task, record.setting).kind for record in records}
+    kinds = {record.distractor.kind for record in records}
     for name in ("difficulty", "backgrounds"):
         if getattr(request, name) and kinds <= {"none"}:
             raise RecipeError(f"--{name} is of distractors, and what is painted here has none; leave it out")
@@ -213,11 +213,11 @@ def _old_backgrounds(release: Release, old: SubsetRecord) -> str:
 def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None) -> str:
     if distractor is None and difficulty is None:
         return subset.setting
-    if family_of(subset.task) == ANT_MAZE:
+    if is_maze(subset.task):
         raise RecipeError(f"{subset.name} varies in style, not by distractor; leave --distractor away or use --only")
-    old = DistractorSetting.parse(subset.setting)
-    given = DistractorSetting.parse(distractor) if distractor else old
-    return DistractorSetting(given.kind, difficulty or given.difficulty).name
+    old = Distractor.parse(subset.setting)
+    given = Distractor.parse(distractor) if distractor else old
+    return Distractor(given.kind, difficulty or given.difficulty).name
 
 
 def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Repainting) -> Manifest:

@@ -8,7 +8,7 @@ and one call of the renderer.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -20,23 +20,21 @@ from numpy.typing import ArrayLike
 
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.distractors import DistractorSampler, DistractorSetting, floor_alpha_for, load_backgrounds
+from dmcvb_gen.distractors import Distractor, DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import check_size
 from dmcvb_gen.generate.render import check_renderer
-from dmcvb_gen.names import (
-    ANT_MAZE,
-    FIXED,
+from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.spec import (
     GOAL_PICTURES,
     HIDDEN,
     SPLITS,
     VISIBLE,
-    distractor_of,
-    hides_goal,
-    normalize_setting,
+    GoalMode,
+    SubsetSpec,
+    is_maze,
 )
-from dmcvb_gen.rendering import make_renderer
-from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 
@@ -83,23 +81,22 @@ class Scene:
     goal_seed: int = 0
     threads: int = 1
 
-    def normalized_setting(self) -> str:
-        """The setting's canonical name, e.g. "static_hard" or "fixed".
+    def spec(self) -> SubsetSpec:
+        """The task with its distractor and goal mode; the level is of no account.
 
         Raises:
           UnknownNameError: the task has no such setting, or there is no such difficulty.
         """
-        maze = get_task(self.task).family == ANT_MAZE
-        if maze and self.distractor == "none":
-            return VISIBLE  # mazes differ in style, always, and in whether the goal is seen
-        setting = normalize_setting(self.task, self.distractor)
+        maze = is_maze(get_task(self.task).id)
+        # Mazes always differ in style, and in whether the goal is seen.
+        spec = SubsetSpec.parse(self.task, "random", VISIBLE if maze and self.distractor == "none" else self.distractor)
         if self.difficulty and not maze:
-            return DistractorSetting(DistractorSetting.parse(setting).kind, self.difficulty).name
-        return setting
+            return replace(spec, distractor=Distractor(spec.distractor.kind, self.difficulty))
+        return spec
 
     def check(self) -> None:
         """Raises DmcvbError for a field that has no such value, or none for this task."""
-        maze = get_task(self.task).family == ANT_MAZE
+        maze = is_maze(get_task(self.task).id)
         for field, value, known in (("split", self.split, SPLITS), ("goal", self.goal, (None, *GOAL_PICTURES))):
             if value not in known:
                 raise UnknownNameError(field, str(value), [name for name in known if name])
@@ -116,13 +113,13 @@ class _Stage:
         if count < 1:
             raise DmcvbError(f"num_envs is {count}; give at least 1")
         scene.check()
-        setting = scene.normalized_setting()
+        spec = scene.spec()
         self.task, self.count, self.size, self.split = get_task(scene.task), count, scene.size, scene.split
-        self.setting = distractor_of(scene.task, setting)
-        hide = scene.goal == HIDDEN if scene.goal else hides_goal(setting)
+        self.setting = spec.distractor
+        hide = scene.goal == HIDDEN if scene.goal else spec.hides_goal
         self.pictures = Pictures(self.task.views, hide).select(scene.views)
         self.max_steps = scene.max_steps or self.task.evaluation_steps
-        self.pairs = _pairs(self.task, scene) if setting == FIXED else None
+        self.pairs = _pairs(self.task, scene) if spec.goal is GoalMode.FIXED else None
         self._first_pair = scene.goal_pair or 0
         check_size(scene.size)
         check_renderer(scene.renderer)

@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.names import DISTRACTOR_KINDS, GOAL_MODES, MazeName
+from dmcvb_gen.spec import DISTRACTOR_KINDS, GOAL_MODES, MazeName
 
 if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec

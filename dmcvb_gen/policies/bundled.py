@@ -8,8 +8,8 @@ from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
-from dmcvb_gen.names import TRAINED_LEVELS
 from dmcvb_gen.policies.policy_file import read_header
+from dmcvb_gen.spec import TRAINED_LEVELS
 
 
 def bundled_folder() -> Path:

@@ -6,7 +6,7 @@ import csv
 import functools
 from importlib import resources
 
-from dmcvb_gen.names import REWARDS, MazeName
+from dmcvb_gen.spec import REWARDS, MazeName
 
 MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "medium": "ant-maze/multi-obstacle"}
 """Layout's difficulty -> the paper's row, which pools the layouts of a difficulty."""

@@ -17,9 +17,9 @@ from safetensors.numpy import save as dump_safetensors
 
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.files import parse_json, write_bytes
-from dmcvb_gen.names import ANT_MAZE, family_of
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
+from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -105,4 +105,4 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
 
 def _same_family(first: str, second: str) -> bool:
     """Ant-maze policies never see the layout, so one may be used (and warm-started) in another maze."""
-    return family_of(first) == family_of(second) == ANT_MAZE
+    return is_maze(first) and is_maze(second)

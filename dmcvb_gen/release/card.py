@@ -20,21 +20,22 @@ from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.dataset.schema import stored_name
 from dmcvb_gen.distractors import background, camera, color
-from dmcvb_gen.distractors.base import DistractorSetting
+from dmcvb_gen.distractors.base import Distractor
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import remove_partial, replacing, write_text
 from dmcvb_gen.generate.info import describe_release
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
-from dmcvb_gen.names import ANT_MAZE, FIXED, distractor_of, pluralize
 from dmcvb_gen.policies.header import origin_of
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
+from dmcvb_gen.spec import FIXED
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.text import pluralize
 
 README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
 PLOT, SHEET = f"{CARD_FOLDER}/returns.png", f"{CARD_FOLDER}/contact_sheet.png"
@@ -263,7 +264,7 @@ def card_text(
             levels=level_statistics(release),
             level_episodes=STATISTICS_EPISODES,
             distractors=_distractors(manifest),
-            has_mazes=any(record.family == ANT_MAZE for record in manifest.subsets),
+            has_mazes=any(record.goal_mode is not None for record in manifest.subsets),
             making=_making(manifest),
             policies=_policies(manifest),
             first=next(iter(release.subsets)),
@@ -294,10 +295,10 @@ STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 
 def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
     """Rows (setting, scale, camera, colors, background) of the table of distractors; none for mazes alone."""
-    settings: dict[str, DistractorSetting] = {}
+    settings: dict[str, Distractor] = {}
     for record in manifest.subsets:
-        if record.family != ANT_MAZE:
-            settings.setdefault(record.setting, distractor_of(record.task, record.setting))
+        if record.goal_mode is None:
+            settings.setdefault(record.setting, record.distractor)
     rows = []
     for name, setting in settings.items():
         if setting.kind == "none":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dmcvb_gen.dataset import Release, Subset, open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, subset_path
-from dmcvb_gen.names import pluralize
+from dmcvb_gen.text import pluralize
 
 SHOWN = 5
 """Shards named of a subset before the rest is counted."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from dmcvb_gen.names import ANT_MAZE, FIXED, HIDDEN, LOCOMOTION, VISIBLE, family_of
+from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, VISIBLE, is_maze
 
 _CAMERAS = {
     "top": "lowres_top_camera",
@@ -24,14 +24,14 @@ _FOLDERS = {
 
 def picture_feature(task: str, view: str, hide_goal: bool) -> str:
     """The observation that holds a view's pictures."""
-    if family_of(task) != ANT_MAZE:
+    if not is_maze(task):
         return view
     return _CAMERAS.get(view, view) + (_HIDDEN_TARGET if hide_goal else "")
 
 
 def state_feature(task: str, field: str) -> str:
     """The observation that holds a field of the state."""
-    return f"walker/{field}" if family_of(task) == ANT_MAZE and field not in _OF_THE_TASK else field
+    return f"walker/{field}" if is_maze(task) and field not in _OF_THE_TASK else field
 
 
 def parse_folder(parts: tuple[str, ...]) -> tuple[str, str, str, int | None] | None:
@@ -51,4 +51,4 @@ def parse_folder(parts: tuple[str, ...]) -> tuple[str, str, str, int | None] | N
             return (task, "expert", setting, int(third)) if third.isdigit() else None
         return task, third, setting, None
     task = first.replace("_", "-")
-    return (task, second, third, None) if family_of(task) == LOCOMOTION else None
+    return (task, second, third, None) if not is_maze(task) else None

@@ -40,11 +40,11 @@ from dmcvb_gen.dataset.writer import (
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD
-from dmcvb_gen.names import FIXED, LEVELS, hides_goal, normalize_setting, subset_name
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
+from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec, subset_name
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -184,24 +184,21 @@ def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | No
     task, level, setting = task or guess[0], level or guess[1], setting or guess[2]
     try:
         get_task(task)
-        setting = normalize_setting(task, setting)
-        known = level in LEVELS
+        spec = SubsetSpec.parse(task, level, setting)
     except UnknownNameError:
-        known = False
-    if not known:
         raise StoreError(
             f"{path} does not say what it is by .../walker_walk/expert/static_medium, "
             ".../antmaze_random_hidden_goal/empty7x7/expert or .../antmaze_fixed_hidden_goal/empty7x7/<seed>; give "
             f"--task, --level ({', '.join(LEVELS)}) and --setting"
-        )
-    return task, level, setting, guess[3]
+        ) from None
+    return task, level, spec.setting, guess[3]
 
 
 def _record(
     name: str, facts: tuple[str, str, str], folders: tuple[Path, ...], places: tuple[Place, ...]
 ) -> SubsetRecord:
     task, level, setting = facts
-    hidden = hides_goal(setting)
+    hidden = SubsetSpec.parse(task, level, setting).hides_goal
     features = _step_features(folders[0])
     pictures = {
         view: features.get(f"observation/{picture_feature(task, view, hidden)}", {}).get("image")

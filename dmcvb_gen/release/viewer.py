@@ -28,8 +28,8 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
-from dmcvb_gen.names import select
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import is_url, local_path, public, storage_errors
 
 EPISODES = 12

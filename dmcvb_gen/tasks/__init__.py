@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib import metadata
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.names import ANT_MAZE, family_of
+from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
@@ -64,7 +64,7 @@ def get_task(task_id: str) -> Task:
     """
     if task_id in REGISTRY:
         return REGISTRY[task_id]()
-    if family_of(task_id) == ANT_MAZE:
+    if is_maze(task_id):
         return ant_maze_task(task_id)
     if is_own(task_id):
         return own_task(task_id)

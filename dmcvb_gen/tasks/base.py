@@ -20,7 +20,7 @@ from mujoco.batch import Batch
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import LOCOMOTION
+from dmcvb_gen.spec import LOCOMOTION
 
 ACTION_REPEAT = 2
 """Control steps an agent step (paper, section 3.2)."""
@@ -55,7 +55,7 @@ class Task(abc.ABC):
 
     Attributes:
       id: the task's name, e.g. "walker-walk".
-      family: "locomotion" or "ant-maze" (`names.FAMILIES`): which settings it takes.
+      family: "locomotion" or "ant-maze" (`spec.FAMILIES`): which settings it takes.
       model: the compiled MuJoCo model. Never change it: renderers and batches share it.
       state_fields: name -> size of each part of the state, in the state's order.
       max_steps: agent steps at which the time limit ends an episode of data.

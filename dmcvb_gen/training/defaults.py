@@ -11,7 +11,7 @@ from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import read_yaml
-from dmcvb_gen.names import ANT_MAZE, family_of
+from dmcvb_gen.spec import ANT_MAZE, is_maze
 from dmcvb_gen.training.runs import RunConfig
 from dmcvb_gen.training.settings import check_settings
 
@@ -27,7 +27,7 @@ def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
     `settings` of the file are sac's; another algorithm's are under `algorithms: {<name>: {...}}` of "all" and of
     the task, on top of that algorithm's own defaults; its budget, where it differs, under the task's `runs`.
     """
-    family = ANT_MAZE if family_of(task_id) == ANT_MAZE else task_id
+    family = ANT_MAZE if is_maze(task_id) else task_id
     general, own = _all()["all"], _all().get(family, {})
     values = {name: value for name, value in (general | own).items() if name not in ("algorithms", "runs")}
     values |= (own.get("runs") or {}).get(algorithm) or {}

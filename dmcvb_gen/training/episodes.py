@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.task import SPAWN_NOISE
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 from dmcvb_gen.training.runs import Run
@@ -30,7 +30,7 @@ def shaping_of(task: Task) -> Callable[[np.ndarray], np.ndarray]:
     if task.id == "humanoid-walk":
         height, vertical = slices["head_height"].start, slices["torso_vertical"].start + 2
         return lambda state: np.clip(state[:, height] / 1.4, 0, 1) ** 2 * (1 + state[:, vertical]) / 2
-    if task.family == ANT_MAZE:
+    if is_maze(task.id):
         upright = slices["world_zaxis"].start + 2
         return lambda state: (state[:, upright] - 1) / 2 - HURRY
     return lambda state: np.zeros(len(state))
@@ -78,7 +78,7 @@ class Episodes:
             self.batch.set_physics(standing_states(self._task, self._rng, len(standing)), standing)
         sunken = ids[self._rng.random(len(ids)) < getattr(run.settings, "sunken_starts", 0.0)]
         if len(sunken):
-            if self._task.family != ANT_MAZE:
+            if not is_maze(self._task.id):
                 raise DmcvbError(f"setting sunken_starts is for ant mazes, nothing sinks in {self._task.id}")
             self.batch.sink(sunken, self._rng.uniform(-SPAWN_NOISE, -SPAWN_NOISE / 2, len(sunken)))
         return self.batch.behaviour_observation()

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import ANT_MAZE
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import WAY_SIZE
 from dmcvb_gen.policies.open_maze import places
 from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 from dmcvb_gen.tasks.ant_maze.task import GOAL_NOISE
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
@@ -89,7 +89,7 @@ class GuidedRun(Run):
     @functools.cached_property
     def walker(self) -> Policy:
         """The policy that knows how to walk, not where."""
-        if self.task.family != ANT_MAZE:
+        if not is_maze(self.task.id):
             raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
         source = self.config.init_from
         path = resolve_policies(self.task.id if source else GUIDE, "expert", source)[0]

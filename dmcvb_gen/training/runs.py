@@ -35,12 +35,12 @@ import torch
 from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_bytes
-from dmcvb_gen.names import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import save_policy
+from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.networks import as_arrays
 from dmcvb_gen.training.pruning import prunable_checkpoints

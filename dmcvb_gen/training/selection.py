@@ -18,12 +18,12 @@ import numpy as np
 
 from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
-from dmcvb_gen.names import ANT_MAZE, MAZE_TRAINED_LEVELS, TRAINED_LEVELS
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
+from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.run_log import read_rows
 
@@ -274,7 +274,7 @@ def select_checkpoints(
     if not files:
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(files[0]).task)
-    mazes = task.family == ANT_MAZE
+    mazes = is_maze(task.id)
     base = evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed)[0].mean if mazes else 0.0
     measured: dict[Path, tuple[Policy, Evaluation]] = {}
 

@@ -12,10 +12,10 @@ from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
 from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
-from dmcvb_gen.names import select
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import all_formats, get_format
+from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import local_path, storage_errors
 
 STAMP = ".dmcvb-gen.json"

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.release import ReleaseReader
-from dmcvb_gen.names import FIXED
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.policies.simulate import simulate
+from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import get_task
 
 RANDOM_EPISODES, SEED, NAMES = 10, 0, ("reference",)

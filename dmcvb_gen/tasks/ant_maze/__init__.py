@@ -7,7 +7,7 @@ an ending "@geodesic" takes the shortest path's length for the reward.
 from __future__ import annotations
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.names import REWARDS, MazeName
+from dmcvb_gen.spec import REWARDS, MazeName
 from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, load_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import AntMaze
 from dmcvb_gen.tasks.base import Task

@@ -15,7 +15,7 @@ import skfmm
 from scipy import ndimage
 
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.names import REWARDS
+from dmcvb_gen.spec import REWARDS
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 PIXELS = 10

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.names import REWARDS
+from dmcvb_gen.spec import REWARDS
 from dmcvb_gen.tasks.ant_maze.arena import GOAL_RADIUS
 from dmcvb_gen.tasks.ant_maze.distance import center_pixel, descend, floor_pixels, geodesic_field, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.names import ANT_MAZE
+from dmcvb_gen.spec import ANT_MAZE
 from dmcvb_gen.tasks.ant_maze.arena import (
     ACTIONS,
     CAMERAS,

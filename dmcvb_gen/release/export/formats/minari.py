@@ -13,9 +13,9 @@ import numpy as np
 from dmcvb_gen import files
 from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.loaders.release import ReleaseReader
-from dmcvb_gen.names import ANT_MAZE, FIXED, HIDDEN, VISIBLE, DistractorSetting, hides_goal
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.registry import register_exporter
+from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def _environment(source: Source, split: str) -> EnvSpec:
     from gymnasium.envs.registration import EnvSpec
 
     record = source.subset.record
-    maze = record.family == ANT_MAZE
-    setting = record.setting if maze else DistractorSetting.parse(record.setting).kind
+    maze = record.goal_mode is not None
+    setting = record.setting if maze else record.distractor.kind
     options = {
         "task": record.task,
         "distractor": setting,
@@ -103,10 +103,10 @@ def _environment(source: Source, split: str) -> EnvSpec:
     if record.renderer.get("name") and not record.imported:
         options["renderer"] = record.renderer["name"]
     if not maze:
-        options["difficulty"] = DistractorSetting.parse(record.setting).difficulty
+        options["difficulty"] = record.distractor.difficulty
     if maze:
         options["views"] = list(source.views)
-        if record.hidden_goal != hides_goal(setting):  # `paint --goal` decides it, too
+        if record.hidden_goal != record.spec.hides_goal:  # `paint --goal` decides it, too
             options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
     options["max_steps"] = record.max_steps
     if record.setting == FIXED:

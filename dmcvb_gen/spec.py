@@ -1,10 +1,13 @@
-"""The vocabulary: texts that name tasks, levels, settings and subsets in, checked names and their parts out.
+"""What a subset is: typed values for tasks, levels, distractors and goal modes, and the one place that parses them.
 
 A subset is named "<task>/<level>/<setting>": "walker-walk/expert/dynamic_hard", "ant-maze-easy7x7a/medium/hidden".
+The setting is the stored form of two things: the distractor of a locomotion task, or the goal mode of a maze.
+`SubsetSpec` keeps them apart.
 """
 
 from __future__ import annotations
 
+import enum
 import fnmatch
 import re
 from collections.abc import Sequence
@@ -16,10 +19,45 @@ LOCOMOTION, ANT_MAZE = "locomotion", "ant-maze"
 FAMILIES = (LOCOMOTION, ANT_MAZE)
 """Families of tasks: what a task may vary in, and so which settings it takes. `Task.family` is one of them."""
 
+
+class Level(enum.StrEnum):
+    """Behaviour policies of a subset (paper, section 3.2); "random" needs no trained policy."""
+
+    EXPERT = "expert"
+    MEDIUM = "medium"
+    MIXED = "mixed"
+    RANDOM = "random"
+
+    @classmethod
+    def parse(cls, name: str) -> Level:
+        """The level of a name.
+
+        Raises:
+          UnknownNameError: there is no such level.
+        """
+        if name not in LEVELS:
+            raise UnknownNameError("level", name, LEVELS)
+        return cls(name)
+
+
+class GoalMode(enum.StrEnum):
+    """How a maze treats its goal: random and seen (B1), random and left out of the images (B3's pre-training), or
+    fixed pairs of start and goal, left out too (B3)."""
+
+    VISIBLE = "visible"
+    HIDDEN = "hidden"
+    FIXED = "fixed"
+
+    @property
+    def hides_goal(self) -> bool:
+        """Whether the images leave the goal out."""
+        return self is not GoalMode.VISIBLE
+
+
 TRAINED_LEVELS = ("expert", "medium", "mixed")
 MAZE_TRAINED_LEVELS = ("expert", "medium")
 """Levels with a trained policy; the paper's mazes have no mixed one."""
-LEVELS = (*TRAINED_LEVELS, "random")
+LEVELS = tuple(level.value for level in Level)
 
 DISTRACTOR_KINDS = ("none", "static", "dynamic")
 DIFFICULTY_SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
@@ -28,13 +66,11 @@ DIFFICULTY_VIDEOS = {"easy": 4, "medium": 8, "hard": None}
 """Difficulty -> how many background videos are in play; None: all."""
 DIFFICULTIES = tuple(DIFFICULTY_SCALES)
 
-VISIBLE, HIDDEN, FIXED = "visible", "hidden", "fixed"
-GOAL_MODES = (VISIBLE, HIDDEN, FIXED)
-"""Settings of mazes: a random goal that is seen (B1) or left out of the pictures (B3's pre-training), and fixed
-pairs of start and goal, left out too (B3)."""
+VISIBLE, HIDDEN, FIXED = GOAL_MODES = tuple(mode.value for mode in GoalMode)
+"""The stored names of the goal modes."""
 
 GOAL_PICTURES = (VISIBLE, HIDDEN)
-"""The two kinds of a maze's pictures: with the goal, and without it."""
+"""The two kinds of a maze's images: with the goal, and without it."""
 
 REWARDS = ("saturated", "geodesic")
 """How a maze's reward measures the distance to the goal: DMC-VB's way first, then the shortest path's length."""
@@ -76,14 +112,14 @@ class MazeName:
         return cls(**found.groupdict()) if found else None
 
 
-def family_of(task_id: str) -> str:
-    """The family of the task that an id names (`Task.family`, for those who have the id alone)."""
-    return ANT_MAZE if task_id.startswith(f"{ANT_MAZE}-") else LOCOMOTION
+def is_maze(task_id: str) -> bool:
+    """Whether an id names a maze, for callers that have no `Task` at hand."""
+    return task_id.startswith(f"{ANT_MAZE}-")
 
 
 def task_folder(task_id: str) -> str:
     """A task id as a folder name: without a maze's rows, if it carries its own."""
-    if family_of(task_id) != ANT_MAZE:
+    if not is_maze(task_id):
         return re.sub(r"[^A-Za-z0-9_.-]", "-", task_id)
     head, _, reward = task_id.partition("@")
     return re.sub(r"[^A-Za-z0-9_.-]", "-", head.split(":")[0] + (f"-{reward}" if reward else ""))
@@ -93,8 +129,8 @@ def task_folder(task_id: str) -> str:
 
 
 @dataclass(frozen=True)
-class DistractorSetting:
-    """A kind of distractor at a difficulty; `name` is "none", "static", "dynamic_hard", ... (medium is not named)."""
+class Distractor:
+    """A kind of distractor at a difficulty (paper, section 3.1); "medium" is left out of its `name`."""
 
     kind: str = "none"
     difficulty: str = "medium"
@@ -107,93 +143,97 @@ class DistractorSetting:
 
     @property
     def name(self) -> str:
+        """Its stored name: "none", "static", "dynamic_hard", ..."""
         return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
 
     @property
     def scale(self) -> float:
+        """The scale s of every range; 0 without distractors."""
         return 0.0 if self.kind == "none" else DIFFICULTY_SCALES[self.difficulty]
 
     @property
     def videos(self) -> int | None:
-        """How many videos are in play, None for all."""
+        """Number of background videos in use; None for all."""
         return DIFFICULTY_VIDEOS[self.difficulty]
 
     @classmethod
-    def parse(cls, name: str) -> DistractorSetting:
-        """The setting of a name such as "dynamic", "dynamic_medium" or "static_easy"."""
+    def parse(cls, name: str) -> Distractor:
+        """The distractor of a name such as "dynamic", "dynamic_medium" or "static_easy".
+
+        Raises:
+          UnknownNameError: there is no such kind or difficulty.
+        """
         kind, _, difficulty = name.partition("_")
         return cls(kind, difficulty or "medium")
 
 
-def normalize_setting(task_id: str, setting: str) -> str:
-    """The setting's canonical name ("dynamic_medium" -> "dynamic").
+def parse_setting(task_id: str, setting: str) -> tuple[Distractor, GoalMode | None]:
+    """The distractor and the goal mode that a task's setting stands for ("dynamic_medium", "hidden").
+
+    Mazes vary in style and have no other distractors; locomotion tasks have no goal mode.
 
     Raises:
       UnknownNameError: the task has no such setting.
     """
-    if family_of(task_id) == ANT_MAZE:
-        if setting not in GOAL_MODES:
-            raise UnknownNameError(f"goal setting of {task_id}", setting, GOAL_MODES)
-        return setting
-    return DistractorSetting.parse(setting).name
-
-
-def distractor_of(task_id: str, setting: str) -> DistractorSetting:
-    """The distractors of a subset's setting; mazes have none but their styles."""
-    return DistractorSetting() if family_of(task_id) == ANT_MAZE else DistractorSetting.parse(setting)
-
-
-def hides_goal(setting: str) -> bool:
-    """Whether a setting's pictures are those without the goal: a maze's "hidden" and "fixed"."""
-    return setting in (HIDDEN, FIXED)
-
-
-def setting_moves(setting: str) -> bool:
-    """Whether the camera of a setting moves (mazes' cameras follow the ant)."""
-    return setting in GOAL_MODES or DistractorSetting.parse(setting).kind == "dynamic"
-
-
-def check_level(level: str) -> str:
-    """`level`.
-
-    Raises:
-      UnknownNameError: there is no such level.
-    """
-    if level not in LEVELS:
-        raise UnknownNameError("level", level, LEVELS)
-    return level
+    if not is_maze(task_id):
+        return Distractor.parse(setting), None
+    if setting not in GOAL_MODES:
+        raise UnknownNameError(f"goal setting of {task_id}", setting, GOAL_MODES)
+    return Distractor(), GoalMode(setting)
 
 
 # -- subsets --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class SubsetName:
-    """The parts of a subset's name; `task` is a folder name (`task_folder`), the task's id for all but own mazes."""
+class SubsetSpec:
+    """The identity of a subset.
+
+    Attributes:
+      task: the task's id.
+      level: the behaviour policies.
+      distractor: "none" for mazes.
+      goal: None for tasks without a goal.
+    """
 
     task: str
-    level: str
-    setting: str
-
-    def __str__(self) -> str:
-        return f"{self.task}/{self.level}/{self.setting}"
+    level: Level
+    distractor: Distractor = Distractor()
+    goal: GoalMode | None = None
 
     @classmethod
-    def parse(cls, name: str) -> SubsetName:
-        """The parts of "<task>/<level>/<setting>".
+    def parse(cls, task_id: str, level: str, setting: str) -> SubsetSpec:
+        """The subset of three names.
 
         Raises:
-          UnknownNameError: not three parts.
+          UnknownNameError: there is no such level, or the task has no such setting.
         """
-        parts = name.split("/")
-        if len(parts) != 3 or not all(parts):
-            raise UnknownNameError("subset", name, ("<task>/<level>/<setting>",))
-        return cls(*parts)
+        return cls(task_id, Level.parse(level), *parse_setting(task_id, setting))
+
+    @property
+    def setting(self) -> str:
+        """The stored name of distractor and goal mode."""
+        return self.distractor.name if self.goal is None else self.goal.value
+
+    @property
+    def name(self) -> str:
+        """The name of the subset in a release, "<task>/<level>/<setting>"."""
+        return subset_name(self.task, self.level, self.setting)
+
+    @property
+    def hides_goal(self) -> bool:
+        """Whether the images leave a goal out."""
+        return self.goal is not None and self.goal.hides_goal
+
+    @property
+    def camera_moves(self) -> bool:
+        """Whether the camera moves: it follows the ant in mazes, and wanders in dynamic distractors."""
+        return self.goal is not None or self.distractor.kind == "dynamic"
 
 
 def subset_name(task_id: str, level: str, setting: str) -> str:
     """The name of a subset, "<task>/<level>/<setting>"."""
-    return str(SubsetName(task_folder(task_id), level, setting))
+    return f"{task_folder(task_id)}/{level}/{setting}"
 
 
 def matches(name: str, patterns: Sequence[str]) -> bool:
@@ -214,8 +254,3 @@ def select(names: Sequence[str], patterns: Sequence[str]) -> list[str]:
         if not any(matches(name, [pattern]) for name in names):
             raise UnknownNameError("subset pattern", pattern, names)
     return [name for name in names if not patterns or matches(name, patterns)]
-
-
-def pluralize(count: int, noun: str) -> str:
-    """A number with its noun, given in the plural: 1, "shards" -> "1 shard"; 1200 -> "1,200 shards"."""
-    return f"{count:,} {noun.removesuffix('s') if count == 1 else noun}"

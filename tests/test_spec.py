@@ -1,0 +1,81 @@
+"""Typed identities of subsets: names and their parts, there and back."""
+
+from __future__ import annotations
+
+import pytest
+
+from dmcvb_gen import spec
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.spec import Distractor, GoalMode, Level, MazeName, SubsetSpec
+from dmcvb_gen.tasks import get_task, task_ids
+from dmcvb_gen.text import pluralize
+
+
+def test_every_task_says_the_family_that_its_id_says():
+    for task_id in task_ids():
+        assert (get_task(task_id).family == spec.ANT_MAZE) == spec.is_maze(task_id)
+    assert {get_task(task_id).family for task_id in task_ids()} == set(spec.FAMILIES)
+
+
+@pytest.mark.parametrize("task_id", ["ant-maze-empty7x7", "ant-maze-my_maze:****/*..*/****@geodesic", "ant-maze-a@b"])
+def test_maze_names_go_there_and_back(task_id):
+    assert str(MazeName.parse(task_id)) == task_id
+
+
+def test_other_tasks_are_no_mazes():
+    assert MazeName.parse("walker-walk") is None and MazeName.parse("ant-maze-") is None
+    assert not spec.is_maze("walker-walk")
+
+
+@pytest.mark.parametrize(
+    "parts,name",
+    [
+        (("walker-walk", "expert", "dynamic_medium"), "walker-walk/expert/dynamic"),
+        (("walker-walk", "mixed", "static_hard"), "walker-walk/mixed/static_hard"),
+        (("ant-maze-mine:***@geodesic", "expert", "hidden"), "ant-maze-mine-geodesic/expert/hidden"),
+    ],
+)
+def test_subsets_have_one_name(parts, name):
+    assert SubsetSpec.parse(*parts).name == name
+
+
+def test_a_subset_has_a_distractor_and_a_goal_mode():
+    walker = SubsetSpec.parse("walker-walk", "expert", "static_hard")
+    assert (walker.level, walker.distractor, walker.goal) == (Level.EXPERT, Distractor("static", "hard"), None)
+    maze = SubsetSpec.parse("ant-maze-empty7x7", "random", "hidden")
+    assert (maze.distractor, maze.goal, maze.setting) == (Distractor(), GoalMode.HIDDEN, "hidden")
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ("walker-walk", "expert", "hidden"),
+        ("ant-maze-empty7x7", "expert", "dynamic"),
+        ("walker-walk", "expert", "static_huge"),
+        ("walker-walk", "exprt", "none"),
+    ],
+)
+def test_names_of_no_subset_are_refused(parts):
+    with pytest.raises(UnknownNameError, match="Known"):
+        SubsetSpec.parse(*parts)
+
+
+def test_goals_are_hidden_and_cameras_move_if_the_setting_says_so():
+    mazes = [SubsetSpec("ant-maze-empty7x7", Level.EXPERT, goal=mode) for mode in GoalMode]
+    assert [maze.hides_goal for maze in mazes] == [False, True, True] and all(maze.camera_moves for maze in mazes)
+    walkers = [SubsetSpec.parse("walker-walk", "expert", s) for s in ("none", "static_hard", "dynamic_easy")]
+    assert [walker.camera_moves for walker in walkers] == [False, False, True]
+    assert not any(walker.hides_goal for walker in walkers)
+
+
+def test_patterns_select_and_unknown_ones_are_refused():
+    known = ["walker-walk/expert/none", "walker-walk/expert/static", "cheetah-run/random/none"]
+    assert spec.select(known, ["walker-walk/*/static"]) == known[1:2]
+    assert spec.select(known, ["walker-walk"]) == known[:2] and spec.select(known, []) == known
+    with pytest.raises(UnknownNameError, match="walker-walk/expert/none"):
+        spec.select(known, ["walker-walk/*/dynamic"])
+
+
+@pytest.mark.parametrize("count,text", [(0, "0 shards"), (1, "1 shard"), (2, "2 shards"), (1200, "1,200 shards")])
+def test_nouns_have_a_plural(count, text):
+    assert pluralize(count, "shards") == text
