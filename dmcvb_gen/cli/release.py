@@ -350,9 +350,10 @@ def export(path, to, only, episodes, merge, video, workers, executor, ray_addres
     with ProgressBar(as_json, unit=" episodes") as bar:
         given = dict(merge=merge, video=video, workers=executor, storage_options=options, tick=bar)
         folders = run(path, to, out, only, episodes, **given)
+    shown = [str(Path(out) / folder.relative_to(Path(out).absolute())) for folder in folders]  # as --out names them
     if as_json:
-        return print_json([str(folder) for folder in folders])
-    click.echo("\n".join(str(folder) for folder in folders))
+        return print_json(shown)
+    click.echo("\n".join(shown))
 
 
 @click.command("import")

@@ -56,6 +56,7 @@ class Scene:
       size: pixels a side. renderer: its name; samples: a pixel.
       split: "val" shows videos and styles that no released data show, "train" those of the data.
       backgrounds: "builtin" or a folder of videos.
+      own_videos: digest of the videos of the data, if these are not the built-in ones; then give `backgrounds`.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
       fixed_goals: of "fixed": how many pairs of start and goal there are; an episode takes the next one.
@@ -73,6 +74,7 @@ class Scene:
     samples: int | None = None
     split: str = "val"
     backgrounds: str = "builtin"
+    own_videos: str | None = None
     views: Sequence[str] | None = None
     max_steps: int | None = None
     goal: str | None = None
@@ -102,6 +104,11 @@ class Scene:
                 raise UnknownNameError(field, str(value), [name for name in known if name])
         if maze and self.difficulty:
             raise DmcvbError(f"{self.task} has no difficulty: mazes differ in style alone; leave difficulty away")
+        if self.own_videos and self.backgrounds == "builtin":
+            raise DmcvbError(
+                f"the data show videos of their own (digest {self.own_videos[:12]}), not the built-in ones: give their "
+                "folder with backgrounds=FOLDER"
+            )
         if self.goal and not maze:
             raise DmcvbError(f"{self.task} has no goal in its pictures; leave goal away")
 

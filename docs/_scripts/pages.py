@@ -32,8 +32,8 @@ def help_text(command: click.Command) -> str:
 def option_table(command: click.Command, context: click.Context) -> str:
     """Every option with its help, as `--help` prints them."""
     records = [parameter.get_help_record(context) for parameter in command.get_params(context)]
-    rows = [f"| <code>{cell(names)}</code> | {cell(text)} |" for names, text in filter(None, records)]
-    return "\n".join(["| option | |", "|---|---|", *rows])
+    rows = [f"| <code>{cell(names)}</code> | {cell(text)} |" for names, text in filter(None, records) if text]
+    return "\n".join(["| option | meaning |", "|---|---|", *rows])
 
 
 def command_page(name: str, command: click.Command) -> str:

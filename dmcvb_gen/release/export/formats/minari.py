@@ -109,6 +109,8 @@ def _environment(source: Source, split: str) -> EnvSpec:
         if record.hidden_goal != record.spec.hides_goal:  # `paint --goal` decides it, too
             options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
     options["max_steps"] = record.max_steps
+    if _own_videos(source):
+        options["own_videos"] = (record.backgrounds or {}).get("digest")
     if record.setting == FIXED:
         options |= {
             "fixed_goals": record.fixed_goals,
@@ -121,14 +123,18 @@ def _environment(source: Source, split: str) -> EnvSpec:
     return spec
 
 
-def _about_videos(source: Source) -> str:
-    """What is said of videos that the package does not bring: where they lie now is nothing to publish."""
+def _own_videos(source: Source) -> str | None:
+    """Where the release keeps its own videos; None if it shows the built-in ones or none."""
     from dmcvb_gen.generate.jobs import BUILTIN
 
     videos = (source.subset.record.backgrounds or {}).get("source", BUILTIN)
-    if videos == BUILTIN:
-        return ""
-    return f"; with its videos: recover_environment(backgrounds=FOLDER), the release's {videos}"
+    return None if videos == BUILTIN else videos
+
+
+def _about_videos(source: Source) -> str:
+    """A sentence about videos that the package does not bring, without their folder on this machine."""
+    videos = _own_videos(source)
+    return f"; with its videos: recover_environment(backgrounds=FOLDER), the release's {videos}" if videos else ""
 
 
 def _buffer(number: int, episode: ExportEpisode) -> EpisodeBuffer:
