@@ -18,7 +18,8 @@ from dmcvb_gen.dataset.shards import chosen_shards
 from dmcvb_gen.dataset.writer import commit_path, finish_release, sha256_file
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
-from dmcvb_gen.generate.jobs import make_jobs, release_inputs
+from dmcvb_gen.generate.inputs import release_inputs
+from dmcvb_gen.generate.jobs import make_jobs
 from dmcvb_gen.generate.plan import make_plan
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify

@@ -18,7 +18,7 @@ import numpy as np
 
 from dmcvb_gen.dataset import Release, Subset, open_release
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.paint import render_differences
 from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool

@@ -19,7 +19,7 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.generate.jobs import video_source
+from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.recipe import RendererChoice, check_size
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream

@@ -21,7 +21,7 @@ from dmcvb_gen.benchmarks.suites import FEW_EPISODES, Cell, Missing, plan_benchm
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError
-from dmcvb_gen.generate.jobs import video_source
+from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import select

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from dmcvb_gen.dataset.schema import SCHEMA_VERSION
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
@@ -21,6 +20,9 @@ from dmcvb_gen.version import __version__
 
 __all__ = ["write_json_atomically"]
 MANIFEST = "manifest.json"
+
+SCHEMA_VERSION = 2
+"""Version of the layout and the manifest; a reader refuses newer ones and reads all older ones."""
 
 MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
 """More than any release has; what asks for more is damaged or hostile, and would keep a reader busy for hours."""

@@ -14,13 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Protocol
 
+from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.errors import UnknownNameError
-
-if TYPE_CHECKING:
-    from dmcvb_gen.dataset.manifest import SubsetRecord
-    from dmcvb_gen.dataset.reader import Subset
 
 ONE_VIEW = ("pixels",)
 """The views of a task with one."""
@@ -28,6 +25,12 @@ SHOWN, HIDDEN = "pixels", "pixels_hidden_goal"
 """Folders of the pictures with the goal, and without it."""
 NOT_TRAINED_ON = ("overhead",)
 """Views that are collected, but that no agent sees (paper, section 3.2)."""
+
+
+class HasRecord(Protocol):
+    """A subset of an open release, as far as its images go."""
+
+    record: SubsetRecord
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def picture_of(array: str) -> tuple[str, bool] | None:
     return view or ONE_VIEW[0], folder == HIDDEN
 
 
-def shown(subset: Subset | SubsetRecord, views: Sequence[str] | None = None) -> Pictures:
+def shown(subset: HasRecord | SubsetRecord, views: Sequence[str] | None = None) -> Pictures:
     """The pictures that a subset (or the subset of a record) shows: all its views, in the task's order, the goal
     hidden where its setting says so; whether they are stored or not.
 
@@ -107,12 +110,11 @@ def shown(subset: Subset | SubsetRecord, views: Sequence[str] | None = None) -> 
     Raises:
       UnknownNameError: no such view.
     """
-    found: Any = subset
-    record: SubsetRecord = getattr(found, "record", found)
+    record = subset if isinstance(subset, SubsetRecord) else subset.record
     return Pictures(record.views, record.hidden_goal).select(views)
 
 
-def training_pictures(subset: Subset) -> Pictures:
+def training_pictures(subset: HasRecord) -> Pictures:
     """The pictures that agents are trained on: those shown, less the overhead view."""
     pictures = shown(subset)
     return pictures.select([view for view in pictures.views if view not in NOT_TRAINED_ON])

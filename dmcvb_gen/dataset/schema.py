@@ -31,18 +31,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import zarr
 from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
+from dmcvb_gen.dataset.manifest import SCHEMA_VERSION, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, stored_pictures
-
-if TYPE_CHECKING:
-    from dmcvb_gen.dataset.manifest import SubsetRecord
-
-SCHEMA_VERSION = 2
-"""Version of the layout and the manifest; a reader refuses a newer one, and reads all older ones."""
 
 PIXEL_CHUNK_STEPS = 32
 """Steps an inner chunk of the pictures: the unit of reading (chosen with scripts/bench_store.py)."""

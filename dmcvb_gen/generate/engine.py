@@ -27,7 +27,8 @@ from dmcvb_gen.dataset.shards import damage
 from dmcvb_gen.dataset.writer import write_pictures, write_shard
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.jobs import Inputs, Job
+from dmcvb_gen.generate.inputs import Inputs
+from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, paint_labels, renderers
 from dmcvb_gen.generate.site import staging_folder_of
 from dmcvb_gen.parallel import Future, ProgressCallback, ignore

@@ -35,7 +35,8 @@ from dmcvb_gen.dataset.writer import add_arrays, finish_release, finish_together
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import copy_file, sha256_file, write_json
 from dmcvb_gen.generate.executors import run_arriving
-from dmcvb_gen.generate.jobs import Inputs, Job, Stored, background_source
+from dmcvb_gen.generate.inputs import Inputs, background_source
+from dmcvb_gen.generate.jobs import Job, Stored
 from dmcvb_gen.generate.plan import painting_facts, subset_attributes
 from dmcvb_gen.generate.recipe import check_size
 from dmcvb_gen.generate.regenerate import environment_diff

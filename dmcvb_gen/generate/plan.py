@@ -38,7 +38,8 @@ from dmcvb_gen.dataset.writer import create_subset, finish_release, finish_toget
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.files import copy_file, json_bytes, sha256_bytes, sha256_file, write_bytes
-from dmcvb_gen.generate.jobs import BUILTIN, Inputs, Job, left_to_do, make_jobs, part_of
+from dmcvb_gen.generate.inputs import BUILTIN, Inputs
+from dmcvb_gen.generate.jobs import Job, left_to_do, make_jobs, part_of
 from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.generate.render import check_renderer, renderer_for
 from dmcvb_gen.generate.site import CONNECTIONS, BucketSite, FolderSite, Site

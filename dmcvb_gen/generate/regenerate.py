@@ -46,7 +46,8 @@ from dmcvb_gen.files import (
     write_json,
 )
 from dmcvb_gen.generate.executors import run_jobs
-from dmcvb_gen.generate.jobs import make_jobs, release_inputs
+from dmcvb_gen.generate.inputs import release_inputs
+from dmcvb_gen.generate.jobs import make_jobs
 from dmcvb_gen.generate.plan import copy_inputs, create_groups
 from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore

@@ -22,16 +22,8 @@ from dmcvb_gen.dataset.writer import create_subset, finish_together, read_commit
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.executors import run_jobs
-from dmcvb_gen.generate.jobs import (
-    BUILTIN,
-    Inputs,
-    Stored,
-    make_jobs,
-    policy_files,
-    recipe_of,
-    stream_names,
-    video_source,
-)
+from dmcvb_gen.generate.inputs import BUILTIN, Inputs, policy_files, video_source
+from dmcvb_gen.generate.jobs import Stored, make_jobs, recipe_of, stream_names
 from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
 from dmcvb_gen.generate.recipe import Recipe, check_size, make_recipe
 from dmcvb_gen.generate.render import (

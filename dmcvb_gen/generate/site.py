@@ -41,7 +41,7 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.transfer import create_object, in_parallel, list_files, put_object, read_object, retry, upload
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.jobs import BUILTIN, Inputs, release_inputs
+from dmcvb_gen.generate.inputs import BUILTIN, Inputs, release_inputs
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.parallel.base import TIDY
 from dmcvb_gen.storage.remote import file_system, is_url, public, storage_errors

@@ -20,7 +20,8 @@ from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.generate.jobs import background_source, stream_names
+from dmcvb_gen.generate.inputs import background_source
+from dmcvb_gen.generate.jobs import stream_names
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer

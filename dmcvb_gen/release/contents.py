@@ -15,7 +15,7 @@ from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
-from dmcvb_gen.generate.jobs import video_source
+from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.release.import_tfds import imported_specs
 from dmcvb_gen.release.issue import Issue

@@ -21,7 +21,7 @@ from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.index import CARD_FOLDER
 from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.jobs import background_source
+from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
 
 TABLE = f"{CARD_FOLDER}/episodes.parquet"

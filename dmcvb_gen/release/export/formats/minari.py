@@ -125,7 +125,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
 
 def _own_videos(source: Source) -> str | None:
     """Where the release keeps its own videos; None if it shows the built-in ones or none."""
-    from dmcvb_gen.generate.jobs import BUILTIN
+    from dmcvb_gen.generate.inputs import BUILTIN
 
     videos = (source.subset.record.backgrounds or {}).get("source", BUILTIN)
     return None if videos == BUILTIN else videos

@@ -1,0 +1,111 @@
+"""The policies and videos that a subset is made from: found in the release or the package, checked by digest."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.errors import BackgroundError, DmcvbError, StoreError
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.policies.bundled import resolve_policies
+
+BUILTIN = "builtin"
+"""The videos that the package brings."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The files that a subset is made from, on this machine.
+
+    Attributes:
+      policies: files of the behaviour policies, in the record's order; none for uniform random actions.
+      backgrounds: "builtin", or the folder of the videos.
+    """
+
+    policies: tuple[str, ...] = ()
+    backgrounds: str = BUILTIN
+
+
+def release_inputs(root: Path, records: Iterable[SubsetRecord], backgrounds: str | None = None) -> dict[str, Inputs]:
+    """Policies and videos of a release's subsets, checked by digest.
+
+    Args:
+      root: the release's folder, which has copies of what the package does not bring.
+      backgrounds: where the videos are now, instead of where the manifest says.
+
+    Raises:
+      StoreError: a policy or the videos are not there, or not those of the manifest.
+    """
+    return {
+        record.name: Inputs(policy_files(root, record), background_source(root, record, backgrounds))
+        for record in records
+    }
+
+
+def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:
+    """Files of a subset's policies: the release's own copies, else the bundled ones, by digest.
+
+    Raises:
+      StoreError: neither is there.
+    """
+    found = []
+    for policy in record.policies:
+        candidates = [root / policy.path] if policy.path else []
+        with contextlib.suppress(DmcvbError):  # the release's own copy is enough
+            candidates += resolve_policies(record.task, record.level)
+        same = (str(path) for path in candidates if _digest(path) == policy.digest)
+        if (path := next(same, None)) is not None:
+            found.append(path)
+        else:
+            raise StoreError(
+                f"policy {policy.name} of {record.name} (digest {policy.digest[:12]}) is neither in the release nor "
+                f"bundled with this dmcvb-gen; put its file at {policy.path}"
+            )
+    return tuple(found)
+
+
+def _digest(path: Path) -> str | None:
+    """The digest of a policy file, None if it cannot be read."""
+    try:
+        return sha256_file(path)
+    except OSError:
+        return None
+
+
+def background_source(root: Path, record: SubsetRecord, moved: str | None = None) -> str:
+    """Where a subset's videos are, checked against the manifest's digest.
+
+    Args:
+      moved: where they are now, instead of where the manifest says.
+
+    Raises:
+      StoreError: they are other videos, or not there.
+    """
+    if record.backgrounds is None:
+        return BUILTIN
+    given = video_source(root, record, moved)
+    try:
+        digest = load_backgrounds(given, record.backgrounds["split"]).digest
+    except BackgroundError as error:
+        raise StoreError(f"the backgrounds of {record.name} cannot be used: {error}") from None
+    if digest != record.backgrounds["digest"]:
+        raise StoreError(
+            f"backgrounds {given!r} are not those that {record.name} was painted with; give --backgrounds FOLDER"
+        )
+    return given
+
+
+def video_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:
+    """Where a subset's videos are: "builtin" or a folder; nothing is opened.
+
+    Args:
+      root: the release's folder, which has copies of videos that the package does not bring.
+      moved: where they are now, instead of where the manifest says.
+    """
+    source = moved or (record.backgrounds or {}).get("source", BUILTIN)
+    inside = not (moved or source == BUILTIN or Path(source).is_absolute())  # absolute: in releases of version 1
+    return f"{root}/{source}" if inside else source
