@@ -20,8 +20,9 @@ from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictur
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.inputs import video_source
-from dmcvb_gen.generate.recipe import RendererChoice, check_size
+from dmcvb_gen.generate.recipe import RendererChoice
 from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import GoalMode, SubsetSpec, parse_setting
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task

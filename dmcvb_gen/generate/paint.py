@@ -38,11 +38,11 @@ from dmcvb_gen.generate.executors import run_arriving
 from dmcvb_gen.generate.inputs import Inputs, background_source
 from dmcvb_gen.generate.jobs import Job, Stored
 from dmcvb_gen.generate.plan import painting_facts, subset_attributes
-from dmcvb_gen.generate.recipe import check_size
 from dmcvb_gen.generate.regenerate import environment_diff
 from dmcvb_gen.generate.render import frame_count
 from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task

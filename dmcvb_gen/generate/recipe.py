@@ -25,7 +25,7 @@ import pydantic
 from dmcvb_gen.dataset.manifest import MAX_EPISODES, MAX_SHARDS
 from dmcvb_gen.errors import RecipeError, UnknownNameError
 from dmcvb_gen.files import read_yaml
-from dmcvb_gen.rendering.base import MAX_SIZE, MIN_SIZE
+from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import (
     ANT_MAZE,
     DISTRACTOR_KINDS,
@@ -200,12 +200,6 @@ def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequ
         deterministic=pattern.deterministic and level != "random",
         episodes_per_goal=per_goal,
     )
-
-
-def check_size(size: int) -> None:
-    """Raises RecipeError for a picture size that no renderer takes."""
-    if not MIN_SIZE <= size <= MAX_SIZE:
-        raise RecipeError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)")
 
 
 # -- a recipe made smaller or otherwise -----------------------------------------------------------

@@ -25,12 +25,13 @@ from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.inputs import BUILTIN, Inputs, policy_files, video_source
 from dmcvb_gen.generate.jobs import Stored, make_jobs, recipe_of, stream_names
 from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
-from dmcvb_gen.generate.recipe import Recipe, check_size, make_recipe
+from dmcvb_gen.generate.recipe import Recipe, make_recipe
 from dmcvb_gen.generate.render import (
     check_renderer,
 )
 from dmcvb_gen.generate.site import FolderSite
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import LABEL_TYPES, Distractor, is_maze, select
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task

@@ -22,9 +22,9 @@ from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import Distractor, DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.generate.recipe import check_size
 from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
     GOAL_PICTURES,

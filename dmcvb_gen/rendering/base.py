@@ -78,7 +78,9 @@ class Renderer(abc.ABC):
 def check_size(size: int) -> None:
     """Raises RenderingError for a size that no renderer takes."""
     if not MIN_SIZE <= size <= MAX_SIZE:
-        raise RenderingError(f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side")
+        raise RenderingError(
+            f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)"
+        )
 
 
 def check_frames(task: Task, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None) -> list[int]:
