@@ -20,7 +20,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
-from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.generate import estimate as estimating
 from dmcvb_gen.generate.estimate import estimate, measurements
@@ -234,8 +234,8 @@ def test_shipped_recipes_expand_to_what_the_paper_has():
 @pytest.mark.parametrize(
     "changes, error, words",
     [
-        ({"size": 0}, RecipeError, "8 to 1024"),
-        ({"size": 5000}, RecipeError, "8 to 1024"),
+        ({"size": 0}, RenderingError, "8 to 1024"),
+        ({"size": 5000}, RenderingError, "8 to 1024"),
         ({"seed": -1}, RecipeError, "seed"),
         ({"name": "a/b"}, RecipeError, "name"),
         ({"colour": "red"}, RecipeError, "colour"),
