@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +27,11 @@ from dmcvb_gen.rendering.native.records import (
     BOXED,
     CLIP,
     CONE,
+    CORD,
     EYE,
     GOAL,
+    GRIDDED,
+    HEADLIGHT,
     KIND,
     LAMP,
     LENGTH,
@@ -36,6 +40,7 @@ from dmcvb_gen.rendering.native.records import (
     MIRRORED,
     MIRRORED_AXIS,
     MIRRORED_PLACE,
+    MIRRORED_TURN,
     MOVING,
     NEAR,
     OPACITY,
@@ -45,13 +50,14 @@ from dmcvb_gen.rendering.native.records import (
     RGB,
     SIZE,
     SKY,
+    SPOT,
     STEP,
     TURN,
     VIEW,
     WIDTH,
     WINDOW,
 )
-from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
+from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE, SPHERE
 from dmcvb_gen.rendering.native.shading import aim, cover_body, cover_plane, shade_body, shade_plane, shade_sky
 from dmcvb_gen.rendering.native.visibility import (
     NOTHING,
@@ -59,6 +65,7 @@ from dmcvb_gen.rendering.native.visibility import (
     box_of_plane,
     draw_capsule,
     draw_plane,
+    draw_solid,
     draw_sphere,
     plane_functions,
 )
@@ -79,7 +86,7 @@ class Frames(NamedTuple):
     turn: np.ndarray  # (frame, geom, 3, 3), columns are the geom's axes
     eye: np.ndarray  # (frame, 3)
     axes: np.ndarray  # (frame, 3, 3), the camera's right, up, back as columns
-    lamp: np.ndarray  # (frame, 6), position and direction
+    lamp: np.ndarray  # (frame, lamp, 6), positions and directions
     rgb: np.ndarray  # (frame, material, 3)
     look: np.ndarray  # (frame,) row of the looks' records
     sky: np.ndarray  # (frame,) texture of the sky; -1: none
@@ -90,6 +97,7 @@ class Still(NamedTuple):
 
     looks: np.ndarray  # (look, geom, column) the first columns of `rec`
     constants: np.ndarray  # the first entries of `k`
+    lamps: np.ndarray  # (lamp, 12) their SPOT and CONE; one of zeros if there are none
     boxes: np.ndarray  # (box, 6) solid boxes behind walls, lowest and highest corner
     texels: np.ndarray  # see textures
     width: int  # of a row of the table of textures
@@ -175,6 +183,12 @@ def pose_geoms(rec, looks, center, turn, eye, axes, rgb, look, f):
                 rec[g, TURN + 3 * row + column] = turned(
                     axes, f, row, turn[f, g, 0, column], turn[f, g, 1, column], turn[f, g, 2, column]
                 )
+        if rec[g, CORD] > 0.0:
+            x, y, z = rec[g, TURN + 2], rec[g, TURN + 5], rec[g, TURN + 8]
+            rec[g, SIZE + 1] = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+            for row in range(3):
+                rec[g, TURN + 3 * row + 2] /= rec[g, SIZE + 1]
+        for row in range(3):
             rec[g, AXIS + row] = rec[g, TURN + 3 * row + 2]
         material = int(rec[g, MATERIAL])
         if material >= 0:
@@ -191,15 +205,27 @@ def face_planes(rec):
 
 
 @part
-def pose_camera(k, eye, axes, lamp, sky, f):
+def pose_camera(k, axes, sky, f):
     """Fill a frame's entries of k."""
     for row in range(3):
         for column in range(3):
             k[VIEW + 3 * row + column] = axes[f, row, column]
-        k[LAMP + row] = turned(axes, f, row, lamp[f, 0] - eye[f, 0], lamp[f, 1] - eye[f, 1], lamp[f, 2] - eye[f, 2])
-        k[LAMP + 3 + row] = turned(axes, f, row, lamp[f, 3], lamp[f, 4], lamp[f, 5])
     k[EYE], k[EYE + 1], k[EYE + 2] = 0.0, 0.0, -1.0
     k[SKY] = sky[f]
+
+
+@part
+def choose_lamp(k, constants, lamps, lamp, eye, axes, f, which):
+    """Fill the lamp's entries of k with one of the lamps; the headlight shines beside the first one alone."""
+    for i in range(9):
+        k[SPOT + i] = lamps[which, i]
+        k[HEADLIGHT + i] = constants[HEADLIGHT + i] if which == 0 else 0.0
+    for i in range(3):
+        k[CONE + i] = lamps[which, 9 + i]
+    x, y, z = lamp[f, which, 0] - eye[f, 0], lamp[f, which, 1] - eye[f, 1], lamp[f, which, 2] - eye[f, 2]
+    for row in range(3):
+        k[LAMP + row] = turned(axes, f, row, x, y, z)
+        k[LAMP + 3 + row] = turned(axes, f, row, lamp[f, which, 3], lamp[f, which, 4], lamp[f, which, 5])
 
 
 @leaf
@@ -219,6 +245,9 @@ def reflect(k, rec):
         for source, target, far in ((PLACE, MIRRORED_PLACE, away), (AXIS, MIRRORED_AXIS, 0.0)):
             x, y, z = mirrored(rec[g, source], rec[g, source + 1], rec[g, source + 2], nx, ny, nz, far)
             rec[g, target], rec[g, target + 1], rec[g, target + 2] = x, y, z
+        for c in range(3):
+            x, y, z = mirrored(rec[g, TURN + c], rec[g, TURN + 3 + c], rec[g, TURN + 6 + c], nx, ny, nz, 0.0)
+            rec[g, MIRRORED_TURN + c], rec[g, MIRRORED_TURN + 3 + c], rec[g, MIRRORED_TURN + 6 + c] = x, y, z
     for i, far in ((0, 0.0), (3, away), (6, 0.0)):
         x, y, z = mirrored(k[EYE + i], k[EYE + i + 1], k[EYE + i + 2], nx, ny, nz, far)
         k[MIRRORED + i], k[MIRRORED + i + 1], k[MIRRORED + i + 2] = x, y, z
@@ -261,8 +290,11 @@ def draw_body(inverse, number, rays, k, rec, g, place, axis):
     nearest, geom = 1.0 / k[NEAR], np.uint8(g)
     if rec[g, KIND] == CAPSULE:
         draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
-    else:
+    elif rec[g, KIND] == SPHERE:
         draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
+    else:
+        turn = i8(TURN if place == PLACE else MIRRORED_TURN)
+        draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)
 
 
 @part
@@ -451,7 +483,7 @@ def give_base(s, n, jobs, color, room, first):
 
 
 @stage
-def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, mirrored, veil):
+def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, mirrored, veil, further):
     """Lay geom g over the colors of its jobs.
 
     Args:
@@ -465,7 +497,7 @@ def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, m
         take_base(s, n, jobs, color, room, at)
         if rec[g, KIND] == PLANE:
             shade_plane(s, n, k, rec, texels, width, plane, g)
-            cover_plane(s, n, k, rec, g, veil)
+            cover_plane(s, n, k, rec, g, veil, further)
         else:
             shade_body(s, n, k, rec, texels, width, g, mirrored)
             cover_body(s, n, k, rec, g, k[REFLECTANCE] if mirrored else 1.0)
@@ -509,11 +541,12 @@ def take_heaven(jobs, color, room, pixels, first, total):
 
 
 @stage
-def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known):
+def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known, further):
     """Colors of all listed jobs: mirror images, what is in front, what that is seen through.
 
     Args:
       known: the sky is kept.
+      further: add the light of another lamp to the colors that they have.
     """
     geoms, room = rec.shape[0], room_for(pixels)
     for layer in range(3):
@@ -524,8 +557,10 @@ def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, kno
             if get(jobs, length_at(room, geoms, which, g)) > 0:
                 rest = (1.0 - rec[g, OPACITY]) * (1.0 - rec[g, OPACITY])  # MuJoCo draws what is transparent twice
                 veil = 1.0 - rest if layer == 2 else 1.0
-                shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, layer == 0, veil)
+                shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, layer == 0, veil, further)
         first, total = lists_at(room, geoms, 0, geoms), np.int64(get(jobs, length_at(room, geoms, 0, geoms)))
+        if further:
+            continue
         if layer == 1 and known:
             take_heaven(jobs, color, room, pixels, first, total)
         elif layer == 1:
@@ -560,16 +595,21 @@ def clip_to_some(k, rec, pixels, goal):
 @stage
 def paint(
     inverse, number, behind, behind_number, rays, s, k, rec, texels, width, plane, jobs, color,
-    which, inside, known, out,
+    constants, lamps, lamp, eye, axes, f, which, inside, known, out,
 ):  # fmt: skip
-    """Paint the CLIP of a frame into a picture (row, column, 3)."""
+    """Paint the CLIP of frame f into a picture (row, column, 3)."""
     pixels, bottom = rays.size // 9, int(k[CLIP + 3])
     veiled, room = veils(rec, inside), room_for(pixels)
     draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled)
     for row in range(int(k[CLIP + 2]), bottom, room // (4 * pixels)):
         past_row = min(row + room // (4 * pixels), bottom)
         count = list_jobs(number, behind_number, jobs, color, k, pixels, rec.shape[0], row, past_row)
-        shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known)
+        for at in range(len(lamps)):
+            if len(lamps) > 1:
+                light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, at)
+                if k[MIRROR] >= 0.0:
+                    reflect(k, rec)
+            shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known, at > 0)
         write_pixels(jobs, color, room, count, out)
 
 
@@ -605,30 +645,31 @@ def same_sky(axes, sky, f):
     return 0 < f < sky.size and sky[f] == sky[f - 1] and same(axes, f)
 
 
-@stage
-def light_frame(s, k, rec, plane):
-    """Make the lamp's light on the lit plane and its shadow map ready."""
+@part
+def light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, which):
+    """Make a lamp's light on the lit plane and its shadow map ready."""
+    choose_lamp(k, constants, lamps, lamp, eye, axes, f, which)
     for i in range(4):
         k[WINDOW + i] = 0.0
     if k[CONE] <= 0.0:
         return
     aim_shadows(k, rec)
     for g in range(rec.shape[0]):
-        if rec[g, KIND] == PLANE:
+        if rec[g, GRIDDED] > 0.0:
             light_vertices(s, k, rec, plane, g)
 
 
 @stage
-def pose(k, rec, looks, center, turn, eye, axes, lamp, rgb, look, sky, f, pixels):
+def pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels):
     """Everything of frame f into the camera's frame."""
     pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
-    pose_camera(k, eye, axes, lamp, sky, f)
+    pose_camera(k, axes, sky, f)
     clip(k, i8(0), pixels, i8(0), pixels)
 
 
 @stage
 def paint_frames(
-    looks, constants, boxes, texels, width, rays,
+    looks, constants, lamps, boxes, texels, width, rays,
     center, turn, eye, axes, lamp, rgb, look, sky,
     inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
     stays, shown, hidden,
@@ -644,9 +685,9 @@ def paint_frames(
     all_, both = ALL if len(shown) else NO_GOAL, len(shown) > 0 and len(hidden) > 0
     for f in range(look.size):
         out = shown[f] if len(shown) else hidden[f]
-        pose(k, rec, looks, center, turn, eye, axes, lamp, rgb, look, sky, f, pixels)
+        pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels)
         face_planes(rec)
-        light_frame(s, k, rec, plane)
+        light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, i8(0))
         inside = in_a_box(boxes, eye, f)
         known = known and same_sky(axes, sky, f)
         if not known and same_sky(axes, sky, f + 1):
@@ -683,13 +724,13 @@ def paint_frames(
                 continue
             paint(
                 inverse, number, behind, behind_number, rays, s, k, rec, texels, width, plane, jobs, color,
-                which, inside, known, picture,
+                constants, lamps, lamp, eye, axes, f, which, inside, known, picture,
             )  # fmt: skip
 
 
 @stage
 def label_frames(
-    looks, constants, boxes, texels, width, rays,
+    looks, constants, lamps, boxes, texels, width, rays,
     center, turn, eye, axes, lamp, rgb, look, sky,
     inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
     depth, geom,
@@ -698,7 +739,7 @@ def label_frames(
     set_constants(k, constants)
     pixels = rays.size // 9
     for f in range(look.size):
-        pose(k, rec, looks, center, turn, eye, axes, lamp, rgb, look, sky, f, pixels)
+        pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels)
         for g in range(rec.shape[0]):
             rec[g, OWN_OPACITY] = 1.0 / BACK_OF_PLANE
         face_planes(rec)
@@ -718,14 +759,14 @@ def painter(version: int):
 
     @njit(nogil=True, error_model="numpy", cache=True)
     def paint_them(
-        looks, constants, boxes, texels, width, rays,
+        looks, constants, lamps, boxes, texels, width, rays,
         center, turn, eye, axes, lamp, rgb, look, sky,
         inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
         stays, shown, hidden,
     ):  # fmt: skip
         if version != 0:
             paint_frames(
-                looks, constants, boxes, texels, width, rays,
+                looks, constants, lamps, boxes, texels, width, rays,
                 center, turn, eye, axes, lamp, rgb, look, sky,
                 inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
                 stays, shown, hidden,
@@ -739,14 +780,14 @@ def labeler(version: int):
 
     @njit(nogil=True, error_model="numpy", cache=True)
     def label_them(
-        looks, constants, boxes, texels, width, rays,
+        looks, constants, lamps, boxes, texels, width, rays,
         center, turn, eye, axes, lamp, rgb, look, sky,
         inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
         depth, geom,
     ):  # fmt: skip
         if version != 0:
             label_frames(
-                looks, constants, boxes, texels, width, rays,
+                looks, constants, lamps, boxes, texels, width, rays,
                 center, turn, eye, axes, lamp, rgb, look, sky,
                 inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
                 depth, geom,

@@ -43,6 +43,7 @@ from dmcvb_gen.rendering.native.lanes import (
 )
 from dmcvb_gen.rendering.native.records import (
     AXIS,
+    BALL,
     BOUNDS,
     CONE,
     EXPONENT,
@@ -63,8 +64,8 @@ from dmcvb_gen.rendering.native.records import (
     WINDOW,
 )
 from dmcvb_gen.rendering.native.sampling import fill
-from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE
-from dmcvb_gen.rendering.native.visibility import slopes_of_ball
+from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE, SPHERE
+from dmcvb_gen.rendering.native.visibility import half_length, own_origin, slopes_of_ball, through_solid
 
 f4, i4, i8 = np.float32, np.int32, np.int64
 DIM = 0.8
@@ -176,9 +177,9 @@ def aim_shadows(k, rec):
             depth = dx * x + dy * y + dz * z
             right = dx * k[SHADOW] + dy * k[SHADOW + 1] + dz * k[SHADOW + 2]
             up = dx * ux + dy * uy + dz * uz
-            low, high = slopes_of_ball(right, depth, rec[g, SIZE])
+            low, high = slopes_of_ball(right, depth, rec[g, BALL])
             least_x, most_x = min(least_x, low), max(most_x, high)
-            low, high = slopes_of_ball(up, depth, rec[g, SIZE])
+            low, high = slopes_of_ball(up, depth, rec[g, BALL])
             least_y, most_y = min(least_y, low), max(most_y, high)
         rec[g, BOUNDS], rec[g, BOUNDS + 1] = least_x, most_x
         rec[g, BOUNDS + 2], rec[g, BOUNDS + 3] = least_y, most_y
@@ -250,6 +251,25 @@ def cast_shadow(s, n, k, rec, g):
         put(s, LIGHT + i, f4(0) if blocked else get(s, LIGHT + i))
 
 
+@part
+def cast_solid_shadow(s, n, k, rec, g):
+    """As `cast_shadow`, of a cylinder, box or ellipsoid."""
+    distinct()
+    kind, x, y, z = int(rec[g, KIND]), k[LAMP], k[LAMP + 1], k[LAMP + 2]
+    ox, oy = f4(own_origin(rec, g, PLACE, TURN, 0, x, y, z)), f4(own_origin(rec, g, PLACE, TURN, 1, x, y, z))
+    oz = f4(own_origin(rec, g, PLACE, TURN, 2, x, y, z))
+    a, b, c = 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
+    ax, ay, az = f4(a * rec[g, TURN]), f4(a * rec[g, TURN + 3]), f4(a * rec[g, TURN + 6])
+    bx, by, bz = f4(b * rec[g, TURN + 1]), f4(b * rec[g, TURN + 4]), f4(b * rec[g, TURN + 7])
+    cx, cy, cz = f4(c * rec[g, TURN + 2]), f4(c * rec[g, TURN + 5]), f4(c * rec[g, TURN + 8])
+    for i in range(n):
+        x, y, z = get(s, WAY_X + i), get(s, WAY_Y + i), get(s, WAY_Z + i)
+        dx, dy, dz = ax * x + ay * y + az * z, bx * x + by * y + bz * z, cx * x + cy * y + cz * z
+        enter, leave, face = through_solid(kind, ox, oy, oz, dx, dy, dz)
+        blocked = (enter < leave) & (enter > f4(0)) & (enter < f4(0.9995)) & (abs(x) + abs(y) + abs(z) > f4(0))
+        put(s, LIGHT + i, f4(0) if blocked else get(s, LIGHT + i))
+
+
 @stage
 def cast_shadows(s, n, k, rec, itself):
     """Points in; LIGHT is 0 where a body other than `itself` is between them and the lamp."""
@@ -265,7 +285,10 @@ def cast_shadows(s, n, k, rec, itself):
             and GRAIN * rec[g, BOUNDS + 2] <= high + 2
             and GRAIN * rec[g, BOUNDS + 3] >= low - 2
         ):
-            cast_shadow(s, n, k, rec, g)
+            if rec[g, KIND] == SPHERE or rec[g, KIND] == CAPSULE:
+                cast_shadow(s, n, k, rec, g)
+            else:
+                cast_solid_shadow(s, n, k, rec, g)
 
 
 # -- the lit plane ---------------------------------------------------------------------------------
@@ -360,6 +383,20 @@ def raise_lights(s, n, k, exponent):
     if k[CONE] > 0.0:
         raise_row(s, n, i8(LAMP_SHINE), exponent)
         raise_row(s, n, i8(CONE_FACTOR), int(k[CONE + 1]))
+
+
+@part
+def lamp_everywhere(s, n, k, rec, g, exponent):
+    """`lamp_light` on plane g in; LAMP_RED and the others out, without a grid of vertices."""
+    raise_row(s, n, i8(LAMP_SHINE), exponent)
+    raise_row(s, n, i8(CONE_FACTOR), int(k[CONE + 1]))
+    share = f4(rec[g, SHARE])
+    for c in range(3):
+        own, at = f4(rec[g, RGB + c]), LAMP_RED + c * CHUNK
+        flat, matt, glow = own * f4(k[SPOT + c]), own * f4(k[SPOT + 3 + c]), share * f4(k[SPOT + 6 + c])
+        for i in range(n):
+            color = flat + matt * get(s, LAMP_DIFFUSE + i) + glow * get(s, LAMP_SHINE + i)
+            put(s, at + i, min(get(s, CONE_FACTOR + i) * color, f4(1)))
 
 
 @leaf

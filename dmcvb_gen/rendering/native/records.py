@@ -8,7 +8,7 @@ in them are in the camera's frame: x right, y up, looking along -z, the eye at t
 from __future__ import annotations
 
 # -- columns of `rec`: what a look says of a geom
-KIND = 0  # PLANE, SPHERE or CAPSULE
+KIND = 0  # of `scene`: PLANE, SPHERE, CAPSULE, ...
 SIZE = 1  # 3: half lengths, as MuJoCo's
 GOAL = 4  # 1 for the goal's geoms
 MOVING = 5  # 1 for geoms that can move
@@ -20,16 +20,20 @@ REPEAT = 10  # 2: texture coordinates for each meter
 SHARE = 12  # of specular light
 EXPONENT = 13  # of specular light, whole
 OWN_OPACITY = 14  # before it is changed by the side that is seen
+BALL = 15  # radius of the ball around a body, less half of a capsule's length
+GRIDDED = 16  # 1 for the plane that the lamps light at the vertices of a grid; they light all else in every pixel
+CORD = 17  # 1 for a tendon's piece: its third axis is as long as half of it in every frame
 # what a frame says of it
-RGB = 15  # 3
-PLACE = 18  # 3: center
-TURN = 21  # 9: axes are its columns
-AXIS = 30  # 3: its third axis
-MIRRORED_PLACE = 33  # 3
-MIRRORED_AXIS = 36  # 3
-FUNCTIONS = 39  # 9, of a plane: see visibility.draw_plane
-BOUNDS = 48  # 4, of a body: least and greatest slopes of its outline in the shadow map
-WIDTH = 52
+RGB = 18  # 3
+PLACE = 21  # 3: center
+TURN = 24  # 9: axes are its columns
+AXIS = 33  # 3: its third axis
+MIRRORED_PLACE = 36  # 3
+MIRRORED_AXIS = 39  # 3
+FUNCTIONS = 42  # 9, of a plane: see visibility.draw_plane
+BOUNDS = 51  # 4, of a body: least and greatest slopes of its outline in the shadow map
+MIRRORED_TURN = 55  # 9
+WIDTH = 64
 
 # -- entries of `k`: what a camera, a scene says
 STEP = 0  # of a ray's x and y from pixel to pixel
@@ -38,7 +42,7 @@ FAR = 2
 MIRROR = 3  # geom, -1: none
 REFLECTANCE = 4
 HEADLIGHT = 5  # 9: ambient, diffuse, specular RGB
-SPOT = 14  # 9: the lamp's
+SPOT = 14  # 9: of the lamp at work
 CONE = 23  # 3: cosine of the cut-off angle (0: no lamp), exponent, tangent of the shadow map's half angle
 LINES = 26  # 2: vertices of the lit plane along its axes
 GRID = 28  # lines in each row of the lit plane's grid

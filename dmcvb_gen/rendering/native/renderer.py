@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from importlib import metadata
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from dmcvb_gen.distractor_state import DistractorState
@@ -15,7 +16,16 @@ from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
 from dmcvb_gen.rendering.native import records as columns
 from dmcvb_gen.rendering.native.compiled import call
 from dmcvb_gen.rendering.native.frame import Frames, Still, labeler, make_work, painter
-from dmcvb_gen.rendering.native.scene import PLANE, Scene, look_of, scene_of
+from dmcvb_gen.rendering.native.scene import (
+    BOX,
+    CYLINDER,
+    ELLIPSOID,
+    PLANE,
+    SUN_DISTANCE,
+    Scene,
+    look_of,
+    scene_of,
+)
 from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
 from dmcvb_gen.rendering.native.visibility import sample_rays
 from dmcvb_gen.tasks.base import Task
@@ -55,11 +65,21 @@ class NativeRenderer(Renderer):
         self._textures.make_ready(self._scene.sky)
         self._looks: dict[int, int] = {}
         self._records = np.zeros((0, len(self._scene.geoms), columns.RGB + 3))
-        fields = ["geom_xpos", "geom_xmat"] + (["light_xpos", "light_xdir"] if self._scene.lamp >= 0 else [])
+        fields = ["geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "light_xpos", "light_xdir"]
+        needed = {
+            "geom": True,
+            "site": len(self._scene.sites) or len(self._scene.cords),
+            "ligh": len(self._scene.lamps),
+        }
+        fields = [name for name in fields if needed[name[:4]]]
         self._kinematics = Kinematics(task, fields)
         self._stays = (
-            self._scene.mirror < 0 and self._scene.lamp < 0 and not self._scene.moving[self._scene.kind == PLANE].any()
+            self._scene.mirror < 0
+            and not len(self._scene.lamps)
+            and not self._scene.moving[self._scene.kind == PLANE].any()
         )
+        sun = task.model.light_type[self._scene.lamps] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        self._far_away = np.where(sun, SUN_DISTANCE * task.model.stat.extent, 0.0)
         self._work = make_work(len(self._scene.geoms), size, self._scene.grid)
 
     def describe(self) -> dict[str, Any]:
@@ -144,12 +164,14 @@ class NativeRenderer(Renderer):
         scene, count = self._scene, len(exogenous)
         backgrounds = zip(exogenous.background_video.tolist(), exogenous.background_frame.tolist(), strict=True)
         sky = [self._textures.background(*key) if key[0] >= 0 else scene.sky for key in backgrounds]
-        lamp = np.zeros((count, 6))
-        if scene.lamp >= 0:
-            lamp[:, :3], lamp[:, 3:] = poses["light_xpos"][:, scene.lamp], poses["light_xdir"][:, scene.lamp]
+        lamp = np.zeros((count, len(scene.shine), 6))
+        if len(scene.lamps):
+            lamp[..., :3], lamp[..., 3:] = poses["light_xpos"][:, scene.lamps], poses["light_xdir"][:, scene.lamps]
+            lamp[..., :3] -= self._far_away[:, None] * lamp[..., 3:]
+        center, turn = _poses(scene, poses)
         return Frames(
-            center=np.ascontiguousarray(poses["geom_xpos"][:, scene.geoms]),
-            turn=np.ascontiguousarray(poses["geom_xmat"][:, scene.geoms].reshape(count, -1, 3, 3)),
+            center=center,
+            turn=turn,
             eye=np.ascontiguousarray(exogenous.camera_position[:, view], np.float64),
             axes=np.ascontiguousarray(matrices(exogenous.camera_quaternion[:, view].astype(np.float64))),
             lamp=lamp,
@@ -167,7 +189,9 @@ class NativeRenderer(Renderer):
             rec = np.zeros(self._records.shape[1:])
             rec[:, columns.KIND], rec[:, columns.SIZE : columns.SIZE + 3] = scene.kind, scene.size
             rec[:, columns.GOAL], rec[:, columns.BOXED] = scene.goal, _boxed(self.task, scene)
-            rec[:, columns.MOVING] = scene.moving
+            rec[:, columns.MOVING], rec[:, columns.BALL] = scene.moving, ball_radius(scene)
+            rec[:, columns.CORD] = np.arange(len(rec)) >= len(rec) - len(scene.cords)
+            rec[:, columns.GRIDDED] = np.arange(len(rec)) == scene.gridded
             rec[:, columns.MATERIAL], rec[:, columns.OWN_OPACITY] = look.material, look.color[:, 3]
             rec[:, columns.TEXTURE], rec[:, columns.REPEAT : columns.REPEAT + 2] = look.texture, look.repeat
             rec[:, columns.SHARE], rec[:, columns.EXPONENT] = look.shine.T
@@ -184,8 +208,7 @@ class NativeRenderer(Renderer):
             [
                 [step, scene.near, scene.far, scene.mirror, scene.reflectance],
                 scene.headlight,
-                scene.spot,
-                scene.cone,
+                scene.shine[0],
                 scene.lines,
                 [scene.grid.shape[1], scene.horizon],
             ]
@@ -193,6 +216,7 @@ class NativeRenderer(Renderer):
         return Still(
             looks=self._records,
             constants=constants,
+            lamps=scene.shine,
             boxes=scene.boxes,
             texels=self._textures.texels,
             width=self._textures.table.shape[1],
@@ -208,8 +232,35 @@ def _finest_level(size: int, angle: float) -> int:
     return max(int(math.floor(math.log2(rho) - 0.25)), 0) if rho > 1 else 0
 
 
+def _poses(scene: Scene, poses: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Centers (frame, geom, 3) and axes (frame, geom, 3, 3) of a scene's geoms, sites and pieces of tendons."""
+    geoms = scene.geoms[scene.geoms >= 0]
+    center = [poses["geom_xpos"][:, geoms]]
+    turn = [poses["geom_xmat"][:, geoms].reshape(len(center[0]), -1, 3, 3)]
+    if len(scene.sites):
+        center.append(poses["site_xpos"][:, scene.sites])
+        turn.append(poses["site_xmat"][:, scene.sites].reshape(len(center[0]), -1, 3, 3))
+    if len(scene.cords):
+        one, two = poses["site_xpos"][:, scene.cords[:, 0]], poses["site_xpos"][:, scene.cords[:, 1]]
+        center.append((one + two) / 2)
+        turn.append(np.zeros((*one.shape, 3)))
+        turn[-1][..., 2] = (two - one) / 2
+    return np.ascontiguousarray(np.concatenate(center, axis=1)), np.ascontiguousarray(np.concatenate(turn, axis=1))
+
+
+def ball_radius(scene: Scene) -> np.ndarray:
+    """(geom,) meters: of the ball around a body (around the end of a capsule)."""
+    size, kind = scene.size, scene.kind
+    reach = {
+        ELLIPSOID: size.max(axis=1),
+        CYLINDER: np.hypot(size[:, 0], size[:, 1]),
+        BOX: np.sqrt((size**2).sum(axis=1)),
+    }
+    return np.select([kind == each for each in reach], list(reach.values()), size[:, 0])
+
+
 def _boxed(task: Task, scene: Scene) -> np.ndarray:
     """(geom,) bool: planes that lie on a side of a box."""
-    place = task.model.geom_pos[scene.geoms][:, None]
+    place = np.where(scene.geoms[:, None] >= 0, task.model.geom_pos[scene.geoms], np.inf)[:, None]
     touching = (scene.boxes[None, :, :3] - 1e-6 <= place) & (place <= scene.boxes[None, :, 3:] + 1e-6)
     return (scene.kind == PLANE) & touching.all(axis=2).any(axis=1)

@@ -10,8 +10,12 @@ import numpy as np
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.tasks.base import Task
 
-PLANE, SPHERE, CAPSULE = 0, 2, 3
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 """MuJoCo's numbers of the kinds of geoms painted here."""
+_PAINTED = (PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
+_KIND_NAMES = {1: "height field", 7: "mesh", 8: "signed distance field"}
+SUN_DISTANCE = 25.0
+"""A directional light is a lamp so far away, times the model's extent."""
 OPAQUE = 0.995
 """OpenGL's border between opaque and blended, as MuJoCo draws it."""
 MAX_GEOMS = 250
@@ -28,7 +32,7 @@ _MAX_GRID = 200
 
 @dataclass(frozen=True)
 class Look:
-    """What the geoms of a scene are covered with, one visual look.
+    """What the geoms of a scene (and sites, and tendons) are covered with, one visual look.
 
     Attributes:
       material: (geom,) int64, the material that gives the geom's color; -1: its own color.
@@ -47,21 +51,26 @@ class Look:
 
 @dataclass(frozen=True)
 class Scene:
-    """What never changes from frame to frame, geoms in the model's order.
+    """What never changes from frame to frame: geoms in the model's order, then sites, then pieces of tendons.
 
     Attributes:
-      geoms: (geom,) int64, the model's geoms that can be seen.
-      kind: (geom,) int64, PLANE, SPHERE or CAPSULE.
+      geoms: (geom,) int64, the model's geoms that can be seen; -1 for sites and pieces of tendons.
+      sites: the model's sites that can be seen.
+      cords: (piece, 2) int64, the sites at the ends of the pieces of tendons.
+      kind: (geom,) int64, PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER or BOX.
+      material: (geom,) int64, of the model's own look; -1: none.
+      rgba: (geom, 4) float32, the model's own colors without materials.
       size: (geom, 3) float64, meters, half lengths as MuJoCo's.
       moving: (geom,) bool; the others never move.
       goal: (geom,) bool, left out of the hidden-goal pictures.
       mirror: the geom that mirrors (the first reflective plane), or -1.
       reflectance: of that plane.
       headlight: (9,) float64, ambient, diffuse and specular RGB; zeros when off.
-      spot: (9,) float64, the same of the one lamp; zeros without one.
-      lamp: index of the lamp in the model, -1 without one.
-      cone: (3,) float64, cosine of the lamp's cut-off angle, its exponent, tangent of the shadow map's half angle.
-      grid: (2, line) float64, coordinates in the lit plane's frame of the vertices that it is drawn with.
+      lamps: indices of the lamps in the model.
+      shine: (lamp, 12) float64, the same of each lamp, then the cosine of its cut-off angle, its exponent, and the
+        tangent of its shadow map's half angle; one row of zeros without a lamp.
+      gridded: the plane that is lit at its vertices (the largest one), or -1.
+      grid: (2, line) float64, coordinates in that plane's frame of the vertices that it is drawn with.
       lines: (2,) int64, how many there are along each axis.
       boxes: (box, 6) float64, lowest and highest corner of the solid boxes behind walls (not drawn themselves).
       sky: texture of the sky, or -1.
@@ -70,6 +79,10 @@ class Scene:
     """
 
     geoms: np.ndarray
+    sites: np.ndarray
+    cords: np.ndarray
+    material: np.ndarray
+    rgba: np.ndarray
     kind: np.ndarray
     size: np.ndarray
     moving: np.ndarray
@@ -77,9 +90,9 @@ class Scene:
     mirror: int
     reflectance: float
     headlight: np.ndarray
-    spot: np.ndarray
-    lamp: int
-    cone: np.ndarray
+    lamps: np.ndarray
+    shine: np.ndarray
+    gridded: int
     grid: np.ndarray
     lines: np.ndarray
     boxes: np.ndarray
@@ -96,31 +109,59 @@ def scene_of(task: Task) -> Scene:
       RenderingError: the model has what this painter does not paint.
     """
     model = task.picture_model
+    geoms, sites, cords = _shown(model.geom_group), _visible_sites(model), _cords(task, model)
+    tendons = np.array([tendon for tendon, _, _ in cords], np.int64)
+    material = np.concatenate([model.geom_matid[geoms], model.site_matid[sites], model.tendon_matid[tendons]])
+    rgba = np.concatenate([model.geom_rgba[geoms], model.site_rgba[sites], model.tendon_rgba[tendons]])
+    kind = np.concatenate([model.geom_type[geoms], model.site_type[sites], np.full(len(cords), CAPSULE)])
+    width = np.stack([model.tendon_width[tendons], np.ones(len(cords)), np.ones(len(cords))], axis=1)
+    size = np.concatenate([model.geom_size[geoms], model.site_size[sites], width]).astype(np.float64)
     alpha = np.where(
-        (model.geom_matid >= 0) & (model.geom_rgba == _OWN_COLOR).all(axis=1),
-        model.mat_rgba[model.geom_matid, 3] if model.nmat else 1.0,
-        model.geom_rgba[:, 3],
+        (material >= 0) & (rgba == _OWN_COLOR).all(axis=1), _of_materials(model.mat_rgba, material)[:, 3], 0
     )
-    geoms = np.flatnonzero((alpha > 0) & (model.geom_group < SHOWN_GROUPS))
-    kind = model.geom_type[geoms].astype(np.int64)
-    _refuse_what_is_not_painted(task, geoms, kind, alpha)
-    shiny = model.mat_reflectance[model.geom_matid[geoms]] * (model.geom_matid[geoms] >= 0) * (kind == PLANE)
+    alpha = np.where((material >= 0) & (rgba == _OWN_COLOR).all(axis=1), alpha, rgba[:, 3])
+    seen = np.flatnonzero(alpha > 0)
+    numbers = np.concatenate([geoms, np.full(len(sites) + len(cords), -1)])
+    moving = [
+        _moves(model, model.geom_bodyid[geoms]),
+        _moves(model, model.site_bodyid[sites]),
+        np.ones(len(cords), bool),
+    ]
+    ends = np.array([[one, two] for _, one, two in cords], np.int64).reshape(-1, 2)
+    geoms, kind, size, material, rgba = (
+        numbers[seen],
+        kind[seen].astype(np.int64),
+        size[seen],
+        material[seen],
+        rgba[seen],
+    )
+    first, second = len(numbers) - len(sites) - len(cords), len(numbers) - len(cords)
+    sites, ends = sites[seen[(seen >= first) & (seen < second)] - first], ends[seen[seen >= second] - second]
+    _refuse_what_is_not_painted(task, material, kind, size, alpha[seen])
+    shiny = _of_materials(model.mat_reflectance, material) * (kind == PLANE)
     mirror = int(np.flatnonzero(shiny)[0]) if shiny.any() else -1
-    lamp = int(np.flatnonzero(model.light_active)[0]) if np.any(model.light_active) else -1
-    grid, lines = _vertices(model, geoms[kind == PLANE]) if lamp >= 0 else (np.zeros((2, 2)), np.zeros(2, np.int64))
+    lamps = np.flatnonzero(model.light_active)
+    planes = np.flatnonzero(kind == PLANE)
+    gridded = int(planes[np.argmax(size[planes, 0] * size[planes, 1])]) if len(planes) and len(lamps) else -1
+    grid, lines = _vertices(size[gridded]) if gridded >= 0 else (np.zeros((2, 2)), np.zeros(2, np.int64))
+    shine = [np.concatenate([_light(model, lamp), _cone(model, lamp)]) for lamp in lamps]
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     return Scene(
         geoms=geoms,
+        sites=sites,
+        cords=ends,
+        material=material.astype(np.int64),
+        rgba=rgba,
         kind=kind,
-        size=np.array(model.geom_size[geoms], np.float64),
-        moving=(model.body_weldid[model.geom_bodyid[geoms]] != 0) | (model.body_mocapid[model.geom_bodyid[geoms]] >= 0),
+        size=size,
+        moving=np.concatenate(moving)[seen] | bool(task.model_entries),
         goal=np.isin(geoms, task.goal_geoms),
         mirror=mirror,
         reflectance=float(shiny[mirror]) if mirror >= 0 else 0.0,
         headlight=_headlight(model),
-        spot=_light(model, lamp),
-        lamp=lamp,
-        cone=_cone(model, lamp),
+        lamps=lamps,
+        shine=np.array(shine) if shine else np.zeros((1, 12)),
+        gridded=gridded,
         grid=grid,
         lines=lines,
         boxes=_boxes(model),
@@ -137,49 +178,109 @@ def look_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> Look:
     Args:
       floor_alpha: opacity of the planes whose material is their own (below 1: the floor is seen through).
     """
-    model, geoms = task.picture_model, scene.geoms
+    model, material = task.picture_model, scene.material.copy()
     chosen = task.style_geom_matid(style) if style >= 0 else None
-    material = np.array(model.geom_matid if chosen is None else chosen)[geoms].astype(np.int64)
-    own = (model.geom_rgba[geoms] != _OWN_COLOR).any(axis=1) | (material < 0)
-    color = np.where(own[:, None], model.geom_rgba[geoms], model.mat_rgba[material]).astype(np.float64)
-    color[(scene.kind == PLANE) & ~own & (floor_alpha < 1), 3] = floor_alpha
-    texture = np.where(material >= 0, model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB], -1)
-    uniform = model.mat_texuniform[material].astype(bool)[:, None]
-    shine = np.stack([model.mat_specular[material], np.rint(128.0 * model.mat_shininess[material])], axis=1)
+    if chosen is not None:
+        material[scene.geoms >= 0] = chosen[scene.geoms[scene.geoms >= 0]]
+    own = (scene.rgba != _OWN_COLOR).any(axis=1) | (material < 0)
+    color = np.where(own[:, None], scene.rgba, _of_materials(model.mat_rgba, material)).astype(np.float64)
+    textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    texture = np.where(material >= 0, textures, -1)
+    color[(scene.kind == PLANE) & ~own & (texture >= 0) & (floor_alpha < 1), 3] = floor_alpha
+    uniform = _of_materials(model.mat_texuniform, material).astype(bool)[:, None]
+    shininess = np.rint(128.0 * _of_materials(model.mat_shininess, material))
+    shine = np.stack([_of_materials(model.mat_specular, material), shininess], axis=1)
     shine[material < 0] = 0.5, 64.0  # MuJoCo's defaults of a geom without a material
     scale = np.where(uniform, 1.0, 1.0 / np.maximum(scene.size[:, :2], 1e-9))
     return Look(
         material=np.where(own, -1, material),
         color=color,
         texture=texture.astype(np.int32),
-        repeat=0.5 * model.mat_texrepeat[material] * scale,
+        repeat=0.5 * _of_materials(model.mat_texrepeat, material) * scale,
         shine=shine.astype(np.float64),
     )
 
 
-def _refuse_what_is_not_painted(task: Task, geoms: np.ndarray, kind: np.ndarray, alpha: np.ndarray) -> None:
+def _shown(groups: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(groups < SHOWN_GROUPS)
+
+
+def _visible_sites(model: mujoco.MjModel) -> np.ndarray:
+    """Sites that MuJoCo shows, but for balls that are wholly inside an opaque capsule or ball of their body."""
+    sites = _shown(model.site_group)
+    hidden = np.zeros(len(sites), bool)
+    for number, site in enumerate(sites.tolist()):
+        for geom in np.flatnonzero(model.geom_bodyid == model.site_bodyid[site]).tolist():
+            if model.geom_type[geom] not in (SPHERE, CAPSULE) or model.geom_group[geom] >= SHOWN_GROUPS:
+                continue
+            axis = np.zeros(3)
+            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), model.geom_quat[geom])
+            away = model.site_pos[site] - model.geom_pos[geom]
+            half = model.geom_size[geom, 1] if model.geom_type[geom] == CAPSULE else 0.0
+            away = away - np.clip(away @ axis, -half, half) * axis
+            hidden[number] |= np.linalg.norm(away) + model.site_size[site].max() < model.geom_size[geom, 0]
+    return sites[~hidden]
+
+
+def _moves(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    return (model.body_weldid[bodies] != 0) | (model.body_mocapid[bodies] >= 0)
+
+
+def _of_materials(values: np.ndarray, material: np.ndarray) -> np.ndarray:
+    """A field of the materials for each of `material`; zeros in a model that has none."""
+    return values[material] if len(values) else np.zeros((len(material), *values.shape[1:]), values.dtype)
+
+
+def _cords(task: Task, model: mujoco.MjModel) -> list[tuple[int, int, int]]:
+    """Pieces of the tendons that are drawn: tendon, and the sites at both ends.
+
+    Raises:
+      RenderingError: a tendon that is wrapped around a geom.
+    """
+    out = []
+    for tendon in _shown(model.tendon_group).tolist():
+        wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+        kinds = model.wrap_type[wraps]
+        if (kinds == mujoco.mjtWrap.mjWRAP_JOINT).any() or model.tendon_width[tendon] <= 0:
+            continue  # it has no place in space
+        if (kinds != mujoco.mjtWrap.mjWRAP_SITE).any():
+            raise _not_painted(task, "tendons wrapped around geoms")
+        sites = model.wrap_objid[wraps].tolist()
+        out += [(tendon, one, two) for one, two in zip(sites, sites[1:], strict=False)]
+    return out
+
+
+def _not_painted(task: Task, what: str) -> RenderingError:
+    return RenderingError(f"{task.id} has {what}, which 'native' does not paint; use --renderer opengl or warp")
+
+
+def _refuse_what_is_not_painted(
+    task: Task, material: np.ndarray, kind: np.ndarray, size: np.ndarray, alpha: np.ndarray
+) -> None:
     model = task.model
-    materials = np.unique(model.geom_matid[geoms])
-    materials = materials[materials >= 0]
+    materials = np.unique(material[material >= 0])
     lights = np.flatnonzero(model.light_active)
+    others = [_KIND_NAMES.get(number, "unknown") for number in np.unique(kind).tolist() if number not in _PAINTED]
+    textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    textured = (kind != PLANE) & (material >= 0) & (textures >= 0)
     faults = {
-        "geoms other than planes, spheres and capsules": not np.isin(kind, (PLANE, SPHERE, CAPSULE)).all(),
-        f"more than {MAX_GEOMS} geoms": len(geoms) > MAX_GEOMS,
-        "transparent bodies": bool((alpha[geoms][kind != PLANE] < 1).any()),
-        "infinite planes": bool((model.geom_size[geoms][kind == PLANE][:, :2] <= 0).any()),
+        f"geoms of type {', '.join(others)}": bool(others),
+        "a skin": model.nskin > 0,
+        "bodies with a texture that is no cube": bool((model.tex_type[textures[textured]] == 0).any()),
+        f"more than {MAX_GEOMS} geoms": len(kind) > MAX_GEOMS,
+        "transparent bodies": bool((alpha[kind != PLANE] < 1).any()),
+        "infinite planes": bool((size[kind == PLANE][:, :2] <= 0).any()),
         "luminous materials": bool(model.mat_emission[materials].any()),
-        "several lamps": len(lights) > 1,
-        "several planes under a lamp": len(lights) > 0 and int((kind == PLANE).sum()) > 1,
-        "a lamp that is no spot light with whole exponent and without attenuation": any(
-            model.light_type[i] != mujoco.mjtLightType.mjLIGHT_SPOT
-            or model.light_exponent[i] % 1
-            or not np.array_equal(model.light_attenuation[i], (1, 0, 0))
+        "a spot light without whole exponent or with attenuation": any(
+            model.light_type[i] == mujoco.mjtLightType.mjLIGHT_SPOT
+            and (model.light_exponent[i] % 1 or not np.array_equal(model.light_attenuation[i], (1, 0, 0)))
             for i in lights
         ),
+        "a lamp that is neither a spot light nor directional": bool((model.light_type[lights] > 1).any()),
     }
     for what, there in faults.items():
         if there:
-            raise RenderingError(f"{task.id} has {what}, which 'native' does not paint; use --renderer warp")
+            raise _not_painted(task, what)
 
 
 def _headlight(model: mujoco.MjModel) -> np.ndarray:
@@ -188,15 +289,14 @@ def _headlight(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _light(model: mujoco.MjModel, lamp: int) -> np.ndarray:
-    if lamp < 0:
-        return np.zeros(9)
     parts = model.light_ambient[lamp], model.light_diffuse[lamp], model.light_specular[lamp]
     return np.concatenate(parts).astype(np.float64)
 
 
 def _cone(model: mujoco.MjModel, lamp: int) -> np.ndarray:
-    if lamp < 0:
-        return np.zeros(3)
+    if model.light_type[lamp] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
+        edge = float(model.vis.map.shadowclip) / SUN_DISTANCE * bool(model.light_castshadow[lamp])
+        return np.array([1e-6, 0.0, edge])
     cutoff = float(model.light_cutoff[lamp])
     shadow = min(2 * cutoff * float(model.vis.map.shadowscale), 160.0) / 2
     casts = bool(model.light_castshadow[lamp])
@@ -204,11 +304,12 @@ def _cone(model: mujoco.MjModel, lamp: int) -> np.ndarray:
     return np.array([np.cos(angles[0]), float(model.light_exponent[lamp]), np.tan(angles[1]) * casts])
 
 
-def _vertices(model: mujoco.MjModel, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where MuJoCo puts the vertices of the lit plane: OpenGL computes light there and blends between them."""
-    if not len(planes):
-        return np.zeros((2, 2)), np.zeros(2, np.int64)
-    size = model.geom_size[planes[0]].astype(np.float64)
+def _vertices(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where MuJoCo puts the vertices of a plane: OpenGL computes light there and blends between them.
+
+    Args:
+      size: (3,) of the plane.
+    """
     axes = []
     for half in size[:2]:
         step = max(size[2], half / (_MAX_GRID - 2))

@@ -56,6 +56,7 @@ from dmcvb_gen.rendering.native.lanes import (
 from dmcvb_gen.rendering.native.lighting import (
     cast_shadows,
     head_light,
+    lamp_everywhere,
     lamp_light,
     lamp_on_plane,
     raise_lights,
@@ -68,12 +69,14 @@ from dmcvb_gen.rendering.native.records import (
     EYE,
     FIRST,
     FUNCTIONS,
+    GRIDDED,
     HEADLIGHT,
     KIND,
     LAMP,
     MIRRORED,
     MIRRORED_AXIS,
     MIRRORED_PLACE,
+    MIRRORED_TURN,
     OPACITY,
     PLACE,
     REPEAT,
@@ -88,7 +91,8 @@ from dmcvb_gen.rendering.native.records import (
     VIEW,
 )
 from dmcvb_gen.rendering.native.sampling import fill, sample_cube, sample_repeating
-from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE
+from dmcvb_gen.rendering.native.scene import CAPSULE, CYLINDER, OPAQUE, SPHERE
+from dmcvb_gen.rendering.native.visibility import half_length, own_origin, through_solid
 
 f4, i4, i8 = np.float32, np.int32, np.int64
 
@@ -167,17 +171,25 @@ def shade_plane(s, n, k, rec, texels, width, plane, g):
     exponent = int(rec[g, EXPONENT])
     head_light(s, n, k, i8(EYE), exponent)
     fill(s, n, i8(LIGHT), f4(0))
-    if k[CONE] > 0.0 and lamp_on_plane(s, n, k, rec, plane, g) and rec[g, OPACITY] >= OPAQUE:
-        cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
+    if k[CONE] > 0.0:
+        if rec[g, GRIDDED] > 0.0:
+            lit = lamp_on_plane(s, n, k, rec, plane, g)
+        else:
+            lamp_light(s, n, k, i8(LAMP), exponent)
+            lamp_everywhere(s, n, k, rec, g, exponent)
+            lit = True
+        if lit and rec[g, OPACITY] >= OPAQUE:
+            cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
     raise_row(s, n, i8(HEAD_SHINE), exponent)
 
 
 @part
-def cover_plane(s, n, k, rec, g, veil):
+def cover_plane(s, n, k, rec, g, veil, further):
     """Lay plane g over the base colors; with `veil` below 1 blended with them.
 
     Args:
       veil: how much of the base colors is hidden.
+      further: the first lamp has been laid over them already, and this is the light of another one.
     """
     distinct()
     share, hidden, one = f4(rec[g, SHARE]), f4(veil), f4(1)
@@ -197,7 +209,10 @@ def cover_plane(s, n, k, rec, g, veil):
         green = green * min(flat_g + matt_g * diffuse + spec_g * shine, one)
         blue = blue * min(flat_b + matt_b * diffuse + spec_b * shine, one)
         base_r, base_g, base_b = get(s, BASE_RED + i), get(s, BASE_GREEN + i), get(s, BASE_BLUE + i)
-        if veiled:
+        if veiled and further:
+            red, green, blue = base_r + lit_r * hidden, base_g + lit_g * hidden, base_b + lit_b * hidden
+            red, green, blue = min(red, one), min(green, one), min(blue, one)
+        elif veiled:
             red = base_r * (one - hidden) + min(red + lit_r, one) * hidden
             green = base_g * (one - hidden) + min(green + lit_g, one) * hidden
             blue = base_b * (one - hidden) + min(blue + lit_b, one) * hidden
@@ -260,6 +275,52 @@ def meet_body(s, n, rec, g, place, axis):
 
 
 @part
+def meet_solid(s, n, rec, g, place, turn):
+    """As `meet_body`, of a cylinder, box or ellipsoid.
+
+    Args:
+      place, turn: the columns of `rec` where its center and its axes are.
+    """
+    distinct()
+    kind = int(rec[g, KIND])
+    ox, oy = (
+        f4(own_origin(rec, g, place, turn, 0, 0.0, 0.0, 0.0)),
+        f4(own_origin(rec, g, place, turn, 1, 0.0, 0.0, 0.0)),
+    )
+    oz, deep = f4(own_origin(rec, g, place, turn, 2, 0.0, 0.0, 0.0)), f4(0) if kind == CYLINDER else f4(1)
+    a, b, c = 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
+    a1, a2, a3 = f4(rec[g, turn]), f4(rec[g, turn + 3]), f4(rec[g, turn + 6])
+    b1, b2, b3 = f4(rec[g, turn + 1]), f4(rec[g, turn + 4]), f4(rec[g, turn + 7])
+    c1, c2, c3 = f4(rec[g, turn + 2]), f4(rec[g, turn + 5]), f4(rec[g, turn + 8])
+    a, b, c, one = f4(a), f4(b), f4(c), f4(1)
+    for i in range(n):
+        x, y = get(s, RAY_X + i), get(s, RAY_Y + i)
+        dx, dy, dz = a * (a1 * x + a2 * y - a3), b * (b1 * x + b2 * y - b3), c * (c1 * x + c2 * y - c3)
+        enter, leave, face = through_solid(kind, ox, oy, oz, dx, dy, dz)
+        depth = max(min(enter, leave), f4(1e-6))
+        lx, ly, lz = a * (ox + dx * depth), b * (oy + dy * depth), deep * c * (oz + dz * depth)
+        lx = lx if face == 0 else ((-one if dx > f4(0) else one) if face == 1 else f4(0))
+        ly = ly if face == 0 else ((-one if dy > f4(0) else one) if face == 2 else f4(0))
+        lz = lz if face == 0 else ((-one if dz > f4(0) else one) if face == 3 else f4(0))
+        over = one / max(math.sqrt(lx * lx + ly * ly + lz * lz), f4(1e-12))
+        put(s, PX + i, depth * x)
+        put(s, PY + i, depth * y)
+        put(s, PZ + i, -depth)
+        put(s, NX + i, (a1 * lx + b1 * ly + c1 * lz) * over)
+        put(s, NY + i, (a2 * lx + b2 * ly + c2 * lz) * over)
+        put(s, NZ + i, (a3 * lx + b3 * ly + c3 * lz) * over)
+
+
+@part
+def meet(s, n, rec, g, mirrored):
+    """As `meet_body`, of any body or its mirror image."""
+    if rec[g, KIND] == SPHERE or rec[g, KIND] == CAPSULE:
+        meet_body(s, n, rec, g, i8(MIRRORED_PLACE if mirrored else PLACE), i8(MIRRORED_AXIS if mirrored else AXIS))
+    else:
+        meet_solid(s, n, rec, g, i8(MIRRORED_PLACE if mirrored else PLACE), i8(MIRRORED_TURN if mirrored else TURN))
+
+
+@part
 def turn_rays(s, n, source_x, source_y, dx, dy):
     """RAY_X and RAY_Y from two other rows, moved."""
     for i in range(n):
@@ -286,16 +347,16 @@ def cover_ball(s, n, k, rec, texels, width, g):
     """Rays in; color of the cube map around ball g out."""
     step = f4(k[STEP])
     turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), f4(0), f4(0))
-    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    meet(s, n, rec, g, False)
     own_directions(s, n, rec, g, i8(DX), i8(-1))
     turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), step, f4(0))
-    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    meet(s, n, rec, g, False)
     own_directions(s, n, rec, g, i8(RIGHT_X), i8(DX))
     turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), f4(0), step)
-    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    meet(s, n, rec, g, False)
     own_directions(s, n, rec, g, i8(UP_X), i8(DX))
     turn_rays(s, n, i8(X), i8(Y), f4(0), f4(0))
-    meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+    meet(s, n, rec, g, False)
     own_directions(s, n, rec, g, i8(DX), i8(-1))
     sample_cube(s, n, texels, width, int(rec[g, TEXTURE]))
 
@@ -311,9 +372,9 @@ def shade_body(s, n, k, rec, texels, width, g, mirrored):
         for c in range(3):
             fill(s, n, RED + c * CHUNK, f4(1))
     if mirrored:
-        meet_body(s, n, rec, g, i8(MIRRORED_PLACE), i8(MIRRORED_AXIS))
+        meet(s, n, rec, g, True)
     elif rec[g, TEXTURE] < 0.0:
-        meet_body(s, n, rec, g, i8(PLACE), i8(AXIS))
+        meet(s, n, rec, g, False)
     head_light(s, n, k, MIRRORED if mirrored else EYE, exponent)
     if k[CONE] > 0.0:
         lamp_light(s, n, k, MIRRORED + 3 if mirrored else LAMP, exponent)

@@ -11,8 +11,23 @@ import math
 
 import numpy as np
 
-from dmcvb_gen.rendering.native.lanes import distinct, get, part, put
-from dmcvb_gen.rendering.native.records import AXIS, CLIP, FAR, FUNCTIONS, HORIZON, NEAR, PLACE, SIZE, STEP, TURN, VIEW
+from dmcvb_gen.rendering.native.lanes import distinct, get, leaf, part, put
+from dmcvb_gen.rendering.native.records import (
+    AXIS,
+    BALL,
+    CLIP,
+    FAR,
+    FUNCTIONS,
+    HORIZON,
+    KIND,
+    NEAR,
+    PLACE,
+    SIZE,
+    STEP,
+    TURN,
+    VIEW,
+)
+from dmcvb_gen.rendering.native.scene import BOX, CYLINDER
 
 SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
 """Where the four samples lie in a pixel: to the right and down."""
@@ -65,7 +80,7 @@ def box_of_body(k, rec, g, place, axis, half, size):
       place, axis: the columns of `rec` where its center and its axis are.
     """
     left, right, low, high = 1e9, -1e9, 1e9, -1e9
-    radius, behind = rec[g, SIZE], True
+    radius, behind = rec[g, BALL], True
     for end in range(2):
         reach = half if end == 0 else -half
         x, y = rec[g, place] + reach * rec[g, axis], rec[g, place + 1] + reach * rec[g, axis + 1]
@@ -157,6 +172,94 @@ def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nea
             w = w_side if side else w_end
             hit = (side & (square > zero)) | ((not side) & (ball > zero) & (along > zero))
             seen = hit & (w > before) & (w < limit)
+            put(inverse, at + i, w if seen else before)
+            put(number, at + i, geom if seen else get(number, at + i))
+
+
+# -- cylinders, boxes, ellipsoids ------------------------------------------------------------------
+# In a solid's own frame, with each axis divided by its half length, these are a cylinder, a cube and a ball of size 1.
+
+
+@leaf
+def own_origin(rec, g, place, turn, axis, x, y, z):
+    """Coordinate `axis` of the camera-frame point (x, y, z) in a solid's own frame."""
+    at, over = turn + axis, 1.0 / half_length(rec, g, axis)
+    dx, dy, dz = x - rec[g, place], y - rec[g, place + 1], z - rec[g, place + 2]
+    return (rec[g, at] * dx + rec[g, at + 3] * dy + rec[g, at + 6] * dz) * over
+
+
+@leaf
+def half_length(rec, g, axis):
+    """Of a solid along one of its axes, meters; a cylinder's sizes are its radius and its half length."""
+    if rec[g, KIND] == CYLINDER:
+        return rec[g, SIZE + 1] if axis == 2 else rec[g, SIZE]
+    return rec[g, SIZE + axis]
+
+
+@leaf
+def slab(origin, direction):
+    """Where a line enters and leaves the slab from -1 to 1 of a coordinate."""
+    tiny = np.float32(1e-9)
+    over = np.float32(1) / (direction if abs(direction) > tiny else tiny)
+    one, two = (np.float32(-1) - origin) * over, (np.float32(1) - origin) * over
+    return min(one, two), max(one, two)
+
+
+@leaf
+def through_solid(kind, ox, oy, oz, dx, dy, dz):
+    """Where a line enters and leaves a solid: both distances over the length of d, and the face that it enters by.
+
+    Faces: 0 the round one, 1 to 3 the flat ones across the axes. A line that passes by leaves before it enters.
+    """
+    zero, far = np.float32(0), np.float32(1e9)
+    enter, leave, face = -far, far, np.int32(0)
+    if kind != BOX:
+        deep = zero if kind == CYLINDER else np.float32(1)
+        square = dx * dx + dy * dy + deep * dz * dz
+        along = ox * dx + oy * dy + deep * oz * dz
+        rest = along * along - square * (ox * ox + oy * oy + deep * oz * oz - np.float32(1))
+        over = np.float32(1) / max(square, np.float32(1e-12))
+        root = math.sqrt(max(rest, zero))
+        enter, leave = (-along - root) * over, (-along + root) * over
+        leave = leave if rest > zero else enter - np.float32(1e-6) * abs(enter)
+    if kind == BOX:
+        low, high = slab(ox, dx)
+        face, enter, leave = np.int32(1), low, high
+        low, high = slab(oy, dy)
+        face, enter, leave = (np.int32(2) if low > enter else face), max(enter, low), min(leave, high)
+    if kind == BOX or kind == CYLINDER:
+        low, high = slab(oz, dz)
+        face, enter, leave = (np.int32(3) if low > enter else face), max(enter, low), min(leave, high)
+    return enter, leave, face
+
+
+@part
+def draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom):
+    """Put a cylinder, box or ellipsoid into the buffers; see `draw_sphere`.
+
+    Args:
+      turn: the column of `rec` where its axes are.
+    """
+    distinct()
+    f4, kind = np.float32, int(rec[g, KIND])
+    ox, oy = (
+        f4(own_origin(rec, g, place, turn, 0, 0.0, 0.0, 0.0)),
+        f4(own_origin(rec, g, place, turn, 1, 0.0, 0.0, 0.0)),
+    )
+    oz = f4(own_origin(rec, g, place, turn, 2, 0.0, 0.0, 0.0))
+    a, b, c = 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
+    ax, ay, az = f4(a * rec[g, turn]), f4(a * rec[g, turn + 3]), f4(a * rec[g, turn + 6])
+    bx, by, bz = f4(b * rec[g, turn + 1]), f4(b * rec[g, turn + 4]), f4(b * rec[g, turn + 7])
+    cx, cy, cz = f4(c * rec[g, turn + 2]), f4(c * rec[g, turn + 5]), f4(c * rec[g, turn + 8])
+    limit, tiny, size = f4(nearest), f4(1e-6), rays.size // 9
+    for row in range(r0, r1):
+        top, at = rays[8 * size + row], 4 * size * row
+        for i in range(4 * c0, 4 * c1):
+            x, y, before = get(rays, i), top + get(rays, 4 * size + i), get(inverse, at + i)
+            dx, dy, dz = ax * x + ay * y - az, bx * x + by * y - bz, cx * x + cy * y - cz
+            enter, leave, face = through_solid(kind, ox, oy, oz, dx, dy, dz)
+            w = f4(1) / max(enter, tiny)
+            seen = (enter < leave) & (enter > tiny) & (w > before) & (w < limit)
             put(inverse, at + i, w if seen else before)
             put(number, at + i, geom if seen else get(number, at + i))
 
