@@ -118,7 +118,9 @@ class Work(NamedTuple):
     behind_number: np.ndarray
     rec: np.ndarray  # (geom, records.WIDTH)
     k: np.ndarray  # (records.LENGTH,)
-    plane: np.ndarray  # float32, the lit plane's grid (2, line), and the lamp's color at its vertices (x, y, 3)
+    plane: (
+        np.ndarray
+    )  # float32, the lit plane's grid (2, line), the lamp's color at its vertices (x, y, 3), all lights'
     s: np.ndarray  # see lanes
     jobs: np.ndarray  # int32, see above
     color: np.ndarray  # float32, (3, room) of each job, then the sky's (3, pixels^2)
@@ -135,7 +137,7 @@ def make_work(geoms: int, pixels: int, grid: np.ndarray) -> Work:
         behind_number=np.zeros(samples, np.uint8),
         rec=np.zeros((geoms, WIDTH)),
         k=np.zeros(LENGTH),
-        plane=np.concatenate([grid.ravel(), np.zeros(3 * grid.shape[1] ** 2)]).astype(np.float32),
+        plane=np.concatenate([grid.ravel(), np.zeros(6 * grid.shape[1] ** 2)]).astype(np.float32),
         s=np.zeros(ROWS * CHUNK, np.float32),
         jobs=np.empty(lists_at.py_func(room, geoms, 2, 0) + 2 * (geoms + 1), np.int32),  # taken as it is written
         color=np.zeros(3 * room + 3 * pixels * pixels, np.float32),
@@ -254,6 +256,15 @@ def reflect(k, rec):
 
 
 @part
+def swap_with_image(rec, g):
+    """Exchange plane g and its mirror image; gives whether what is at its place now faces the camera."""
+    for there, here, count in ((MIRRORED_PLACE, PLACE, 3), (MIRRORED_TURN, TURN, 9), (MIRRORED_AXIS, AXIS, 3)):
+        for i in range(count):
+            rec[g, there + i], rec[g, here + i] = rec[g, here + i], rec[g, there + i]
+    return plane_functions(rec, g)
+
+
+@part
 def in_a_box(boxes, eye, f):
     """Whether the eye is inside one of the solid boxes."""
     for b in range(boxes.shape[0]):
@@ -313,6 +324,18 @@ def draw_planes(inverse, number, rays, k, rec, opaque):
             c0, c1, r0, r1 = box_of_plane(k, rec, g, k[NEAR], rays.size // 9)
             if c0 < c1 and r0 < r1:
                 draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
+
+
+@part
+def draw_mirrored_planes(inverse, number, rays, k, rec):
+    """Draw the mirror images of the other planes, as far as their front is seen in the mirror."""
+    for g in range(rec.shape[0]):
+        if rec[g, KIND] == PLANE and g != int(k[MIRROR]):
+            if swap_with_image(rec, g):
+                c0, c1, r0, r1 = box_of_plane(k, rec, g, k[NEAR], rays.size // 9)
+                if c0 < c1 and r0 < r1:
+                    draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
+            swap_with_image(rec, g)
 
 
 @part
@@ -378,6 +401,7 @@ def draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled):
     elif k[MIRROR] >= 0.0:
         reflect(k, rec)
         draw_bodies(behind, behind_number, rays, k, rec, which, i8(MIRRORED_PLACE), i8(MIRRORED_AXIS))
+        draw_mirrored_planes(behind, behind_number, rays, k, rec)
         drop_hidden_images(inverse, number, behind, behind_number, k, pixels)
 
 
@@ -496,8 +520,13 @@ def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, m
         aim(s, n, jobs, room, at, pixels, k[STEP])
         take_base(s, n, jobs, color, room, at)
         if rec[g, KIND] == PLANE:
-            shade_plane(s, n, k, rec, texels, width, plane, g)
-            cover_plane(s, n, k, rec, g, veil, further)
+            if mirrored:
+                swap_with_image(rec, g)
+            tint = k[REFLECTANCE] if mirrored else 1.0
+            shade_plane(s, n, k, rec, texels, width, plane, g, mirrored, tint)
+            cover_plane(s, n, k, rec, g, veil, further, tint)
+            if mirrored:
+                swap_with_image(rec, g)
         else:
             shade_body(s, n, k, rec, texels, width, g, mirrored)
             cover_body(s, n, k, rec, g, k[REFLECTANCE] if mirrored else 1.0)
@@ -656,7 +685,7 @@ def light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, which):
     aim_shadows(k, rec)
     for g in range(rec.shape[0]):
         if rec[g, GRIDDED] > 0.0:
-            light_vertices(s, k, rec, plane, g)
+            light_vertices(s, k, rec, plane, g, len(lamps) > 1, which)
 
 
 @stage

@@ -329,7 +329,7 @@ def lit_window(k, rec, plane, g):
 
 
 @part
-def store_vertices(s, n, k, rec, plane, g, first, high, lines):
+def store_vertices(s, n, k, rec, plane, g, first, high, lines, several, which):
     """Light at some vertices of the lit plane in, the lamp's color there (red, green, blue of each) out.
 
     Args:
@@ -347,17 +347,27 @@ def store_vertices(s, n, k, rec, plane, g, first, high, lines):
             color = min(s[CONE_FACTOR + i] * color, 1.0)
             if together:
                 head = own * (k[HEADLIGHT + c] + k[HEADLIGHT + 3 + c] * s[HEAD + i])
-                color = min(color, 1.0 - min(head + k[HEADLIGHT + 6 + c] * share * s[HEAD_SHINE + i], 1.0))
+                head = min(head + k[HEADLIGHT + 6 + c] * share * s[HEAD_SHINE + i], 1.0)
+                if which > 0:
+                    head = plane[at + c + 3 * int(k[GRID]) * int(k[GRID])]
+                color = min(color, 1.0 - head)
+                if several:
+                    plane[at + c + 3 * int(k[GRID]) * int(k[GRID])] = head + color
             plane[at + c] = color
 
 
 @stage
-def light_vertices(s, k, rec, plane, g):
+def light_vertices(s, k, rec, plane, g, several, which):
     """Fill WINDOW, and the vertices in it, with the lamp's color on plane g.
 
-    An opaque plane is lit in two passes; on one that is seen through both lights are added before they are cut at 1.
+    An opaque plane is lit in two passes; on one that is seen through all lights are added before they are cut at 1.
+
+    Args:
+      several: there are several lamps, and this is number `which`; they are asked for in their order.
     """
     lit_window(k, rec, plane, g)
+    if several:
+        k[WINDOW], k[WINDOW + 1], k[WINDOW + 2], k[WINDOW + 3] = 0, k[LINES], 0, k[LINES + 1]
     high, exponent = int(k[WINDOW + 3] - k[WINDOW + 2]), int(rec[g, EXPONENT])
     total = int(k[WINDOW + 1] - k[WINDOW]) * high
     for first in range(0, total, CHUNK):
@@ -373,7 +383,7 @@ def light_vertices(s, k, rec, plane, g):
         head_light(s, n, k, i8(EYE), exponent)
         lamp_light(s, n, k, i8(LAMP), exponent)
         raise_lights(s, n, k, exponent)
-        store_vertices(s, n, k, rec, plane, g, first, high, int(k[LINES + 1]))
+        store_vertices(s, n, k, rec, plane, g, first, high, int(k[LINES + 1]), several, which)
 
 
 @part
@@ -386,13 +396,13 @@ def raise_lights(s, n, k, exponent):
 
 
 @part
-def lamp_everywhere(s, n, k, rec, g, exponent):
-    """`lamp_light` on plane g in; LAMP_RED and the others out, without a grid of vertices."""
+def lamp_everywhere(s, n, k, rec, g, exponent, tint):
+    """`lamp_light` on plane g in; LAMP_RED and the others out, without a grid of vertices. See `shading.cover_body`."""
     raise_row(s, n, i8(LAMP_SHINE), exponent)
     raise_row(s, n, i8(CONE_FACTOR), int(k[CONE + 1]))
     share = f4(rec[g, SHARE])
     for c in range(3):
-        own, at = f4(rec[g, RGB + c]), LAMP_RED + c * CHUNK
+        own, at = f4(tint * rec[g, RGB + c]), LAMP_RED + c * CHUNK
         flat, matt, glow = own * f4(k[SPOT + c]), own * f4(k[SPOT + 3 + c]), share * f4(k[SPOT + 6 + c])
         for i in range(n):
             color = flat + matt * get(s, LAMP_DIFFUSE + i) + glow * get(s, LAMP_SHINE + i)

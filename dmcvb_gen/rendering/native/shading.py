@@ -156,8 +156,8 @@ def meet_plane(s, n, rec, g, step, wide, high):
 
 
 @stage
-def shade_plane(s, n, k, rec, texels, width, plane, g):
-    """Rays in; texture, headlight and lamp (LAMP_RED and the others, LIGHT) on plane g out."""
+def shade_plane(s, n, k, rec, texels, width, plane, g, mirrored, tint):
+    """Rays in; texture, headlight and lamp (LAMP_RED and the others, LIGHT) on plane g, or on its mirror image, out."""
     texture = int(rec[g, TEXTURE])
     at = max(texture, 0) * width + FIRST
     meet_plane(s, n, rec, g, k[STEP], texels[at + 1], texels[at + 2])
@@ -169,31 +169,32 @@ def shade_plane(s, n, k, rec, texels, width, plane, g):
     for axis in range(3):
         fill(s, n, NX + axis * CHUNK, f4(rec[g, AXIS + axis]))
     exponent = int(rec[g, EXPONENT])
-    head_light(s, n, k, i8(EYE), exponent)
+    head_light(s, n, k, i8(MIRRORED if mirrored else EYE), exponent)
     fill(s, n, i8(LIGHT), f4(0))
     if k[CONE] > 0.0:
-        if rec[g, GRIDDED] > 0.0:
+        if rec[g, GRIDDED] > 0.0 and not mirrored:
             lit = lamp_on_plane(s, n, k, rec, plane, g)
         else:
-            lamp_light(s, n, k, i8(LAMP), exponent)
-            lamp_everywhere(s, n, k, rec, g, exponent)
-            lit = True
+            lamp_light(s, n, k, i8(MIRRORED + 3 if mirrored else LAMP), exponent)
+            lamp_everywhere(s, n, k, rec, g, exponent, tint)
+            lit = not mirrored
         if lit and rec[g, OPACITY] >= OPAQUE:
             cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
     raise_row(s, n, i8(HEAD_SHINE), exponent)
 
 
 @part
-def cover_plane(s, n, k, rec, g, veil, further):
+def cover_plane(s, n, k, rec, g, veil, further, tint):
     """Lay plane g over the base colors; with `veil` below 1 blended with them.
 
     Args:
       veil: how much of the base colors is hidden.
+      tint: dims its color, but no highlight.
       further: the first lamp has been laid over them already, and this is the light of another one.
     """
     distinct()
     share, hidden, one = f4(rec[g, SHARE]), f4(veil), f4(1)
-    own_r, own_g, own_b = f4(rec[g, RGB]), f4(rec[g, RGB + 1]), f4(rec[g, RGB + 2])
+    own_r, own_g, own_b = f4(tint * rec[g, RGB]), f4(tint * rec[g, RGB + 1]), f4(tint * rec[g, RGB + 2])
     at = HEADLIGHT
     flat_r, flat_g, flat_b = own_r * f4(k[at]), own_g * f4(k[at + 1]), own_b * f4(k[at + 2])
     matt_r, matt_g, matt_b = own_r * f4(k[at + 3]), own_g * f4(k[at + 4]), own_b * f4(k[at + 5])
