@@ -7,13 +7,12 @@ import pytest
 
 from dmcvb_gen.distractors import Distractor, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.rendering import available_renderers, make_renderer, warp
+from dmcvb_gen.rendering import available_renderers, default_renderer, make_renderer, warp
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 
 needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
-RENDERERS = ["native", "warp", pytest.param("opengl", marks=needs_opengl)]
 FRAMES = 12
 LARGEST_DIFFERENCE = {"none": 8.0, "static": 8.0, "dynamic": 8.0}
 """Mean absolute difference of the renderers in grey levels of 255: no mirror image on the floor in warp."""
@@ -43,20 +42,89 @@ def renderer_of(name, task, setting, size=64, **options):
     )
 
 
-@pytest.mark.parametrize("name", RENDERERS)
-@pytest.mark.parametrize("setting_name", ["none", "dynamic"])
-def test_a_frame_does_not_depend_on_the_frames_beside_it(name, setting_name):
-    task, setting, physics, labels = frames_of("humanoid-walk", setting_name)
-    renderer = renderer_of(name, task, setting, 32)
-    whole = renderer.render(physics, labels)
-    assert whole.shape == (FRAMES, 1, 32, 32, 3) and whole.dtype == np.uint8
-    order = np.random.default_rng(0).permutation(FRAMES)
-    np.testing.assert_array_equal(renderer.render(physics[order], labels[order]), whole[order])
-    np.testing.assert_array_equal(renderer.render(physics[5:6], labels[5:6]), whole[5:6])
-    renderer.close()
-    other = renderer_of(name, task, setting, 32)
-    np.testing.assert_array_equal(other.render(physics[:3], labels[:3]), whole[:3])
-    other.close()
+class RendererTests:
+    """What every renderer does. A renderer of your own passes it too: inherit, and set `name`."""
+
+    name: str
+
+    @pytest.mark.parametrize("setting_name", ["none", "dynamic"])
+    def test_a_frame_does_not_depend_on_the_frames_beside_it(self, setting_name):
+        task, setting, physics, labels = frames_of("humanoid-walk", setting_name)
+        renderer = renderer_of(self.name, task, setting, 32)
+        whole = renderer.render(physics, labels)
+        assert whole.shape == (FRAMES, 1, 32, 32, 3) and whole.dtype == np.uint8
+        order = np.random.default_rng(0).permutation(FRAMES)
+        np.testing.assert_array_equal(renderer.render(physics[order], labels[order]), whole[order])
+        np.testing.assert_array_equal(renderer.render(physics[5:6], labels[5:6]), whole[5:6])
+        renderer.close()
+        other = renderer_of(self.name, task, setting, 32)
+        np.testing.assert_array_equal(other.render(physics[:3], labels[:3]), whole[:3])
+        other.close()
+
+    def test_a_material_color_changes_its_pixels(self):
+        task, setting, physics, labels = frames_of("walker-walk", "none", 2)
+        renderer = renderer_of(self.name, task, setting)
+        before = renderer.render(physics, labels).astype(int)
+        labels.material_rgb[:, task.model.material("self").id] = (0.0, 1.0, 0.0)
+        after = renderer.render(physics, labels).astype(int)
+        changed = np.abs(after - before).sum(-1) > 30
+        greener = (after - before)[changed][:, 1] - (after - before)[changed][:, 0]
+        assert 0.01 < changed.mean() < 0.4 and (greener > 0).mean() > 0.9
+        renderer.close()
+
+    def test_a_background_changes_the_sky_alone_under_an_opaque_floor(self):
+        task, setting, physics, labels = frames_of("walker-walk", "static", 4)
+        renderer = renderer_of(self.name, task, setting)
+        segmentation = renderer.render_labels(physics, labels)["segmentation"]
+        first = renderer.render(physics, labels).astype(int)
+        labels.background_video[:] = (labels.background_video + 1) % 8
+        second = renderer.render(physics, labels).astype(int)
+        changed = np.abs(second - first).sum(-1) > 0
+        inside = ~_near(segmentation == -1)  # pixels away from the sky's edge, which samples may touch
+        assert changed[segmentation == -1].mean() > 0.9
+        reflections = 0.02 if self.name == "opengl" else 0.0
+        assert changed[inside].mean() <= reflections
+        renderer.close()
+
+    def test_the_background_shows_through_humanoids_floor(self):
+        task, setting, physics, labels = frames_of("humanoid-walk", "static", 2)
+        renderer = renderer_of(self.name, task, setting)
+        segmentation = renderer.render_labels(physics, labels)["segmentation"]
+        floor = task.model.geom("floor").id
+        first = renderer.render(physics, labels).astype(int)
+        labels.background_video[:] = (labels.background_video + 1) % 8
+        second = renderer.render(physics, labels).astype(int)
+        assert (np.abs(second - first).sum(-1) > 0)[segmentation == floor].mean() > 0.8
+        renderer.close()
+
+    def test_labels_leave_a_hidden_goal_out_as_its_pictures_do(self):
+        task, setting, physics, labels = frames_of("ant-maze-empty7x7", "none", 2)
+        renderer = renderer_of(self.name, task, setting)
+        shown, hidden = (renderer.render_labels(physics, labels, hide_goal=hide) for hide in (False, True))
+        renderer.close()
+        goal = np.isin(shown["segmentation"], task.goal_geoms)
+        assert goal.any() and not np.isin(hidden["segmentation"], task.goal_geoms).any()
+        for label in ("segmentation", "depth"):  # but for OpenGL's edges
+            assert (shown[label][~goal] == hidden[label][~goal]).mean() > 0.999
+        assert (hidden["depth"][goal] > shown["depth"][goal] - 1e-3).mean() > 0.9  # what lies behind it
+
+    @pytest.mark.parametrize("size", [0, 7, 5000])
+    def test_sizes_out_of_range_are_refused(self, size):
+        with pytest.raises(RenderingError, match="8 to 1024"):
+            make_renderer(self.name, get_task("walker-walk"), size)
+
+
+class TestNative(RendererTests):
+    name = "native"
+
+
+class TestWarp(RendererTests):
+    name = "warp"
+
+
+@needs_opengl
+class TestOpengl(RendererTests):
+    name = "opengl"
 
 
 def test_a_frame_does_not_depend_on_the_size_of_its_launch(monkeypatch):
@@ -73,35 +141,6 @@ def test_a_frame_does_not_depend_on_the_size_of_its_launch(monkeypatch):
     renderer.close()
 
 
-@pytest.mark.parametrize("name", RENDERERS)
-def test_a_material_color_changes_its_pixels(name):
-    task, setting, physics, labels = frames_of("walker-walk", "none", 2)
-    renderer = renderer_of(name, task, setting)
-    before = renderer.render(physics, labels).astype(int)
-    labels.material_rgb[:, task.model.material("self").id] = (0.0, 1.0, 0.0)
-    after = renderer.render(physics, labels).astype(int)
-    changed = np.abs(after - before).sum(-1) > 30
-    greener = (after - before)[changed][:, 1] - (after - before)[changed][:, 0]
-    assert 0.01 < changed.mean() < 0.4 and (greener > 0).mean() > 0.9
-    renderer.close()
-
-
-@pytest.mark.parametrize("name", RENDERERS)
-def test_a_background_changes_the_sky_alone_under_an_opaque_floor(name):
-    task, setting, physics, labels = frames_of("walker-walk", "static", 4)
-    renderer = renderer_of(name, task, setting)
-    segmentation = renderer.render_labels(physics, labels)["segmentation"]
-    first = renderer.render(physics, labels).astype(int)
-    labels.background_video[:] = (labels.background_video + 1) % 8
-    second = renderer.render(physics, labels).astype(int)
-    changed = np.abs(second - first).sum(-1) > 0
-    inside = ~_near(segmentation == -1)  # pixels away from the sky's edge, which samples may touch
-    assert changed[segmentation == -1].mean() > 0.9
-    reflections = 0.02 if name == "opengl" else 0.0
-    assert changed[inside].mean() <= reflections
-    renderer.close()
-
-
 def _near(mask):
     """The mask grown by one pixel."""
     out = mask.copy()
@@ -110,19 +149,6 @@ def _near(mask):
             out |= np.roll(mask, shift, axis)
             mask = out.copy()
     return out
-
-
-@pytest.mark.parametrize("name", RENDERERS)
-def test_the_background_shows_through_humanoids_floor(name):
-    task, setting, physics, labels = frames_of("humanoid-walk", "static", 2)
-    renderer = renderer_of(name, task, setting)
-    segmentation = renderer.render_labels(physics, labels)["segmentation"]
-    floor = task.model.geom("floor").id
-    first = renderer.render(physics, labels).astype(int)
-    labels.background_video[:] = (labels.background_video + 1) % 8
-    second = renderer.render(physics, labels).astype(int)
-    assert (np.abs(second - first).sum(-1) > 0)[segmentation == floor].mean() > 0.8
-    renderer.close()
 
 
 @needs_opengl
@@ -143,19 +169,6 @@ def test_depth_and_segmentation_of_the_renderers_agree(task_id, other):
     both = same & (found[other]["segmentation"] > 0) & (found["opengl"]["depth"] > 0)  # 0 is the floor
     ratio = found[other]["depth"][both] / found["opengl"]["depth"][both]
     assert len(ratio) > 20 and np.median(np.abs(ratio - 1)) < 0.02
-
-
-@pytest.mark.parametrize("name", RENDERERS)
-def test_labels_leave_a_hidden_goal_out_as_its_pictures_do(name):
-    task, setting, physics, labels = frames_of("ant-maze-empty7x7", "none", 2)
-    renderer = renderer_of(name, task, setting)
-    shown, hidden = (renderer.render_labels(physics, labels, hide_goal=hide) for hide in (False, True))
-    renderer.close()
-    goal = np.isin(shown["segmentation"], task.goal_geoms)
-    assert goal.any() and not np.isin(hidden["segmentation"], task.goal_geoms).any()
-    for label in ("segmentation", "depth"):  # but for OpenGL's edges
-        assert (shown[label][~goal] == hidden[label][~goal]).mean() > 0.999
-    assert (hidden["depth"][goal] > shown["depth"][goal] - 1e-3).mean() > 0.9  # what lies behind it
 
 
 @needs_opengl
@@ -196,13 +209,6 @@ def test_warp_stays_close_to_opengl(task_id, setting_name):
     assert difference < shuffled  # the bound would mean nothing if any frame met it
 
 
-@pytest.mark.parametrize("size", [0, 7, 5000])
-@pytest.mark.parametrize("name", RENDERERS)
-def test_sizes_out_of_range_are_refused(name, size):
-    with pytest.raises(RenderingError, match="8 to 1024"):
-        make_renderer(name, get_task("walker-walk"), size)
-
-
 def test_unknown_renderers_and_devices_name_the_cure():
     with pytest.raises(UnknownNameError, match="warp"):
         make_renderer("vulkan", get_task("walker-walk"), 64)
@@ -211,6 +217,12 @@ def test_unknown_renderers_and_devices_name_the_cure():
             make_renderer(name, get_task("walker-walk"), 64, device="cuda:7")
 
 
-def test_available_renderers_say_why_not():
+def test_every_renderer_has_its_contract_and_says_why_it_cannot_start():
+    assert {tests.name for tests in RendererTests.__subclasses__()} == set(available_renderers())
     found = available_renderers()
     assert found["warp"] is None and (found["opengl"] is None or "libegl1" in found["opengl"])
+
+
+def test_what_native_does_not_paint_is_painted_by_another_renderer():
+    assert default_renderer(get_task("quadruped-walk")) == "native"
+    assert default_renderer(get_task("lqr-lqr_2_1")) == ("warp" if unavailable() else "opengl")

@@ -117,6 +117,8 @@ def rollout(
     executor = make_executor(workers, options["executor"], options["ray_address"])
     by_warp = device != "cpu" and not options["recipe"] and not is_given(context, "renderer")
     options["renderer"] = "warp" if by_warp else options["renderer"]
+    if device == "cpu" and options["tasks"] and not options["recipe"] and not is_given(context, "renderer"):
+        options["renderer"] = _default_renderer(options["tasks"])
     chosen = _recipe(context, options, going_on=bool(out))
     if options["slurm_script"]:
         if chosen:
@@ -312,6 +314,17 @@ def _recipe_from_options(tasks, options, given):
         split=options["split"],
         **_translated(options),
     )
+
+
+def _default_renderer(tasks: tuple[str, ...]) -> str:
+    """The renderer of tasks that are rolled out together: the first one that is not native, if any."""
+    from dmcvb_gen.rendering import default_renderer
+    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.own import allow
+
+    allow(tasks)  # a person typed these names, so their code may run
+    chosen = [default_renderer(get_task(task)) for task in tasks]
+    return next((name for name in chosen if name != "native"), "native")
 
 
 def _layout_task(layout: str) -> str:

@@ -1,15 +1,49 @@
-"""Rendering: `make_renderer("native", task, 64)` gives a renderer; physics states and labels become pictures."""
+"""Rendering: `make_renderer("native", task, 64)` gives a renderer; physics states and labels become pictures.
+
+A renderer is a module or package beside this file with a subclass of `Renderer` as `RENDERER`; its file name is the
+renderer's name. Other packages add theirs under the entry point group `dmcvb_gen.renderers` (name = class).
+"""
 
 from __future__ import annotations
 
+import functools
+import importlib
+import logging
+import pkgutil
 from collections.abc import Callable
+from importlib import metadata
 
-from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.extras import installed
+from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks.base import Task
 
-RENDERERS = ("native", "warp", "opengl")
+ENTRY_POINTS = "dmcvb_gen.renderers"
+_log = logging.getLogger(__name__)
+
+
+def _loader(module: str) -> Callable[[], type[Renderer]]:
+    return lambda: importlib.import_module(f"{__name__}.{module}").RENDERER
+
+
+@functools.cache
+def _table() -> dict[str, Callable[[], type[Renderer]]]:
+    """Renderer -> what gives its class; nothing is imported before it is asked for."""
+    own = {found.name: _loader(found.name) for found in pkgutil.iter_modules(__path__) if found.name != "base"}
+    return {point.name: point.load for point in metadata.entry_points(group=ENTRY_POINTS)} | own
+
+
+RENDERERS = tuple(_table())
+
+
+def renderer_class(name: str) -> type[Renderer]:
+    """The class of a renderer.
+
+    Raises:
+      UnknownNameError: no renderer has that name.
+    """
+    if name not in _table():
+        raise UnknownNameError("renderer", name, RENDERERS)
+    return _table()[name]()
 
 
 def make_renderer(
@@ -34,35 +68,34 @@ def make_renderer(
     Raises:
       UnknownNameError, RenderingError: no such renderer, or it cannot start here.
     """
-    chosen: Callable[..., Renderer]
-    if name == "native":
-        from dmcvb_gen.rendering.native import NativeRenderer
-
-        chosen = NativeRenderer
-    elif name == "warp":
-        from dmcvb_gen.rendering.warp import WarpRenderer
-
-        chosen = WarpRenderer
-    elif name == "opengl":
-        from dmcvb_gen.rendering.opengl import OpenglRenderer
-
-        chosen = OpenglRenderer
-    else:
-        raise UnknownNameError("renderer", name, RENDERERS)
+    chosen = renderer_class(name)
     return chosen(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha, device=device, samples=samples)
 
 
 def available_renderers() -> dict[str, str | None]:
     """Renderer -> None if it can start here, else why not and what to do."""
-    from dmcvb_gen.rendering import opengl
+    return {name: renderer_class(name).unavailable() for name in RENDERERS}
 
-    warp = None if installed("mujoco_warp") else "mujoco-warp is not installed: pip install mujoco-warp==3.17.0"
-    return {"native": None, "warp": warp, "opengl": opengl.unavailable()}
+
+def default_renderer(task: Task) -> str:
+    """The renderer that paints a task on a CPU unless another one is asked for.
+
+    It is native if that paints the task, else opengl (or warp, if OpenGL cannot start here).
+    """
+    try:
+        renderer_class("native").check_task(task)
+    except RenderingError as error:
+        other = "warp" if renderer_class("opengl").unavailable() else "opengl"
+        _log.warning("%s is painted by %s: %s", task.id, other, error)
+        return other
+    return "native"
 
 
 __all__ = [
     "RENDERERS",
     "Renderer",
     "available_renderers",
+    "default_renderer",
     "make_renderer",
+    "renderer_class",
 ]

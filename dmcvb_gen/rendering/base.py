@@ -30,6 +30,16 @@ class Renderer(abc.ABC):
     _backgrounds: Any = None
     """The videos that labels may name."""
 
+    @classmethod
+    def unavailable(cls) -> str | None:
+        """Why this renderer cannot start on this machine and what to do, or None."""
+        return None
+
+    @classmethod
+    def check_task(cls, task: Task) -> None:
+        """Raises RenderingError if this renderer does not paint a task; most paint every one."""
+        return
+
     @abc.abstractmethod
     def render(
         self,

@@ -55,6 +55,10 @@ class OpenglRenderer(Renderer):
 
     name = "opengl"
 
+    @classmethod
+    def unavailable(cls):
+        return unavailable()
+
     def __init__(
         self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
     ):
@@ -219,6 +223,9 @@ class OpenglRenderer(Renderer):
             self._context.free()
             self._gl.free()
             self._gl = None
+
+
+RENDERER = OpenglRenderer
 
 
 @contextlib.contextmanager

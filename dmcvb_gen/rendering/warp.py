@@ -21,6 +21,7 @@ from PIL import Image
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.extras import installed
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
@@ -79,6 +80,11 @@ class WarpRenderer(Renderer):
     """See the module and `Renderer`."""
 
     name = "warp"
+
+    @classmethod
+    def unavailable(cls):
+        return None if installed("mujoco_warp") else "mujoco-warp is not installed: pip install mujoco-warp==3.17.0"
+
     worlds = WORLDS
     """Frames a launch; may be lowered before the first picture, where few frames are painted at a time."""
 
@@ -371,3 +377,6 @@ class WarpRenderer(Renderer):
         self._skies.clear()
         self._data.clear()
         self._model = self._held = None
+
+
+RENDERER = WarpRenderer

@@ -1,20 +1,38 @@
-"""The painter of our own: a tracer in numba for exactly our scenes; physics states and labels in, pictures out.
+"""The painter of our own: a tracer in numba for dm_control's scenes; physics states and labels become pictures.
 
 It follows MuJoCo's OpenGL pipeline term by term, as a CPU runs it: four visibility samples a pixel, one shading
 a pixel and surface, light computed at the floor's vertices, textures from the same mip levels.
 
+A map for who comes after. One frame goes through these kernels (`frame.paint_frames`):
+
+    pose_geoms, choose_lamp    records of geoms and lamps, in the camera's frame          frame.py, records.py
+    light_frame                the lamp's light at the floor's vertices, its shadow map   lighting.py
+    draw                       the nearest geom of each of four samples a pixel:          visibility.py
+                               draw_sphere, draw_capsule, draw_solid (cylinder, box,
+                               ellipsoid), draw_plane; mirror images and what is seen
+                               through a plane go to a second buffer
+    list_jobs                  a job is a surface in a pixel, with its number of samples  frame.py
+    shade_jobs                 colors of all jobs, geom by geom, once for each lamp:      shading.py
+                               meet_body, meet_solid, meet_plane (points and normals),
+                               head_light, lamp_light, cast_shadow, cast_solid_shadow,    lighting.py
+                               sample_repeating, sample_cube, shade_sky                   sampling.py
+    write_pixels               jobs weighed by their samples                              frame.py
+
+Around them:
+
+    scene.py       a task's model -> geoms, sites and tendons that can be seen, lamps, materials by look
+    textures.py    pictures -> mip levels in one buffer; skies.py: the same of a video's frames
     lanes.py       how loops touch memory so that they become vector code
-    scene.py       a task's model -> arrays of what can be seen, lights, materials by look
-    textures.py    pictures -> mip levels in one buffer
-    skies.py       a video's frames -> mip levels of skies
-    sampling.py    texture coordinates -> colors
-    visibility.py  geoms in the camera's frame -> the nearest of each sample
-    lighting.py    points and normals -> light, shadows
-    frame.py       one frame from its poses
-    compiled.py    entry points, compiled once a machine
+    compiled.py    entry points, compiled once a machine (about a minute)
     renderer.py    the `Renderer`: batches, caches, hidden goals
+
+A new kind of convex geom needs `visibility.through_solid` (where a ray enters and leaves it) and `half_length`, a
+radius in `renderer.ball_radius`, and its number in `scene`. Meshes, skins, height fields and transparent bodies are
+missing.
 """
 
 from dmcvb_gen.rendering.native.renderer import NativeRenderer
 
-__all__ = ["NativeRenderer"]
+RENDERER = NativeRenderer
+
+__all__ = ["RENDERER", "NativeRenderer"]

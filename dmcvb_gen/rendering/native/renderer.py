@@ -47,6 +47,10 @@ class NativeRenderer(Renderer):
 
     name = "native"
 
+    @classmethod
+    def check_task(cls, task):
+        scene_of(task)
+
     def __init__(
         self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
     ):
