@@ -6,6 +6,10 @@ import difflib
 from collections.abc import Iterable
 
 
+MOST_LISTED = 24
+"""Names that a message lists at most; of more, it lists the nearest."""
+
+
 def _made_again(kind: type[Exception], *arguments: object) -> Exception:
     """An error from its class and arguments, without its constructor."""
     return kind.__new__(kind, *arguments)
@@ -22,7 +26,11 @@ class UnknownNameError(DmcvbError, KeyError):
         known = sorted(map(str, known))
         near = difflib.get_close_matches(str(name), known, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
-        super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(known)}.")
+        listed, rest = known, ""
+        if len(known) > MOST_LISTED:
+            listed = difflib.get_close_matches(str(name), known, n=MOST_LISTED // 3, cutoff=0.3)
+            rest = f" and {len(known) - len(listed)} more"
+        super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(listed)}{rest}.")
 
     def __str__(self) -> str:  # KeyError would print the repr
         return str(self.args[0])

@@ -256,8 +256,9 @@ def test_inactive_simulations_stay_and_earn_nothing():
 
 
 def test_an_unknown_task_lists_the_known_ones_and_the_nearest():
-    with pytest.raises(UnknownNameError, match="Did you mean 'walker-walk'.*cheetah-run"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'walker-walk'.*walker-run.* and .* more") as caught:
         get_task("walker-wakl")
+    assert len(str(caught.value)) < 300
 
 
 @given(

@@ -512,6 +512,7 @@ def list_command(remote, options, as_json):
             ", ".join(task["behaviours"]) or "-",
         )
     console.print(table)
+    console.print(f"tasks of dm_control's suite: {', '.join(facts['suite_tasks'])}")
     console.print(f"levels: {', '.join(facts['levels'])}")
     console.print(f"distractors: {', '.join(facts['distractors'])} (difficulty {', '.join(facts['difficulties'])})")
     console.print(f"maze goals: {', '.join(facts['maze_settings'])}")

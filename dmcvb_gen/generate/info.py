@@ -64,7 +64,7 @@ def describe_package() -> dict[str, Any]:
     from dmcvb_gen.generate.recipe import shipped_recipes
     from dmcvb_gen.policies.bundled import bundled_levels
     from dmcvb_gen.rendering import available_renderers
-    from dmcvb_gen.tasks import get_task, task_ids
+    from dmcvb_gen.tasks import get_task, suite_ids, task_ids
 
     tasks = []
     for task_id in task_ids():
@@ -82,6 +82,7 @@ def describe_package() -> dict[str, Any]:
     return dict(
         version=__version__,
         tasks=tasks,
+        suite_tasks=list(suite_ids()),
         levels=list(LEVELS),
         distractors=list(DISTRACTOR_KINDS),
         difficulties=list(DIFFICULTIES),

@@ -86,8 +86,6 @@ class Task(abc.ABC):
     unstored_fields: tuple[str, ...] = ()
     """Fields of the state that a physics state alone does not give."""
 
-    batched: bool = True
-    """Whether rewards and observations are computed for all episodes at once; else dm_control's task runs for each."""
     floor_alpha: float = 0.3
     """Opacity of the ground plane under distractors (Distracting Control Suite)."""
     model_entries: Mapping[str, np.ndarray] = {}

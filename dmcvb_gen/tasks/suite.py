@@ -11,6 +11,7 @@ import copy
 import functools
 import importlib
 import importlib.util
+import logging
 import math
 import re
 import warnings
@@ -25,6 +26,7 @@ from mujoco.batch import MODEL_FIELDS
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
 
+_log = logging.getLogger(__name__)
 DEFAULT_STEPS = 500
 """Agent steps an episode if dm_control gives no time limit."""
 PROBES = 6
@@ -79,9 +81,8 @@ class SuiteTask(Task):
       DmcvbError: the environment is none of dm_control's, or its observations or model cannot be stored.
     """
 
-    batched = False
-
     def __init__(self, id: str, make: Callable[[], Any], domain: str = ""):
+        _log.info("%s: dm_control computes rewards and observations episode by episode, which takes longer", id)
         self.id = id
         self.floor_alpha = {"walker": 1.0, "cheetah": 1.0, "reacher": 0.0}.get(domain, 0.3)
         try:
