@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-
 MOST_LISTED = 24
 """Names that a message lists at most; of more, it lists the nearest."""
 
