@@ -30,5 +30,5 @@ def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
     assert strip.shape[0] == LABEL_HEIGHT + rows * (LABEL_HEIGHT + 32)
     for row in range(rows):
         label = strip[LABEL_HEIGHT + row * (LABEL_HEIGHT + 32) :][:LABEL_HEIGHT]
-        assert set(np.unique(label)) == {0, 255}  # black on white
+        assert label.min() < 60 and (label == 255).mean() > 0.8, row  # dark text on white
     assert episode_strip(walker, 0, columns=20, scale=2).shape[0] == LABEL_HEIGHT + 32

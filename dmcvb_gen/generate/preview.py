@@ -136,9 +136,9 @@ def video_frames(
     Args:
       scale: enlargement of the images; by default the smallest with `VIDEO_SIDE` pixels on the shorter side.
     """
-    if scale is None:
-        height, width = _grid([_subset_frames(subset, 1, 1, episode) for subset in subsets]).shape[1:3]
-        scale = -(-VIDEO_SIDE // min(height, width))
+    if scale is None:  # labels do not grow with the images, so two sizes say how the sides grow
+        one, two = (np.array(_grid([_subset_frames(s, n, 1, episode) for s in subsets]).shape[1:3]) for n in (1, 2))
+        scale = max(1, int(np.ceil((VIDEO_SIDE - (2 * one - two)) / (two - one)).max()))
     return _grid([_subset_frames(subset, scale, frames, episode) for subset in subsets])
 
 
