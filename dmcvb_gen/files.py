@@ -1,13 +1,15 @@
 """Files that are whole or not there: bytes, text or JSON in, a file put in place at once, flushed to the disk.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
-disturb each other. The name says whose it is (machine and process), so what a killed writer left can be told from what
-a living one is at.
+disturb each other. The name says who makes it (machine, process namespace and process), so that files of a killed
+process can be told from those of a running one. Containers have process namespaces of their own: their files are left
+alone, even if they share the machine's name.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -64,8 +66,14 @@ def _owner() -> str:
     return f"{_machine()}@{os.getpid()}"
 
 
+@functools.cache
 def _machine() -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()) or "unknown"
+    """Where a process id means a process: the machine's name, its last start and the process namespace."""
+    name = re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()) or "unknown"
+    facts = ""
+    with contextlib.suppress(OSError):  # of Linux alone
+        facts = Path("/proc/sys/kernel/random/boot_id").read_text() + os.readlink("/proc/self/ns/pid")
+    return f"{name}-{sha256_bytes(facts.encode())[:8]}"
 
 
 def _umask() -> int:
@@ -174,14 +182,14 @@ def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
 
 
 def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = True) -> None:
-    """Delete what killed processes of this machine left in the making in a folder.
+    """Delete what killed processes of this machine left in the making in a folder; files of others stay.
 
     Args:
       foreign: delete also what does not say whose it is (other libraries' partial files), for folders where no writer
         can be at work.
       below: look in the folders below, too.
     """
-    for path in list(Path(folder).glob(f"**/*{PARTIAL}" if below else f"*{PARTIAL}")):
+    for path in _partial_files(Path(folder), below):
         owner = _OWNED.fullmatch(path.name)
         if not (owner[1] == _machine() and not _alive(int(owner[2])) if owner else foreign):
             continue
@@ -189,6 +197,17 @@ def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = T
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
+
+
+def _partial_files(folder: Path, below: bool) -> list[Path]:
+    """Files and folders in the making; what is inside such a folder belongs to its owner and is not listed."""
+    if not below:
+        return list(folder.glob(f"*{PARTIAL}"))
+    found = []
+    for parent, folders, names in os.walk(folder):
+        found += [Path(parent, name) for name in (*folders, *names) if name.endswith(PARTIAL)]
+        folders[:] = [name for name in folders if not name.endswith(PARTIAL)]
+    return found
 
 
 def _alive(process: int) -> bool:

@@ -16,12 +16,14 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import open_release, writer
+from dmcvb_gen.dataset.manifest import local_manifest
+from dmcvb_gen.dataset.writer import finish_release, start_release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.jobs import left_to_do, part_of
-from dmcvb_gen.generate.plan import finish, make_plan, prepare
+from dmcvb_gen.generate.plan import describe, finish, make_plan, prepare
 from dmcvb_gen.generate.progress import progress_of
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.generate.site import FolderSite, UploadQueue, site_of, staging_folder_of
@@ -170,6 +172,50 @@ def test_a_release_grows_in_a_bucket_as_in_a_folder(tmp_path):
     assert open_release(f"file://{tmp_path}/bucket").manifest == grown
     with pytest.raises(StoreError, match="seed 2, asked for 4"):
         prepare(make_plan(quick_recipe(seed=4), bucket))
+
+
+def test_finishing_a_bucket_keeps_what_another_machine_adds_meanwhile(tmp_path, monkeypatch):
+    walker, maze = (pattern | {"episodes": 1, "levels": "random"} for pattern in (WALKER, MAZE))
+    bucket = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    plan, others = prepare(make_plan(quick_recipe(walker), bucket)), []
+    list(run_jobs(plan.jobs))
+
+    def grown_meanwhile(*arguments):
+        if not others:
+            others.append(prepare(make_plan(quick_recipe(walker, maze), bucket)))
+        return finish_release(*arguments)
+
+    monkeypatch.setattr("dmcvb_gen.generate.plan.finish_release", grown_meanwhile)
+    assert len(finish(plan).subsets) == 3
+    list(run_jobs(others[0].jobs))
+    done = finish(others[0])
+    assert done.complete and open_release(f"file://{tmp_path}/bucket").manifest == done
+
+
+def test_two_who_begin_in_one_new_folder_both_stay(tmp_path, monkeypatch):
+    walker, maze = (pattern | {"episodes": 1, "levels": "random"} for pattern in (WALKER, MAZE))
+    first, second = (describe(quick_recipe(pattern))[0] for pattern in (walker, maze))
+    other, write = threading.Thread(target=start_release, args=(tmp_path / "r", second)), writer.write_json_atomically
+
+    def write_beside_another(path, value):
+        if value.subsets == first.subsets:
+            other.start()
+            other.join(1)  # long enough to be done, if nothing held it
+        write(path, value)
+
+    monkeypatch.setattr(writer, "write_json_atomically", write_beside_another)
+    start_release(tmp_path / "r", first)
+    other.join()
+    names = {record.name for record in local_manifest(tmp_path / "r").subsets}
+    assert names == {record.name for record in (*first.subsets, *second.subsets)}
+
+
+@pytest.mark.parametrize("place,words", [("s3:/bucket/x", "is a URL"), ("memory://x", "lost when this process ends")])
+def test_places_that_would_go_astray_are_refused(place, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StoreError, match=words):
+        site_of(place, scratch=tmp_path)
+    assert not (tmp_path / "s3:").exists()
 
 
 def test_growing_in_a_bucket_is_refused_where_something_is_damaged_and_goes_on_where_it_was_stopped(

@@ -61,16 +61,26 @@ def test_files_have_the_rights_of_any_new_file(tmp_path):
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
 
 
+def test_the_inside_of_a_living_staging_folder_is_left_alone(tmp_path):
+    with files.folder_in_the_making(tmp_path, "shards") as staging:
+        (staging / "c").mkdir()
+        (staging / "c" / "0.abc.partial").write_text("half")  # zarr's own name for a chunk that it writes
+        files.remove_partial(tmp_path, foreign=True)
+        assert (staging / "c" / "0.abc.partial").exists()
+
+
 def test_what_killed_writers_left_is_removed(tmp_path):
     files.write_text(tmp_path / "sub/kept", "")
+    owner = files._machine()
     killed = subprocess.Popen([sys.executable, "-c", ""])
     killed.wait()
-    (tmp_path / "sub" / f".kept.{socket.gethostname()}@{killed.pid}.x8.partial").write_text("half")
-    living = tmp_path / "sub" / f".kept.{socket.gethostname()}@{os.getpid()}.x8.partial"
+    (tmp_path / "sub" / f".kept.{owner}@{killed.pid}.x8.partial").write_text("half")
+    container = tmp_path / "sub" / f".kept.{socket.gethostname()}@{killed.pid}.x8.partial"  # a process elsewhere
+    living = tmp_path / "sub" / f".kept.{owner}@{os.getpid()}.x8.partial"
     nobodys = tmp_path / "sub" / ".kept.x8.partial"
-    for path in (living, nobodys):
+    for path in (living, nobodys, container):
         path.write_text("half")
     files.remove_partial(tmp_path)
-    assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, nobodys.name, "kept"])
+    assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, nobodys.name, container.name, "kept"])
     files.remove_partial(tmp_path, foreign=True)
-    assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, "kept"])
+    assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, container.name, "kept"])

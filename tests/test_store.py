@@ -263,6 +263,20 @@ def test_no_text_makes_a_manifest_crash(text):
         parse_commit(text)
 
 
+def test_a_chunk_larger_than_a_shard_is_refused_before_it_is_decoded(small_release, tmp_path):
+    name = next(iter(open_release(small_release).subsets))
+    shutil.copytree(small_release, tmp_path / "r")
+    for path in (tmp_path / "r" / f"{name}.zarr").rglob("zarr.json"):
+        node = json.loads(path.read_bytes())
+        metadata = (node.get("consolidated_metadata") or {}).get("metadata", {})
+        for array in [metadata.get("length"), node if path.parent.name == "length" else None]:
+            if array:
+                array["chunk_grid"]["configuration"]["chunk_shape"] = [10**9]
+        path.write_text(json.dumps(node))
+    with pytest.raises(StoreError, match="length of .* in chunks of .1000000000"):
+        open_release(tmp_path / "r")[name].read("length")
+
+
 def test_a_newer_schema_is_refused_with_the_cure(small_release):
     data = json.loads((small_release / "manifest.json").read_text())
     data["schema_version"] += 1

@@ -185,11 +185,17 @@ class Subset:
         rows = array.shape[1] if array.ndim > 1 else 1
         episodes = array.shape[0] if array.ndim else 0
         many = episodes > max(10 * record.episodes, MANY_EPISODES)
-        if not episodes or many or entry > largest or rows > record.max_steps + 1:
+        if not episodes or many or entry > largest or rows > record.max_steps + 1 or not self._chunks_fit(array):
             raise StoreError(
-                f"{name} of {self.name} is {array.dtype} {array.shape}, which does not fit {record.episodes} episodes "
-                f"of {record.max_steps} steps; regenerate or fetch the release again"
+                f"{name} of {self.name} is {array.dtype} {array.shape} in chunks of {array.chunks}, which does not fit "
+                f"{record.episodes} episodes of {record.max_steps} steps; regenerate or fetch the release again"
             )
+
+    def _chunks_fit(self, array: zarr.Array) -> bool:
+        """Whether no chunk is larger than a shard of the subset: a chunk is decoded whole, whatever is read of it."""
+        limits = (max(self.record.episodes_per_shard, 1), *(2 * size for size in array.shape[1:2]), *array.shape[2:])
+        shapes = (array.chunks, array.shards or array.chunks)
+        return all(size <= limit for shape in shapes for size, limit in zip(shape, limits, strict=True))
 
     @property
     def pixel_arrays(self) -> tuple[str, ...]:

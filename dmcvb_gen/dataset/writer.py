@@ -78,8 +78,10 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
     """
     path = root / MANIFEST
     with storage_errors(root, "write to"), contextlib.ExitStack() as stack:
+        _refuse_other_content(root)
+        root.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(write_lock(root, wait=LOCK_SECONDS))  # of two who begin at once, the second takes up
         if path.exists():
-            stack.enter_context(write_lock(root, wait=LOCK_SECONDS))
             there = local_manifest(root)
             old = merged(there, manifest, str(root))
             refuse_altered_folder(root, there)
@@ -89,18 +91,35 @@ def start_release(root: Path, manifest: Manifest) -> Manifest:
                     environments = (*environments, environment)
             manifest = old.model_copy(update={"environments": environments, "digest": None})
             (root / INDEX).unlink(missing_ok=True)  # written again when the release is finished
-        elif root.exists() and any(path.name != LOCK and not path.name.endswith(PARTIAL) for path in root.iterdir()):
-            raise StoreError(f"{root} is not empty and holds no release; choose an empty or new folder for --out")
-        root.mkdir(parents=True, exist_ok=True)
         _clear(root)
         write_json_atomically(path, manifest)
     return manifest
 
 
-def _clear(root: Path) -> None:
-    """Delete what killed processes left in the making, where files are few; a shard's are deleted as it is written."""
+def _refuse_other_content(root: Path) -> None:
+    """Raises StoreError if a folder holds something, but no release."""
+    if not root.exists() or (root / MANIFEST).exists():
+        return
+    if any(path.name != LOCK and not path.name.endswith(PARTIAL) for path in root.iterdir()):
+        if not (root / MANIFEST).exists():  # another process may have begun it meanwhile
+            raise StoreError(f"{root} is not empty and holds no release; choose an empty or new folder for --out")
+
+
+def _clear(root: Path, manifest: Manifest | None = None, foreign: bool = False) -> None:
+    """Delete what killed processes left in the making: at the top, in small folders and beside arrays' metadata.
+
+    The folders of chunks have far more files and are not searched: shards are made in staging folders.
+
+    Args:
+      manifest: names the subsets whose metadata folders are searched, too.
+      foreign: see `remove_partial`.
+    """
     remove_partial(root, below=False)
-    remove_partial(root / "commits")
+    for name in ("commits", "policies", "backgrounds"):
+        remove_partial(root / name)
+    for record in manifest.subsets if manifest else ():
+        for path in metadata_paths(root, record):
+            remove_partial((root / path).parent, foreign=foreign, below=False)
 
 
 def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
@@ -371,7 +390,7 @@ def finish_release(
     manifest = write_release(root, manifest.model_copy(update=facts), found)
     painted = all(commit.painted for shards in found.values() for commit in shards.values())
     with storage_errors(root, "write to"):
-        remove_partial(root, foreign=complete and painted)  # where all is there, nobody has anything left to make
+        _clear(root, manifest, foreign=complete and painted)  # nothing is left to make then
     return manifest
 
 

@@ -362,7 +362,7 @@ def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
     """The manifest of a bucket once it holds all that is asked for; what is new is put there first, the manifest last.
 
     Raises:
-      StoreError: what is there contradicts what is asked for, or somebody else grows the release at the same time.
+      StoreError: what is there contradicts what is asked for, or its manifest vanished.
     """
     manifest = merged(there, plan.manifest, site.place)
     if manifest is there:
@@ -378,11 +378,15 @@ def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
         _refuse_altered_bucket(site, there, begun)
         new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
         in_parallel(lambda name: site.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
-    if site.manifest() != there:
-        raise StoreError(f"{site.place} was grown by somebody else meanwhile; run the same command again")
-    site.remove(INDEX)  # written again when the release is finished
-    site.write(MANIFEST, json_bytes(manifest))
-    return manifest
+    with site.lock():
+        now = site.manifest()
+        if now == there:
+            site.remove(INDEX)  # written again when the release is finished
+            site.write(MANIFEST, json_bytes(manifest))
+            return manifest
+    if now is None:
+        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
+    return _grow_bucket(plan, site, now)  # another process changed it meanwhile
 
 
 def _refuse_altered_bucket(site: BucketSite, there: Manifest, begun: Mapping[str, Path]) -> None:
@@ -498,11 +502,15 @@ def finish_site(site: Site) -> Manifest:
             return finish_together(site.root)
         refuse_altered_folder(site.root, manifest)
         return manifest
-    bucket = cast(BucketSite, site)
-    _refuse_altered_bucket(bucket, manifest, {})
-    if manifest.complete and manifest.digest and site.read(INDEX):
-        return manifest
-    commits = site.commits(manifest.subsets)
+    return _finish_bucket(cast(BucketSite, site), manifest)
+
+
+def _finish_bucket(site: BucketSite, there: Manifest) -> Manifest:
+    """See `finish_site`. If another process changes the manifest meanwhile, it is read again and nothing is lost."""
+    _refuse_altered_bucket(site, there, {})
+    if there.complete and there.digest and site.read(INDEX):
+        return there
+    commits = site.commits(there.subsets)
     with _desk(site) as mirror:
         shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
         small = [path for path in site.listing() if path not in shards | {MANIFEST, INDEX}]
@@ -513,7 +521,13 @@ def finish_site(site: Site) -> Manifest:
                 write_bytes(mirror / path, data)
 
         in_parallel(bring, small, CONNECTIONS, ignore)
-        manifest = finish_release(mirror, manifest, commits)
-        for name in (INDEX, MANIFEST):
-            bucket.write(name, (mirror / name).read_bytes())
-    return manifest
+        manifest = finish_release(mirror, there, commits)
+        with site.lock():
+            now = site.manifest()
+            if now == there:
+                for name in (INDEX, MANIFEST):
+                    site.write(name, (mirror / name).read_bytes())
+                return manifest
+    if now is None:
+        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
+    return _finish_bucket(site, now)

@@ -19,7 +19,9 @@ import os
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Mapping
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,14 +42,19 @@ from dmcvb_gen.dataset.manifest import (
     subset_path,
 )
 from dmcvb_gen.dataset.transfer import create_object, in_parallel, list_files, put_object, read_object, retry, upload
+from dmcvb_gen.dataset.writer import LOCK_SECONDS
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import BUILTIN, Inputs, release_inputs
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.parallel.base import TIDY
-from dmcvb_gen.storage.remote import file_system, is_url, public, storage_errors
+from dmcvb_gen.storage.remote import file_system, is_url, local_path, public, storage_errors
 
 CONNECTIONS = 8
 """Files of a shard that are sent at once."""
+LOCK = ".manifest.lock"
+"""Object that the writer of a bucket's manifest holds."""
+LOCK_PAUSE = 0.5
+"""Seconds between two looks at another writer's lock."""
 SCRATCH_SHARE = 0.5
 """Share of the scratch disk's free room that shards may take, where no bound is given."""
 
@@ -166,7 +173,9 @@ def site_of(
         `workers`; half of what is free by default.
     """
     if not is_url(str(place)):
-        return FolderSite(Path(place))
+        return FolderSite(local_path(place))
+    if str(place).startswith("memory:"):
+        raise StoreError(f"{place} is lost when this process ends; give a folder or a URL such as s3://bucket/name")
     folder = Path(scratch or tempfile.gettempdir()) / "dmcvb-gen"
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -270,10 +279,32 @@ class BucketSite(Site):
 
         retry(self.place, path, attempt)
 
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other writers from the manifest while the block runs, which must be short.
+
+        The lock is an object that is created only if it is absent. One that stays the same for `LOCK_SECONDS` was left
+        by a killed process, and is taken over.
+        """
+        token, seen, since = uuid.uuid4().hex.encode(), None, time.monotonic()
+        while not self.create(LOCK, token):
+            there = self.read(LOCK)
+            if there != seen:
+                seen, since = there, time.monotonic()
+            elif there is not None and time.monotonic() - since > LOCK_SECONDS:
+                self.remove(LOCK)
+            else:
+                time.sleep(LOCK_PAUSE)
+        try:
+            yield
+        finally:
+            if self.read(LOCK) == token:
+                self.remove(LOCK)
+
     def listing(self):
         filesystem, base = self._open()
         found = list_files(filesystem, self.place, base)
-        return {path: Listed(facts["size"], _time_of(facts)) for path, facts in found.items()}
+        return {path: Listed(facts["size"], _time_of(facts)) for path, facts in found.items() if path != LOCK}
 
     def metadata(self, record, folder):
         path = f"{subset_path(record.name)}/zarr.json"
