@@ -177,6 +177,22 @@ def test_versions_count_up():
     assert [next_version(version) for version in ("1.0.0", "1.9.3", "2.0")] == ["1.1.0", "1.10.0", "2.1.0"]
 
 
+def test_a_fetched_copy_follows_a_release_that_grew(grown, tmp_path):
+    url = f"file://{tmp_path}/there"
+    publish(grown.parent / "before", url)
+    fetch(url, tmp_path / "copy")
+    fetch(url, tmp_path / "part", only=["walker-walk"], episodes=(0, 1))
+    inodes = {path: path.stat().st_ino for name in shards_of(tmp_path / "copy") if (path := tmp_path / "copy" / name)}
+    publish(grown, url)
+    for copy in ("copy", "part"):
+        moved = fetch(url, tmp_path / copy)
+        assert 0 < moved.moved < moved.files and verify(tmp_path / copy).sound
+        assert open_release(tmp_path / copy).manifest == open_release(grown).manifest
+    assert inodes and inodes == {path: path.stat().st_ino for path in inodes}
+    with pytest.raises(StoreError, match="choose another --out"):  # there is no way back
+        fetch(f"file://{grown.parent}/before", tmp_path / "copy")
+
+
 def test_a_published_release_grows_by_its_new_shards_alone(grown, tmp_path):
     url, there = f"file://{tmp_path}/there", tmp_path / "there"
     publish(grown.parent / "before", url)

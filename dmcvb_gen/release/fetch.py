@@ -20,7 +20,18 @@ from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.dataset.index import CARD_FILES, CARD_FOLDER, INDEX, Index, is_card, parse_index, write_release
+from dmcvb_gen.dataset.append import is_grown_from
+from dmcvb_gen.dataset.index import (
+    CARD_FILES,
+    CARD_FOLDER,
+    INDEX,
+    Index,
+    is_card,
+    keeps,
+    parse_index,
+    read_index,
+    write_release,
+)
 from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     CommitRecord,
@@ -409,15 +420,20 @@ def _bare(record: SubsetRecord) -> SubsetRecord:
 
 
 def taken_up(out: Path, source: Source) -> Manifest | None:
-    """The manifest of the part that is in a folder already; None where the folder is empty or new.
+    """The manifest of the part that is in a folder already.
+
+    None if the folder is empty or new, or holds an older version that the release has grown from: what is there then
+    counts as files that have come already.
 
     Raises:
-      StoreError: `out` holds anything but a part of this release, painted or not.
+      StoreError: `out` holds anything but a part of this release, painted or not, or of an older version of it.
     """
     with storage_errors(out):
         begun, strange = (out / MANIFEST).is_file(), _is_strange(out, source.manifest)
     if begun:
         old = local_manifest(out)
+        if _is_older_version(out, old, source):
+            return None
         if not _same_release(old, source):
             raise StoreError(
                 f"{out} holds {old.name} {old.version} and not the {source.manifest.name} {source.manifest.version} of "
@@ -427,6 +443,14 @@ def taken_up(out: Path, source: Source) -> Manifest | None:
     if strange:
         raise StoreError(f"{out} is not empty and holds no release; choose an empty or new folder for --out")
     return None
+
+
+def _is_older_version(out: Path, old: Manifest, source: Source) -> bool:
+    """Whether a folder holds a version, or a part of one, that the published release has grown from."""
+    if old.recipe != source.manifest.recipe or not is_grown_from(source.manifest, old):
+        return False
+    index = read_index(out)
+    return index is None or keeps(source.index, index.files)
 
 
 def _same_release(old: Manifest, source: Source) -> bool:
