@@ -1,4 +1,4 @@
-"""What the paper asked of its scores, asked of ours: results of one or more seeds in, answers with their spread out.
+"""The paper's claims, tested on our scores: results of one or more seeds in, answers with their spread out.
 
 Results that differ in nothing but the seed are taken together: the mean of all their episodes; its standard error is
 that of the episodes, or of the seeds' means where these lie further apart. A difference counts from two of its
@@ -60,15 +60,15 @@ class Pooled:
 
 @dataclass(frozen=True)
 class Answer:
-    """One question at one place.
+    """One claim at one place.
 
     Attributes:
-      question: of `QUESTIONS`. where: task, data, setting, agents.
+      claim: of `CLAIMS`. where: task, data, setting, agents.
       answer: "yes", "no", or "open" where the scores do not tell.
       numbers: what it rests on.
     """
 
-    question: str
+    claim: str
     where: str
     answer: str
     numbers: str
@@ -160,10 +160,10 @@ def _beside(names: Sequence[str], scores: Sequence[Pooled], difference: str) -> 
     return f"{listed}; difference {difference}"
 
 
-def _above(question: str, where: str, names: Sequence[str], scores: Sequence[Pooled]) -> Answer:
+def _above(claim: str, where: str, names: Sequence[str], scores: Sequence[Pooled]) -> Answer:
     """Whether the first of two scores is above the second."""
     answer, difference = _judge(*scores)
-    return Answer(question, f"{where}, {names[0]} over {names[1]}", answer, _beside(names, scores, difference))
+    return Answer(claim, f"{where}, {names[0]} over {names[1]}", answer, _beside(names, scores, difference))
 
 
 def _with(place: Place, **others: str) -> Place:
@@ -214,14 +214,14 @@ def _encoder(scores: Scores) -> Iterator[Answer]:
                 yield _above("id", where, (place.agent, other.agent), (score, beside))
 
 
-def _pretrained(benchmark: str, question: str) -> Callable[[Scores], Iterator[Answer]]:
+def _pretrained(benchmark: str, claim: str) -> Callable[[Scores], Iterator[Answer]]:
     def ask(scores: Scores) -> Iterator[Answer]:
         for place, score in scores.items():
             own, with_encoder, _ = place.learns_from.partition(" (encoder: ")
             reference = _with(place, learns_from=own, agent="bc")
             if place.benchmark == benchmark and with_encoder and reference in scores:
                 names, pair = (place.agent, "bc"), (score, scores[reference])
-                yield _above(question, f"{place.task} {place.learns_from}, {place.setting}", names, pair)
+                yield _above(claim, f"{place.task} {place.learns_from}, {place.setting}", names, pair)
 
     return ask
 
@@ -239,7 +239,7 @@ def _share(scores: Scores) -> Iterator[Answer]:
             yield _above("share", where, (f"{many:g} %", f"{few:g} %"), (more, less))
 
 
-QUESTIONS: dict[str, tuple[str, Callable[[Scores], Iterator[Answer]]]] = {
+CLAIMS: dict[str, tuple[str, Callable[[Scores], Iterator[Answer]]]] = {
     "order": ("Do stronger distractors cost return (none > static > dynamic)?", _order),
     "state": ("Does BC(state) stay near its data (5 %)?", _state),
     "gap": ("Is BC(state) above BC from pictures?", _gap),
@@ -254,13 +254,13 @@ QUESTIONS: dict[str, tuple[str, Callable[[Scores], Iterator[Answer]]]] = {
     ),
     "share": ("Does more data give more return?", _share),
 }
-"""Question -> its words, and who answers it at every place that the scores allow."""
+"""Claim -> its words, and who answers it at every place that the scores allow."""
 
 
-def ask(results: Iterable[Mapping[str, Any]]) -> list[Answer]:
+def judge(results: Iterable[Mapping[str, Any]]) -> list[Answer]:
     """All answers that results (of `report.json`, of any number of seeds) allow; those of profile smoke allow none."""
     scores = pool(result for result in results if result["profile"]["scores"])
-    return [answer for _, answers in QUESTIONS.values() for answer in answers(scores)]
+    return [answer for _, answers in CLAIMS.values() for answer in answers(scores)]
 
 
-__all__ = ["QUESTIONS", "Answer", "Place", "Pooled", "ask", "pool", "read_reports"]
+__all__ = ["CLAIMS", "Answer", "Place", "Pooled", "judge", "pool", "read_reports"]

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from dmcvb_gen.benchmarks.agreement import Pair
 from dmcvb_gen.benchmarks.checks import known_returns
 from dmcvb_gen.benchmarks.suites import Cell
 from dmcvb_gen.dataset import Release
@@ -116,6 +117,22 @@ def _curve_figure(groups: Sequence[Sequence], colors: Mapping[str, str], profile
             axis.set_xlim(left=0)
         score.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
+
+
+def agreement_figures(pairs: Sequence[Pair]) -> Iterator[Figure]:
+    """Our scores over the paper's, both as shares of their data's return; none if no cell is in both."""
+    if not pairs:
+        return
+    figure = Figure(figsize=(6, 5), layout="constrained")
+    axis = figure.add_subplot()
+    for task in dict.fromkeys(pair.task for pair in pairs):
+        own = [pair for pair in pairs if pair.task == task]
+        axis.scatter([pair.paper for pair in own], [pair.ours for pair in own], label=task, s=18)
+    most = max(1.0, *(max(pair.paper, pair.ours) for pair in pairs))
+    axis.plot([0, most], [0, most], color="gray", linestyle="--", linewidth=1, label="equal")
+    axis.set(xlabel="the paper's score, share of its data", ylabel="our score, share of our data")
+    axis.legend(fontsize=8)
+    yield figure
 
 
 def label_of(cell: Cell) -> str:

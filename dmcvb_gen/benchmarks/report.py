@@ -18,9 +18,18 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
 from dmcvb_gen.benchmarks.checks import Structure, known_returns
-from dmcvb_gen.benchmarks.claims import QUESTIONS, ask
-from dmcvb_gen.benchmarks.figures import curve_figures, data_url, figure_url, label_of, place_of, return_figures
+from dmcvb_gen.benchmarks.claims import CLAIMS, judge
+from dmcvb_gen.benchmarks.figures import (
+    agreement_figures,
+    curve_figures,
+    data_url,
+    figure_url,
+    label_of,
+    place_of,
+    return_figures,
+)
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.suites import Cell, Missing
@@ -191,6 +200,7 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup
         **_tables(facts),
         figures={
             "returns": [figure_url(figure) for figure in return_figures(release)],
+            "agreement": [figure_url(figure) for figure in agreement_figures(shared_cells(facts["results"]))],
             "curves": [figure_url(figure) for figure in curve_figures(good, name)],
         },
         rollouts=_sheets(good, setup, "rollout"),
@@ -229,6 +239,7 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         returns=_returns(facts["returns"]),
         scores=[_scores(name, facts) for name in dict.fromkeys(r["cell"]["benchmark"] for r in facts["results"])],
         groups=_groups(facts["results"]),
+        agreement=[(one.task, str(one)) for one in rank_agreement(shared_cells(facts["results"]))],
         notes=_notes(facts["results"]),
         answers=_answers(facts["results"]),
         missing=_missing(facts["missing"]),
@@ -412,7 +423,7 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _answers(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    return [(QUESTIONS[a.question][0], a.where, a.answer, a.numbers) for a in ask(results)]
+    return [(CLAIMS[a.claim][0], a.where, a.answer, a.numbers) for a in judge(results)]
 
 
 def _inspection(good: Results, profile: str) -> list[tuple]:

@@ -24,10 +24,7 @@ COMMANDS = {
     "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
     "verify": ("release:verify", "Check that a release is what it says."),
     "validate": ("validate:validate", "Check a release, run the paper's benchmarks, report both."),
-    "questions": (
-        "validate:questions",
-        "Ask reports what the paper asked of its scores, of several seeds together.",
-    ),
+    "claims": ("validate:claims", "Test the paper's claims, and the rank of its scores, on reports of validate."),
     "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
     "paint": ("paint:paint", "Fill in the pictures of a release that travelled without."),
     "repaint": ("release:repaint", "New pixels from stored physics states: distractor, size, renderer."),
@@ -45,6 +42,10 @@ COMMANDS = {
 """Command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""
 
 
+ALIASES = {"questions": "claims"}
+"""Earlier name of a command -> its name."""
+
+
 class LazyGroup(click.Group):
     """Imports a command's module only when it is called, so that --help is quick; prints errors in one line."""
 
@@ -52,6 +53,7 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx, name):
+        name = ALIASES.get(name, name)
         if name not in COMMANDS:
             return None
         module, attribute = COMMANDS[name][0].split(":")

@@ -1,4 +1,4 @@
-"""validate, questions."""
+"""validate, claims."""
 
 from __future__ import annotations
 
@@ -169,37 +169,44 @@ def _show(result, profile) -> None:
 @click.command()
 @click.argument("reports", nargs=-1, required=True, type=click.Path(path_type=Path))
 @json_option
-def questions(reports, as_json):
-    """What the paper asked of its scores, asked of the reports that validate wrote.
+def claims(reports, as_json):
+    """Test the paper's claims on reports that validate wrote.
 
     Is none above static above dynamic? Does BC(state) stay near its data? Does ID+BC beat the others? Does more data
     help? Reports that differ in their seed are taken together. A difference counts from two standard errors on (of the
-    episodes, or of the seeds' means where these lie further apart); what lies nearer is open.
+    episodes, or of the seeds' means if these lie further apart); what lies nearer is open. Last comes Spearman's rho
+    between the scores and the paper's, as shares of their data's returns, with a 95 % bootstrap interval.
 
     \b
     dmcvb-gen validate releases/mini --profile quick --agents bc,state-bc,id+bc --seed 0 --out reports/seed0
     dmcvb-gen validate releases/mini --profile quick --agents bc,state-bc,id+bc --seed 1 --out reports/seed1
-    dmcvb-gen questions reports/seed0 reports/seed1
+    dmcvb-gen claims reports/seed0 reports/seed1
     """
     from dataclasses import asdict
 
-    from dmcvb_gen.benchmarks.claims import QUESTIONS, ask, pool, read_reports
+    from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
+    from dmcvb_gen.benchmarks.claims import CLAIMS, judge, pool, read_reports
 
     results = read_reports(reports)
-    answers, pooled = ask(results), pool(results)
+    answers, pooled, ranks = judge(results), pool(results), rank_agreement(shared_cells(results))
     if as_json:
         scores = [asdict(place) | asdict(score) for place, score in pooled.items()]
-        print_json({"scores": scores, "answers": [asdict(answer) for answer in answers]})
+        ranked = [asdict(one) for one in ranks]
+        print_json({"scores": scores, "answers": [asdict(answer) for answer in answers], "agreement": ranked})
         return
     for place, score in pooled.items():
         seeds = ", ".join(f"{mean:.1f}" for mean in score.seeds)
         where = f"{place.benchmark} {place.task} {place.learns_from}, {place.setting}"
         click.echo(f"{where}, {place.agent}: {score} (seeds: {seeds}); data {score.data:.1f}")
-    for name, (words, _) in QUESTIONS.items():
-        found = [answer for answer in answers if answer.question == name]
+    for name, (words, _) in CLAIMS.items():
+        found = [answer for answer in answers if answer.claim == name]
         if found:
             click.echo(f"\n{words}")
         for answer in found:
             click.echo(f"  {answer.answer:>4}  {answer.where}: {answer.numbers}")
+    if ranks:
+        click.echo("\nAre scores ranked as in the paper? Spearman's rho [95 % interval]")
+    for one in ranks:
+        click.echo(f"  {one.task}: {one}")
     if not answers:
-        click.echo("These reports hold no scores that answer any: use --profile brief, quick or paper.")
+        click.echo("These reports hold no scores that test any claim: use --profile brief, quick or paper.")

@@ -1,4 +1,4 @@
-"""The paper's questions of made-up scores whose answers are known, and of a report that `validate` wrote."""
+"""The paper's claims on made-up scores whose answers are known, and of a report that `validate` wrote."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.benchmarks.claims import ask, pool, read_reports
+from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
+from dmcvb_gen.benchmarks.claims import judge, pool, read_reports
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 
@@ -25,7 +26,7 @@ def near(mean):
 
 
 def answers_of(*results):
-    return {(answer.question, answer.where): answer.answer for answer in ask(results)}
+    return {(answer.claim, answer.where): answer.answer for answer in judge(results)}
 
 
 def test_order_is_asked_of_settings_that_follow_each_other():
@@ -48,13 +49,13 @@ def test_states_near_their_data():
                                                  (935, 10, "yes"), (870, 10, "no")])  # fmt: skip
 def test_the_edge_of_near_counts_from_two_errors_on(mean, error, answer):
     returns = [mean - error * 3**0.5, mean, mean + error * 3**0.5]  # whose mean has that standard error
-    found = ask([result("state-bc", "none", returns, data=950.0)])
-    assert [one.answer for one in found if one.question == "state"] == [answer]
+    found = judge([result("state-bc", "none", returns, data=950.0)])
+    assert [one.answer for one in found if one.claim == "state"] == [answer]
 
 
 def test_returns_of_episodes_cut_elsewhere_are_not_compared_with_their_data():
     cut_at_twice_that = {"score": {"returns": near(-80), "limit": 1200}}
-    [answer] = ask([result("state-bc", "visible", [], data=-100.0, **cut_at_twice_that)])
+    [answer] = judge([result("state-bc", "visible", [], data=-100.0, **cut_at_twice_that)])
     assert answer.answer == "open" and "cut at other lengths" in answer.numbers
 
 
@@ -67,33 +68,33 @@ def test_id_is_compared_with_pictures_alone_and_not_without_distractors():
         "id+bc over bc": "no",
         "id+bc over lfd+bc": "yes",
     }
-    every = ask([result("id+bc", "dynamic", near(50)), result("state-bc", "dynamic", near(97))])
-    assert not [answer for answer in every if answer.question == "id"]
+    every = judge([result("id+bc", "dynamic", near(50)), result("state-bc", "dynamic", near(97))])
+    assert not [answer for answer in every if answer.claim == "id"]
 
 
 def test_the_gap_to_states_is_of_every_setting():
-    found = ask([result("state-bc", "none", near(97)), *(result("bc", s, near(60)) for s in ("none", "dynamic"))])
-    assert [answer.answer for answer in found if answer.question == "gap"] == ["yes", "yes"]
+    found = judge([result("state-bc", "none", near(97)), *(result("bc", s, near(60)) for s in ("none", "dynamic"))])
+    assert [answer.answer for answer in found if answer.claim == "gap"] == ["yes", "yes"]
 
 
 @pytest.mark.parametrize("benchmark, question", [("b2", "mixed"), ("b3", "goals")])
 def test_an_encoder_from_other_data_is_compared_with_bc_on_the_same_episodes(benchmark, question):
     own = dict(benchmark=benchmark, learns="20 expert")
-    found = ask(
+    found = judge(
         [
             result("bc", "none", near(40), **own),
             result("bc", "none", near(90), benchmark=benchmark, learns="expert"),
             result("id+bc", "none", near(70), encoder="mixed", **own),
         ]
     )
-    assert [(answer.question, answer.answer) for answer in found] == [(question, "yes")]
+    assert [(answer.claim, answer.answer) for answer in found] == [(question, "yes")]
     assert "70.0" in found[0].numbers and "40.0" in found[0].numbers
 
 
 def test_shares_are_compared_in_their_order():
     made = [result("bc", "none", near(mean), benchmark="ablations", learns=label) for mean, label in
             ((80, "expert"), (20, "1% expert"), (81, "25% expert"), (40, "5% expert"))]  # fmt: skip
-    assert [answer.answer for answer in ask(made)] == ["yes", "yes", "open"]
+    assert [answer.answer for answer in judge(made)] == ["yes", "yes", "open"]
 
 
 def test_seeds_that_lie_apart_widen_the_error():
@@ -105,7 +106,7 @@ def test_seeds_that_lie_apart_widen_the_error():
 
 
 def test_numbers_that_claim_no_score_answer_nothing():
-    assert ask([result("state-bc", "none", near(97), scores=False)]) == []
+    assert judge([result("state-bc", "none", near(97), scores=False)]) == []
 
 
 def write(folder, profile, *results, release="walkers"):
@@ -156,3 +157,49 @@ def test_agents_trained_on_other_data_are_not_compared(tmp_path):
     assert len(read_reports([tmp_path / "a", tmp_path / "c"])) == 2
     with pytest.raises(DmcvbError, match="different data"):
         read_reports([tmp_path / "a", tmp_path / "b"])
+
+
+# -- rank agreement ---------------------------------------------------------------------------------
+
+
+def beside(task, agent, share, paper, setting="none", spread=0.01, seed=0, **more):
+    """A result of expert data that scored `share` of it, where the paper's table has `paper`."""
+    returns = [100 * (share - spread), 100 * share, 100 * (share + spread)]
+    facts = result(agent, setting, returns, seed=seed, **more)
+    facts["cell"]["task"] = task
+    return facts | {"paper": {"mean": paper, "stderr": 1}}
+
+
+def test_scores_ranked_as_the_papers_agree_and_reversed_ones_do_not():
+    shares = {"bc": (0.9, 900), "id+bc": (0.7, 800), "ae+bc": (0.5, 500), "lfd+bc": (0.1, 60)}
+    alike = shared_cells([beside("walker-walk", agent, *values) for agent, values in shares.items()])
+    [found] = rank_agreement(alike)
+    assert (found.rho, found.cells, found.task) == (1.0, 4, "walker-walk") and found.low == found.high == 1.0
+    reverse = zip(shares, [0.1, 0.5, 0.7, 0.9], [paper for _, paper in shares.values()], strict=True)
+    assert rank_agreement(shared_cells([beside("walker-walk", *row) for row in reverse]))[0].rho == -1.0
+
+
+def test_rho_is_of_shares_of_the_data_by_task_and_together_with_an_interval():
+    """By hand: walker's data returned 958, cheetah's 890, humanoid's 766 in the paper, ours 100 throughout."""
+    papers = {"walker-walk": 958, "cheetah-run": 890, "humanoid-walk": 766}
+    rows = [("bc", 0.9, 0.85), ("id+bc", 0.5, 0.6), ("ae+bc", 0.51, 0.3), ("lfd+bc", 0.1, 0.1)]
+    results = [
+        beside(task, agent, share, paper * data, spread=0.05, seed=seed)
+        for task, data in papers.items()
+        for agent, share, paper in rows
+        for seed in (0, 1)
+    ]
+    pairs = shared_cells(results)
+    assert len(pairs) == 12 and all(len(pair.returns) == 2 for pair in pairs)
+    assert {round(pair.paper, 6) for pair in pairs} == {0.85, 0.6, 0.3, 0.1}
+    found = {one.task: one for one in rank_agreement(pairs)}
+    assert set(found) == {*papers, "all tasks"} and found["all tasks"].cells == 12
+    assert found["walker-walk"].rho == pytest.approx(0.8)  # one swap of neighbors of four: 1 - 6 * 2 / (4 * 15)
+    assert found["walker-walk"].low <= 0.8 <= found["walker-walk"].high and found["walker-walk"].high == 1.0
+
+
+def test_noise_and_cells_that_the_paper_lacks_are_not_ranked():
+    cells = [beside("walker-walk", agent, 0.5, 500, scores=False) for agent in ("bc", "id+bc", "ae+bc")]
+    assert not shared_cells(cells)
+    assert not shared_cells([result("bc", "none", near(90)) | {"paper": None}])
+    assert not rank_agreement(shared_cells([beside("walker-walk", "bc", 0.5, 500)]))  # one cell has no rank

@@ -1,0 +1,107 @@
+"""How well a report's scores are ordered as the paper's: results in, Spearman's rho with its interval out.
+
+A score is taken as a share of its data's mean return, ours of our data and the paper's of the paper's, so that tasks
+and levels compare. The interval is a stratified bootstrap: episodes are drawn again within each cell and seed, as
+rliable does (Agarwal et al. 2021), whose package does not run beside the pandas that we pin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from dmcvb_gen.benchmarks.paper import paper_score
+
+SAMPLES = 2_000
+"""Of the bootstrap."""
+INTERVAL = (2.5, 97.5)
+"""Percentiles of the interval's ends."""
+FEWEST = 3
+"""Cells below which a rank correlation says nothing."""
+ALL = "all tasks"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A cell that both the report and the paper have.
+
+    Attributes:
+      task, where: the task; level, setting and agent.
+      returns: of our episodes as shares of our data's mean return, an array a seed.
+      paper: the paper's score as a share of the paper's data.
+    """
+
+    task: str
+    where: str
+    returns: tuple[np.ndarray, ...]
+    paper: float
+
+    @property
+    def ours(self) -> float:
+        return float(np.concatenate(self.returns).mean())
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Spearman's rho of the cells of a task, or of all.
+
+    Attributes:
+      cells: how many. low, high: ends of its 95 % interval.
+    """
+
+    task: str
+    cells: int
+    rho: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.rho:.2f} [{self.low:.2f}, {self.high:.2f}] over {self.cells} cells"
+
+
+def shared_cells(results: Iterable[Mapping[str, Any]]) -> list[Pair]:
+    """The cells of B1 that the paper's table has, too; seeds together. Profiles without scores have none."""
+    found: dict[tuple[str, str], tuple[list[np.ndarray], float]] = {}
+    for result in results:
+        cell = result["cell"]
+        task, label, setting = cell["task"], cell["policy_label"], cell["setting"]
+        data = paper_score(task, label, setting, "data")
+        if not (result["profile"]["scores"] and result.get("paper") and data) or result["data"]["mean"] <= 0:
+            continue
+        returns = np.array(result["score"]["returns"]) / result["data"]["mean"]
+        paper = result["paper"]["mean"] / data[0]
+        found.setdefault((task, f"{label} {setting} {cell['agent_name']}"), ([], paper))[0].append(returns)
+    return [Pair(task, where, tuple(returns), paper) for (task, where), (returns, paper) in found.items()]
+
+
+def rank_agreement(pairs: Sequence[Pair], seed: int = 0) -> list[Agreement]:
+    """Spearman's rho of each task, and of all together if there are several."""
+    tasks = list(dict.fromkeys(pair.task for pair in pairs))
+    groups = {task: [pair for pair in pairs if pair.task == task] for task in tasks}
+    groups |= {ALL: list(pairs)} if len(tasks) > 1 else {}
+    return [_agreement(task, group, seed) for task, group in groups.items() if len(group) >= FEWEST]
+
+
+def _agreement(task: str, pairs: Sequence[Pair], seed: int) -> Agreement:
+    generator, paper = np.random.default_rng(seed), [pair.paper for pair in pairs]
+    drawn = np.stack([_resampled_means(pair, generator) for pair in pairs])  # (cell, sample)
+    rhos = np.array([_rho(scores, paper) for scores in drawn.T])
+    low, high = np.percentile(rhos, INTERVAL)
+    return Agreement(task, len(pairs), _rho([pair.ours for pair in pairs], paper), float(low), float(high))
+
+
+def _rho(ours: Sequence[float], paper: Sequence[float]) -> float:
+    return float(np.nan_to_num(spearmanr(ours, paper).statistic))  # all alike: no order, so no agreement
+
+
+def _resampled_means(pair: Pair, generator: np.random.Generator) -> np.ndarray:
+    """(sample,) means of a cell whose episodes are drawn again within each seed."""
+    sums, count = np.zeros(SAMPLES), 0
+    for returns in pair.returns:
+        sums += generator.choice(returns, (SAMPLES, len(returns))).sum(axis=1)
+        count += len(returns)
+    return sums / count
