@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -38,6 +39,7 @@ from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.profiles import PROFILES
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.tasks import ACTION_REPEAT
+from tests import independent_td3_bc
 
 SIZE, CHANNELS, ACTIONS, STATES = 16, 9, 6, 24
 
@@ -431,6 +433,25 @@ def test_td3s_policy_noise_and_the_noisy_action_are_clipped(monkeypatch):
     learner.target_value(batch, noise=torch.full((2, ACTIONS), 9.0))
     torch.testing.assert_close(seen[0], torch.full((2, ACTIONS), 0.3))
     torch.testing.assert_close(seen[1], torch.ones(2, ACTIONS))
+
+
+def test_td3_bc_makes_the_steps_of_an_independent_one(monkeypatch):
+    """On states, eight steps: the same weights as `tests.independent_td3_bc`, which knows the equations alone."""
+    torch.manual_seed(0)
+    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    weights = {name: value.detach().clone() for name, value in learner.net.named_parameters()}
+    batches = [make_batch(16, seed) for seed in range(8)]
+    batches = [dataclasses.replace(b, observation=b.state, next_observation=b.state.flip(0)) for b in batches]
+    noises = [torch.randn(16, ACTIONS, generator=torch.Generator().manual_seed(i)) for i in range(8)]
+    drawn = iter(noises)
+    monkeypatch.setattr(torch, "randn_like", lambda like: next(drawn))
+    for batch in batches:
+        learner.update(batch)
+    plain = [(b.observation, b.action, b.reward, b.discount, b.next_observation) for b in batches]
+    theirs = independent_td3_bc.train(dict(weights), plain, noises)
+    for name, value in learner.net.named_parameters():
+        assert not torch.equal(value, weights[name]), name
+        torch.testing.assert_close(value.detach(), theirs[name], atol=2e-5, rtol=1e-3, msg=name)
 
 
 def test_without_alpha_td3_bc_is_bc():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from dmcvb_gen.agents import data as data_module
 from dmcvb_gen.agents import trainer
 from dmcvb_gen.agents.data import PAD, HeldFrames, Source, TrainingData, batches, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import BehaviorCloning
@@ -169,9 +171,10 @@ def test_a_subset_is_held_as_it_is_stored(small_release):
     np.testing.assert_allclose(raw[2 * 501 + 7], episode["state"][7], atol=1e-4)
 
 
-def test_pictures_that_do_not_fit_are_read_from_the_shards_and_are_the_same(small_release):
+def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_release, tmp_path):
     sources = [Source(open_release(small_release)[f"walker-walk/random/{name}"]) for name in ("none", "dynamic")]
-    held, stored = load_data(sources), load_data(sources, memory=0)
+    held, stored = load_data(sources), load_data(sources, memory=0, scratch=tmp_path)
+    assert stored.frames.mapped and not held.frames.mapped and not list(tmp_path.iterdir())
     for hold_out in (False, True):
         one, two = (
             data.batch(12, np.random.default_rng(3), next_observation=True, k=5, hold_out=hold_out)
@@ -186,6 +189,12 @@ def test_pictures_that_do_not_fit_are_read_from_the_shards_and_are_the_same(smal
         torch.manual_seed(0)
         losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), 6), data, settings)[-1]["loss"])
     assert losses[0] == losses[1]
+
+
+def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch):
+    monkeypatch.setattr(data_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+    with pytest.raises(DmcvbError, match="fit neither into memory nor into .* another --out, or more --memory"):
+        load_data([Source(open_release(small_release)["walker-walk/random/none"])], memory=0, scratch=tmp_path)
 
 
 def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):

@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
-from dmcvb_gen.benchmarks.setup import Setup, fingerprint, open_data, pretraining_of
+from dmcvb_gen.benchmarks.setup import Setup, choose_precision, fingerprint, open_data, pretraining_of
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
@@ -509,7 +509,7 @@ def test_data_that_grew_or_look_otherwise_are_read_again(small_release):
 def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
     setup = Setup(root="r", out="o", profile=PROFILES["brief"])
     pixels, states = train_settings(setup, 10), train_settings(setup, 10, pixels=False)
-    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 1.0, False, False)
+    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, False, False)
     assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
     whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10)
     assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
@@ -533,3 +533,13 @@ def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
         ("b3", "ant-maze-empty7x7"): ("5", "-202 ± 1.3", "50 %"),
     }
     assert not report._groups([result("b1", "ant-maze-empty7x7", "expert", -9.0, scores=False)])
+
+
+def test_precision_is_what_the_processor_computes_in_unless_it_is_given(monkeypatch):
+    for has, found in ((True, "bfloat16"), (False, "float32")):
+        for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"):
+            monkeypatch.setattr(torch.cpu, name, lambda has=has: has, raising=False)
+        assert choose_precision("auto", "cpu") == found
+    assert choose_precision("bfloat16", "cpu") == "bfloat16"
+    setup = Setup(root="r", out="o", profile=PROFILES["brief"], precision="bfloat16")
+    assert train_settings(setup, 10).half and not train_settings(setup, 10, pixels=False).half

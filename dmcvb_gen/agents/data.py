@@ -7,17 +7,19 @@ taken there, its reward); a batch is a gather from that table, never a loop over
     frames     o_0  o_1 ...  o_L | o_0 of episode 1 ...  (channel, height, width) uint8
 
 Pictures stay uint8 until they are in a batch. They are held in memory (or on the accelerator) where they fit, else
-read from the shards as they are asked for (`StoredFrames`).
+decoded once into a file that is mapped into memory.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -76,17 +78,6 @@ class Normalization:
         return cls(values.mean(dim=0).float(), std.float())
 
 
-class Frames(Protocol):
-    """A table of pictures."""
-
-    channels: int
-    size: int
-
-    def shifted(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        """(batch, frames) rows, (batch,) offsets in 0..2 PAD -> (batch, frames x channels, size, size) uint8."""
-        ...
-
-
 def mirror(size: int) -> torch.Tensor:
     """(size + 2 PAD,) long: which pixel stands where after padding that repeats the border in reverse."""
     index = torch.arange(size + 2 * PAD) - PAD
@@ -94,19 +85,53 @@ def mirror(size: int) -> torch.Tensor:
     return torch.where(index >= size, 2 * size - 1 - index, index)
 
 
+def _mapped_file(shape: tuple[int, ...], folder: Path) -> np.ndarray:
+    """A uint8 array of that shape in a nameless file."""
+    needed = math.prod(shape)
+    folder.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise DmcvbError(
+            f"{needed / 1e9:.1f} GB of pictures fit neither into memory nor into {folder} ({free / 1e9:.1f} GB free); "
+            "give another --out, or more --memory"
+        )
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.truncate(needed)
+        return np.memmap(file, np.uint8, "r+", shape=shape)
+
+
 class HeldFrames:
-    """Pictures in memory, each line with its mirrored border at both ends (an eighth more bytes).
+    """Pictures in memory, or in a file mapped into it, each line with its mirrored border at both ends.
+
+    The borders take an eighth more bytes.
 
     A shifted line of pixels then is `size` bytes that stand together, so that picking frames, stacking them and moving
     them is one gather of lines, for any number of stacks.
 
     Args:
       rows: pictures it has room for; `put` fills it.
+      scratch: a folder; the pictures then lie in a file there that is mapped into memory, so that the system keeps of
+        them what fits. The file has no name and is gone with the process.
+
+    Raises:
+      DmcvbError: the folder has no room for the file.
     """
 
-    def __init__(self, rows: int, channels: int, size: int, device: str | torch.device = "cpu"):
-        self.channels, self.size = channels, size
-        self.table = torch.empty((rows, channels, size, size + 2 * PAD), dtype=torch.uint8, device=device)
+    def __init__(
+        self,
+        rows: int,
+        channels: int,
+        size: int,
+        device: str | torch.device = "cpu",
+        scratch: str | Path | None = None,
+    ):
+        self.channels, self.size, self.mapped = channels, size, scratch is not None
+        shape = (rows, channels, size, size + 2 * PAD)
+        if scratch is None:
+            self.table = torch.empty(shape, dtype=torch.uint8, device=device)
+        else:
+            self.table = torch.from_numpy(_mapped_file(shape, Path(scratch)))
+            device = "cpu"
         self._mirror = mirror(size).to(device)
 
     @property
@@ -122,7 +147,9 @@ class HeldFrames:
         inner[:] = pictures.to(filled.device)
         filled[..., :PAD], filled[..., -PAD:] = inner[..., :PAD].flip(-1), inner[..., -PAD:].flip(-1)
 
-    def shifted(self, rows, down, right):
+    def shifted(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        """(batch, frames) rows, (batch,) offsets in 0..2 PAD -> (batch, frames x channels, size, size) uint8."""
+        rows, down, right = (values.to(self._mirror.device) for values in (rows, down, right))
         (batch, frames), wide = rows.shape, self.size + 2 * PAD
         line = self._mirror[down[:, None] + torch.arange(self.size, device=rows.device)]  # (batch, size)
         plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=rows.device)
@@ -131,32 +158,6 @@ class HeldFrames:
         flat = self.table.view(-1)
         lines = flat.as_strided((len(flat) - self.size + 1, self.size), (1, 1)).index_select(0, index.reshape(-1))
         return lines.view(batch, frames * self.channels, self.size, self.size)
-
-
-class StoredFrames:
-    """Pictures read from the shards when they are asked for: for data larger than memory.
-
-    Args:
-      subsets: the subsets, their picture arrays, and for every row of the table (subset, episode, step).
-    """
-
-    def __init__(self, subsets: Sequence[Subset], arrays: Sequence[tuple[str, ...]], where: np.ndarray, size: int):
-        self._arrays = [[subset.array(name) for name in names] for subset, names in zip(subsets, arrays, strict=True)]
-        self._where = where
-        self.channels, self.size = 3 * len(arrays[0]), size
-
-    def shifted(self, rows, down, right):
-        out = np.empty((*rows.shape, self.channels, self.size, self.size), np.uint8)
-        for sample, row in enumerate(rows.cpu().numpy()):
-            source, episode, first = self._where[row[0]]
-            last = self._where[row[-1]][2]
-            steps = self._where[row][:, 2] - first
-            views = [array[int(episode), int(first) : int(last) + 1][steps] for array in self._arrays[source]]
-            out[sample] = np.concatenate(views, axis=-1).transpose(0, 3, 1, 2)
-        stacks = torch.from_numpy(out).flatten(1, 2)
-        held = HeldFrames(len(stacks), stacks.shape[1], self.size, rows.device)
-        held.put(0, stacks)  # each sample a "frame" of its own: only the shift is left to do
-        return held.shifted(torch.arange(len(stacks), device=rows.device)[:, None], down, right)
 
 
 def normalize_pixels(
@@ -208,7 +209,7 @@ class TrainingData(Dataset):
         discount: torch.Tensor,
         lengths: np.ndarray,
         held_out: np.ndarray,
-        frames: Frames | None = None,
+        frames: HeldFrames | None = None,
         stack: int = FRAMES,
         returns: np.ndarray | None = None,
     ):
@@ -262,7 +263,7 @@ class TrainingData(Dataset):
         if self.frames is None:
             return self.state[rows]
         stacks = stack_rows(rows, self.start[rows], self.stack)
-        return normalize_pixels(self.frames.shifted(stacks, down, right), dtype, out)
+        return normalize_pixels(self.frames.shifted(stacks, down, right).to(self.device), dtype, out)
 
     def batch(
         self,
@@ -441,6 +442,7 @@ def load_data(
     seed: int = 0,
     device: str = "cpu",
     memory: int | None = None,
+    scratch: str | Path | None = None,
 ) -> TrainingData:
     """Read subsets (mixed, where there are several) for training.
 
@@ -448,7 +450,8 @@ def load_data(
       pixels: agents see pictures; else states.
       stack: frames an observation.
       seed: of the episode split and of shares.
-      memory: bytes of pictures to hold at most; larger data are read from the shards batch by batch.
+      memory: bytes of pictures to hold at most; larger data are mapped into memory from a file.
+      scratch: folder of that file; the system's folder of temporary files by default.
 
     Raises:
       DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
@@ -466,14 +469,14 @@ def load_data(
     rows = int(sum((length + 1).sum() for length in lengths))
     needed = rows * channels * size * (size + 2 * PAD)
     hold = pixels and needed <= (default_memory(device) if memory is None else memory)
-    held = HeldFrames(rows, channels, size, device) if hold else None
-    tables, where = _read_rows(subsets, names, [episodes for episodes, _ in chosen], lengths, held)
-    frames = StoredFrames(subsets, names, where, size) if pixels and not hold else held
+    folder = None if hold else scratch or tempfile.gettempdir()
+    held = HeldFrames(rows, channels, size, device, folder) if pixels else None
+    tables = _read_rows(subsets, names, [episodes for episodes, _ in chosen], lengths, held)
     return TrainingData(
         **{name: torch.from_numpy(values).float().to(device) for name, values in tables.items()},
         lengths=np.concatenate(lengths).astype(np.int64),
         held_out=np.concatenate([out for _, out in chosen]),
-        frames=frames,
+        frames=held,
         stack=stack,
         returns=np.concatenate(returns),
     )
@@ -499,30 +502,29 @@ def _read_rows(
     chosen: Sequence[np.ndarray],
     lengths: Sequence[np.ndarray],
     held: HeldFrames | None,
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
+) -> dict[str, np.ndarray]:
     """The rows of all chosen episodes, one after the other; pictures go into `held`.
 
     Args:
       chosen: (episode,) indices of each subset. lengths: (episode,) of those.
 
     Returns:
-      Tables of (row, ...) values, and (row, 3): subset, episode and step of each.
+      Tables of (row, ...) values.
     """
     tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
-    where, first = [], 0
+    first = 0
     for index, (subset, episodes, length) in enumerate(zip(subsets, chosen, lengths, strict=True)):
         step = np.arange(int(length.max()) + 1)
         for part in range(0, len(episodes), READ_EPISODES):
             few = episodes[part : part + READ_EPISODES]
             e, t = np.nonzero(step[None] <= length[part : part + READ_EPISODES, None])
-            where.append(np.stack([np.full(len(e), index), few[e], t], axis=1))
             for name, table in tables.items():
                 table.append(subset.read(name, few)[e, t])
             for view, name in enumerate(names[index] if held is not None else ()):
                 pictures = torch.from_numpy(subset.read(name, few)[e, t])
                 held.put(first, pictures.permute(0, 3, 1, 2), channel=3 * view)
             first += len(e)
-    return {name: np.concatenate(parts) for name, parts in tables.items()}, np.concatenate(where)
+    return {name: np.concatenate(parts) for name, parts in tables.items()}
 
 
 __all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data"]

@@ -18,7 +18,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from dmcvb_gen.agents.data import StoredFrames, TrainingData, batches
+from dmcvb_gen.agents.data import TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
@@ -45,7 +45,7 @@ class TrainSettings:
       points: points of the learning curve.
       half: bfloat16 autocast. Pays for pictures, not for states.
       compile: torch.compile of the losses.
-      workers: threads that draw batches ahead; 0 draws them in turn (data read from shards have two in any case).
+      workers: threads that draw batches ahead; 0 draws them in turn (pictures in a mapped file have two in any case).
       rate: times the learner's own learning rate (1e-3, the paper's).
       shift: pictures are shifted at random, as the paper's; short trainings learn several times as fast without.
       decay: the learning rate falls linearly to zero over the steps; the paper keeps it, short trainings gain by it.
@@ -138,7 +138,7 @@ def train(
         return draw(learner, data, settings.batch_size, seed, step, shift=settings.shift, reuse=reuse)
 
     schedule = _Schedule(learner, settings)
-    workers = max(settings.workers, 2 if isinstance(data.frames, StoredFrames) else 0)
+    workers = max(settings.workers, 2 if data.frames is not None and data.frames.mapped else 0)
     for step, batch in batches(make, first, settings.steps, workers):
         torch.manual_seed((seed << 32) + step)
         schedule.at(step)

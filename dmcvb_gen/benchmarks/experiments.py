@@ -58,7 +58,9 @@ class _DataCache:
         if self._key is None or self._key[0] != key or (pixels and not self._key[1]):
             self._key = self._data = None  # free the old pictures before new ones are read
             sources = [_source(release, part) for part in parts]
-            self._data = load_data(sources, pixels=pixels, seed=setup.seed, device=setup.device, memory=setup.memory)
+            self._data = load_data(
+                sources, pixels=pixels, seed=setup.seed, device=setup.device, memory=setup.memory, scratch=setup.out
+            )
             self._key = (key, pixels)
         return self._data.with_stack(stack) if pixels else self._data.states_only()
 

@@ -15,7 +15,7 @@ from dmcvb_gen.text import pluralize
 
 TRAINING = (
     *("benchmarks", "agents", "own", "profile", "scale", "seed"),
-    *("train_unsound", "threads", "device", "compile", "dino_weights"),
+    *("train_unsound", "threads", "device", "precision", "compile", "dino_weights"),
 )
 """Options of `validate` that say what is trained, and how."""
 
@@ -37,6 +37,13 @@ TRAINING = (
 @ray_option
 @click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True)
+@click.option(
+    "--precision",
+    type=click.Choice(["auto", "float32", "bfloat16"]),
+    default="auto",
+    show_default=True,
+    help="Of networks that see pictures; auto: bfloat16 if the processor computes in it.",
+)
 @click.option("--compile", is_flag=True, help="torch.compile the losses (pays on CUDA and in long runs).")
 @click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Of all workers; ray: of each.  [default: half]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
@@ -58,7 +65,7 @@ def validate(
     """
     from dmcvb_gen.benchmarks.profiles import get_profile
     from dmcvb_gen.benchmarks.run import default_threads, default_workers
-    from dmcvb_gen.benchmarks.setup import Setup
+    from dmcvb_gen.benchmarks.setup import Setup, choose_precision
     from dmcvb_gen.benchmarks.validate import Progress
     from dmcvb_gen.benchmarks.validate import validate as run
     from dmcvb_gen.errors import DmcvbError
@@ -81,7 +88,11 @@ def validate(
         profile=get_profile(profile).scaled(scale),
         memory=None if memory is None else int(memory * 1e9),
         dino_weights=weights and str(weights),
-        **options | {"threads": options["threads"] or threads},
+        **options
+        | {
+            "threads": options["threads"] or threads,
+            "precision": choose_precision(options["precision"], options["device"]),
+        },
     )
     with ProgressBar(as_json, unit=" checks", desc="structure") as bar:
         progress = Progress(
