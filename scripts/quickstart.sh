@@ -7,4 +7,4 @@ out="${1:-releases/quickstart}"
 dmcvb-gen rollout --recipe quickstart --out "$out" --workers "$(python -c 'import os; print(min(4, os.cpu_count() or 1))')"
 dmcvb-gen info "$out"
 dmcvb-gen preview "$out"
-dmcvb-gen validate "$out" --profile brief --only 'walker-walk/expert/none' --agents state-bc --workers 1 --out reports/quickstart
+dmcvb-gen validate "$out" --checks-only --out reports/quickstart
