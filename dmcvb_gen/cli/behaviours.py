@@ -38,10 +38,12 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.own import allow
     from dmcvb_gen.training.defaults import parse_settings, run_config
     from dmcvb_gen.training.runs import read_config
     from dmcvb_gen.training.training import open_run
 
+    allow([task])  # a person typed its name, so its code may run
     get_task(task)
     folder = out or Path("runs") / task
     found = read_config(folder) if resume else None
