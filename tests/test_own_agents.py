@@ -106,6 +106,7 @@ broken.pixels = False
 """
 
 
+@pytest.mark.slow
 def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_path, monkeypatch):
     (tmp_path / "own_agents.py").write_text(AGENTS)
     monkeypatch.chdir(tmp_path)
@@ -131,6 +132,7 @@ def test_an_agent_that_cannot_be_loaded_is_one_line(small_release, tmp_path, nam
     assert result.exit_code != 0 and told in result.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", ["evaluate_torch", "evaluate_jax"])
 def test_examples_train_and_score_a_policy(small_release, example):
     pytest.importorskip("jax" if "jax" in example else "torch")
