@@ -56,6 +56,7 @@ def test_every_view_is_as_close_to_opengl_as_eyes_see(task_id, setting_name):
         assert worst < 2 * LARGEST_DIFFERENCE[task_id], name  # no frame lacks a shadow or a mirror image
 
 
+@pytest.mark.slow
 @needs_opengl
 @pytest.mark.parametrize("setting_name", ["none", "dynamic"])
 @pytest.mark.parametrize("task_id", PAINTED)
