@@ -1,12 +1,17 @@
-"""The labels of pictures: what distractors draw, the store keeps and renderers paint; arrays in, rows of them out."""
+"""The labels of pictures: distractors draw them, the store keeps them, and renderers paint from them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+
+
+def _label(dtype: str, *dimensions: str) -> Any:
+    """A stored label: its data type, and its dimensions after episode and step."""
+    return field(metadata={"dtype": dtype, "dimensions": dimensions})
 
 
 @dataclass(frozen=True)
@@ -24,12 +29,12 @@ class DistractorState:
       style: (...,) int16, visual look of a maze, its style * 100 + variant; -1: none.
     """
 
-    camera_position: np.ndarray
-    camera_quaternion: np.ndarray
-    material_rgb: np.ndarray
-    background_video: np.ndarray
-    background_frame: np.ndarray
-    style: np.ndarray
+    camera_position: np.ndarray = _label("float32", "view", "xyz")
+    camera_quaternion: np.ndarray = _label("float32", "view", "wxyz")
+    material_rgb: np.ndarray = _label("float32", "material", "rgb")
+    background_video: np.ndarray = _label("int16")
+    background_frame: np.ndarray = _label("int16")
+    style: np.ndarray = _label("int16")
 
     def __getitem__(self, index: Any) -> DistractorState:
         """Index the leading axes of all labels alike."""
@@ -39,8 +44,8 @@ class DistractorState:
         return len(self.background_video)
 
     def items(self) -> Iterator[tuple[str, np.ndarray]]:
-        for field in fields(self):
-            yield field.name, getattr(self, field.name)
+        for label in fields(self):
+            yield label.name, getattr(self, label.name)
 
     def flat(self) -> DistractorState:
         """With the leading (episode, step) axes made one frame axis."""
@@ -48,5 +53,9 @@ class DistractorState:
         return DistractorState(**{name: value.reshape(-1, *value.shape[lead:]) for name, value in self.items()})
 
 
-DISTRACTOR_STATE_NAMES = tuple(field.name for field in fields(DistractorState))
+DISTRACTOR_STATE_NAMES = tuple(label.name for label in fields(DistractorState))
 """Names of the labels, stored as "exogenous/<name>"."""
+LABEL_DTYPES: dict[str, str] = {label.name: label.metadata["dtype"] for label in fields(DistractorState)}
+LABEL_DIMENSIONS: dict[str, tuple[str, ...]] = {
+    label.name: label.metadata["dimensions"] for label in fields(DistractorState)
+}

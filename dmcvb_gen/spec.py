@@ -12,6 +12,7 @@ import fnmatch
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import metadata
 
 from dmcvb_gen.errors import UnknownNameError
 
@@ -60,6 +61,11 @@ MAZE_TRAINED_LEVELS = ("expert", "medium")
 LEVELS = tuple(level.value for level in Level)
 
 DISTRACTOR_KINDS = ("none", "static", "dynamic")
+"""DMC-VB's kinds of distractors; `distractor_kinds` has those of users besides."""
+DISTRACTOR_ENTRY_POINTS = "dmcvb_gen.distractors"
+"""Entry points of other packages' distractors: the kind's name -> its class; see `distractors.registry`."""
+own_distractors: set[str] = set()
+"""Kinds that were registered in this process."""
 DIFFICULTY_SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 """Difficulty -> the scale s of every range (Distracting Control Suite); medium is DMC-VB's."""
 DIFFICULTY_VIDEOS = {"easy": 4, "medium": 8, "hard": None}
@@ -136,8 +142,8 @@ class Distractor:
     difficulty: str = "medium"
 
     def __post_init__(self) -> None:
-        if self.kind not in DISTRACTOR_KINDS:
-            raise UnknownNameError("distractor", self.kind, DISTRACTOR_KINDS)
+        if self.kind not in DISTRACTOR_KINDS and self.kind not in distractor_kinds():
+            raise UnknownNameError("distractor", self.kind, distractor_kinds())
         if self.difficulty not in DIFFICULTIES:
             raise UnknownNameError("difficulty", self.difficulty, DIFFICULTIES)
 
@@ -165,6 +171,12 @@ class Distractor:
         """
         kind, _, difficulty = name.partition("_")
         return cls(kind, difficulty or "medium")
+
+
+def distractor_kinds() -> tuple[str, ...]:
+    """All kinds of distractors: DMC-VB's, then those that users registered or whose packages are installed."""
+    installed = [point.name for point in metadata.entry_points(group=DISTRACTOR_ENTRY_POINTS)]
+    return tuple(dict.fromkeys([*DISTRACTOR_KINDS, *sorted(own_distractors), *installed]))
 
 
 def parse_setting(task_id: str, setting: str) -> tuple[Distractor, GoalMode | None]:

@@ -38,6 +38,7 @@ from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
 from dmcvb_gen.dataset.manifest import SCHEMA_VERSION, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, stored_pictures
+from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES
 
 PIXEL_CHUNK_STEPS = 32
 """Steps an inner chunk of the pictures: the unit of reading (chosen with scripts/bench_store.py)."""
@@ -132,7 +133,6 @@ def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None =
     both = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
     names = both if pictures is None else pictures
     fields = {name: list(part) for name, part in shape.state_fields.items()}
-    views = len(shape.views)
     specs = [picture_spec(name, size) for name in names]
     specs += [
         ArraySpec("state", "float32", (shape.state_size,), ("state_dim",), attributes={"fields": fields}),
@@ -140,12 +140,7 @@ def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None =
         ArraySpec("reward", "float32"),
         ArraySpec("discount", "float32"),
         ArraySpec("physics", "float64", (shape.physics_size,), ("physics_dim",)),
-        ArraySpec("exogenous/camera_position", "float32", (views, 3), ("view", "xyz")),
-        ArraySpec("exogenous/camera_quaternion", "float32", (views, 4), ("view", "wxyz")),
-        ArraySpec("exogenous/material_rgb", "float32", (shape.materials, 3), ("material", "rgb")),
-        ArraySpec("exogenous/background_video", "int16"),
-        ArraySpec("exogenous/background_frame", "int16"),
-        ArraySpec("exogenous/style", "int16"),
+        *_label_specs(shape),
         ArraySpec("length", "int32", steps=False),
         ArraySpec("terminated", "bool", steps=False),
         ArraySpec("return", "float64", steps=False),
@@ -154,6 +149,15 @@ def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None =
         ArraySpec("goal_pair", "int16", steps=False),
     ]
     return tuple(specs)
+
+
+def _label_specs(shape: EpisodeShape) -> list[ArraySpec]:
+    """The distractors' labels, in the order of `DistractorState`."""
+    sizes = {"view": len(shape.views), "material": shape.materials, "xyz": 3, "wxyz": 4, "rgb": 3}
+    return [
+        ArraySpec(f"exogenous/{name}", dtype, tuple(sizes[d] for d in LABEL_DIMENSIONS[name]), LABEL_DIMENSIONS[name])
+        for name, dtype in LABEL_DTYPES.items()
+    ]
 
 
 # -- codecs: how one inner chunk becomes bytes ----------------------------------------------------

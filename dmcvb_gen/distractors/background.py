@@ -1,12 +1,12 @@
-"""The background distractor: an episode's own stream in, a video and one of its frames for every frame out."""
+"""The background distractor: each episode draws a video, and every frame shows a frame of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import Distractor
+from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
 TICKS_A_FRAME = 10
@@ -44,3 +44,24 @@ def background_walk(
         video[episode] = chosen
         index[episode] = ping_pong(start, direction, moves, int(lengths[chosen]))
     return video, index
+
+
+class Background(DistractorPart):
+    """A video on the sky, from a start frame in a direction; -1 for the model's own sky."""
+
+    kinds = ("static", "dynamic")
+    stream = "background"
+    names = ("background_video", "background_frame")
+
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        if scene.backgrounds is None:
+            raise ValueError(f"distractor {scene.setting.name!r} needs backgrounds")
+        lengths = scene.backgrounds.lengths
+        self._video, self._index = background_walk(lengths, scene.setting, scene.frames, generators)
+
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        return {"background_video": self._video[:, frames], "background_frame": self._index[:, frames]}
+
+    @classmethod
+    def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
+        return {name: np.full(physics.shape[:-1], -1, np.int16) for name in cls.names}

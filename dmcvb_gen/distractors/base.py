@@ -1,13 +1,78 @@
-"""What varies in a picture and nowhere else: the setting's name in, its ranges and videos out."""
+"""What a distractor is: it varies some labels of the pictures under some settings, from a random stream of its own."""
 
 from __future__ import annotations
 
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from dmcvb_gen.distractors.backgrounds import Backgrounds
 from dmcvb_gen.spec import DIFFICULTY_SCALES as SCALES
 from dmcvb_gen.spec import DISTRACTOR_KINDS as KINDS
 from dmcvb_gen.spec import Distractor
 from dmcvb_gen.tasks.base import Task
 
-__all__ = ["KINDS", "SCALES", "Distractor", "floor_alpha_for"]
+__all__ = ["KINDS", "SCALES", "Distractor", "DistractorPart", "Scene", "floor_alpha_for"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a distractor draws its labels for.
+
+    Attributes:
+      task: the task that is shown.
+      setting: kind and difficulty; ranges are multiples of its `scale`.
+      episodes, frames: how many episodes, and frames an episode at most.
+      backgrounds: the videos; None if the setting is "none".
+      split: "train" or "val", which maze styles.
+    """
+
+    task: Task
+    setting: Distractor
+    episodes: int
+    frames: int
+    backgrounds: Backgrounds | None
+    split: str = "train"
+
+
+class DistractorPart(abc.ABC):
+    """One distractor. An instance holds what it drew for the episodes of a scene.
+
+    Random walks need their stream alone; a label that follows the agent is completed in `labels`.
+
+    Attributes:
+      kinds: kinds of settings under which it varies.
+      stream: the episode's random stream that it draws from, one of `seeding.STREAMS`.
+      names: labels that it gives, fields of `DistractorState`; these are stored, and renderers paint from them.
+    """
+
+    kinds: ClassVar[tuple[str, ...]]
+    stream: ClassVar[str]
+    names: ClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        """Draw whole episodes, one from each generator. A longer episode must begin with the shorter one."""
+
+    @abc.abstractmethod
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        """The labels of some frames.
+
+        Args:
+          physics: (episode, physics) or (episode, frame, physics) float64, the states at these frames.
+          frames: one frame of all episodes, or a slice of them; indexes the second axis of what was drawn.
+
+        Returns:
+          name -> array with the leading shape of `physics`.
+        """
+
+    @classmethod
+    def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
+        """The labels of the task as it is, where the setting leaves this distractor out; as `labels`."""
+        raise NotImplementedError
 
 
 def floor_alpha_for(task: Task, setting: Distractor) -> float:

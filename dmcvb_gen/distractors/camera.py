@@ -1,4 +1,4 @@
-"""The camera distractor: an episode's own stream in, a camera that drifts around the agent out.
+"""The camera distractor: a camera that drifts around the agent and looks at it.
 
 The camera moves in spherical coordinates around the agent's centre of mass, so its walk is drawn without
 the trajectory; the centre of mass of each frame is added last.
@@ -6,14 +6,15 @@ the trajectory; the centre of mass of each frame is added last.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import Distractor
+from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
 from dmcvb_gen.tasks.base import ACTION_REPEAT
+from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
 
 VELOCITY_STD = 0.1  # of a tick's change of velocity, times s and r0 / 4, meters a tick
 MAX_SPEED = 0.4  # times s and r0 / 4, meters a tick
@@ -146,3 +147,36 @@ def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
     up = np.cross(back, right)
     sin, cos = (part[..., None] for part in arithmetic.sin_cos(roll))
     return np.stack([cos * right + sin * up, cos * up - sin * right, back], axis=-1)
+
+
+class Camera(DistractorPart):
+    """One camera around the agent; without it, the cameras of the task's views."""
+
+    kinds = ("static", "dynamic")
+    stream = "camera"
+    names = ("camera_position", "camera_quaternion")
+
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        self._task, model, camera = scene.task, scene.task.model, camera_ids(scene.task)[0]
+        offset = np.asarray(model.cam_poscom0[camera])
+        bounds = camera_range(offset, scene.setting)
+        self._offset, roll = camera_walk(bounds, scene.setting, scene.frames, generators)
+        target = nominal_target(offset, model.cam_mat0[camera].reshape(3, 3))
+        self._quaternion = quaternions(look_at(self._offset - target, roll))
+
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        lead, flat = physics.shape[:-1], physics.reshape(-1, physics.shape[-1])
+        agent = centers_of_mass(self._task, flat).reshape(*lead, 3)
+        return {
+            "camera_position": (agent + self._offset[:, frames])[..., None, :],
+            "camera_quaternion": self._quaternion[:, frames][..., None, :],
+        }
+
+    @classmethod
+    def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
+        lead, flat = physics.shape[:-1], physics.reshape(-1, physics.shape[-1])
+        position, quaternion = nominal_cameras(scene.task, flat)
+        return {
+            "camera_position": position.reshape(*lead, -1, 3),
+            "camera_quaternion": quaternion.reshape(*lead, -1, 4),
+        }

@@ -1,17 +1,18 @@
-"""The color distractor: an episode's own stream in, a color for every material and frame out."""
+"""The color distractor: the color of every material walks around the model's own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import Distractor
+from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
 from dmcvb_gen.tasks.base import ACTION_REPEAT
+from dmcvb_gen.tasks.cameras import seen_materials
 
 STEP_STD = 0.03
-"""Of a tick's change of a channel, times s."""
+"""Standard deviation of the change of a channel in one tick, as a multiple of s."""
 
 
 def color_walk(
@@ -39,3 +40,25 @@ def color_walk(
         if (tick + 1) % ACTION_REPEAT == 0:
             out[:, (tick + 1) // ACTION_REPEAT] = color
     return out
+
+
+class Color(DistractorPart):
+    """A color for every material; those that no geom or site shows keep the model's."""
+
+    kinds = ("static", "dynamic")
+    stream = "color"
+    names = ("material_rgb",)
+
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        own = scene.task.material_colors
+        self._colors = color_walk(own, scene.setting, scene.frames, generators)
+        unseen = np.setdiff1d(np.arange(len(own)), seen_materials(scene.task.model))
+        self._colors[:, :, unseen] = own[unseen]  # a label that nobody sees would only cost bytes
+
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        return {"material_rgb": self._colors[:, frames]}
+
+    @classmethod
+    def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
+        own = scene.task.material_colors
+        return {"material_rgb": np.broadcast_to(own, (*physics.shape[:-1], *own.shape))}

@@ -9,7 +9,7 @@ import numpy as np
 
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_KINDS, FIXED, GOAL_MODES, LEVELS
+from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds
 from dmcvb_gen.version import __version__
 
 
@@ -84,7 +84,7 @@ def describe_package() -> dict[str, Any]:
         tasks=tasks,
         suite_tasks=list(suite_ids()),
         levels=list(LEVELS),
-        distractors=list(DISTRACTOR_KINDS),
+        distractors=list(distractor_kinds()),
         difficulties=list(DIFFICULTIES),
         maze_settings=list(GOAL_MODES),
         recipes=list(shipped_recipes()),

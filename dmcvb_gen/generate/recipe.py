@@ -28,7 +28,6 @@ from dmcvb_gen.files import read_yaml
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import (
     ANT_MAZE,
-    DISTRACTOR_KINDS,
     FAMILIES,
     FIXED,
     GOAL_MODES,
@@ -36,6 +35,7 @@ from dmcvb_gen.spec import (
     VISIBLE,
     Distractor,
     SubsetSpec,
+    distractor_kinds,
     is_maze,
     parse_setting,
 )
@@ -242,7 +242,7 @@ def narrow(
 
 def _canonical(setting: str) -> str:
     """ "dynamic_medium" -> "dynamic"; what is no distractor stays."""
-    return Distractor.parse(setting).name if setting.split("_")[0] in DISTRACTOR_KINDS else setting
+    return Distractor.parse(setting).name if setting.split("_")[0] in distractor_kinds() else setting
 
 
 SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps")

@@ -20,7 +20,8 @@ from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.dataset.schema import stored_name
 from dmcvb_gen.distractors import background, camera, color
-from dmcvb_gen.distractors.base import Distractor
+from dmcvb_gen.distractors.base import KINDS, Distractor
+from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import remove_partial, replacing, write_text
 from dmcvb_gen.generate.info import describe_release
@@ -303,6 +304,10 @@ def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
     for name, setting in settings.items():
         if setting.kind == "none":
             rows.append((name, "the model's own camera, colors and sky", "", "", ""))
+            continue
+        if setting.kind not in KINDS:
+            words = "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in distractors_of(setting) if d.kinds)
+            rows.append((name, f"s = {setting.scale:g}; {words}", "", "", ""))
             continue
         s, moving = setting.scale, setting.kind == "dynamic"
         low, high = 1 - camera.RADIUS_RANGE[0] * s, 1 + camera.RADIUS_RANGE[1] * s

@@ -1,0 +1,30 @@
+"""The style of mazes: an episode draws textures of walls and floor from its own stream, under every setting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dmcvb_gen.distractors.base import DistractorPart, Scene
+
+
+def _draw(rng: np.random.Generator, choices: Sequence[int]) -> int:
+    return choices[int(rng.integers(len(choices)))]
+
+
+class Style(DistractorPart):
+    """A style of the split for each episode, then one of its looks; -1 for tasks that have no styles."""
+
+    kinds = ()  # a task's styles vary under every setting
+    stream = "style"
+    names = ("style",)
+
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        task, styles = scene.task, scene.task.styles(scene.split)
+        self._style = np.full((scene.episodes, scene.frames), -1, np.int16)
+        if styles:
+            self._style[:] = [[_draw(rng, task.looks(_draw(rng, styles)))] for rng in generators]
+
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        return {"style": self._style[:, frames]}

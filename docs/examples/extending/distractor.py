@@ -1,0 +1,22 @@
+"""A distractor: `--distractor grey` gives every material one grey, drawn for each episode."""
+
+import numpy as np
+
+from dmcvb_gen.distractors import DistractorPart, register_distractor
+
+
+@register_distractor
+class Grey(DistractorPart):
+    """Every material has the same grey, uniform within s of the middle."""
+
+    kinds = ("grey",)  # settings that vary it: grey, grey_easy, grey_hard
+    stream = "color"  # the episode's random stream to draw from
+    names = ("material_rgb",)  # the labels that it gives; all others stay the task's own
+
+    def __init__(self, scene, generators):
+        shape = (scene.frames, *scene.task.material_colors.shape)
+        scale = scene.setting.scale
+        self._grey = np.stack([np.full(shape, 0.5 + scale * rng.uniform(-1, 1)) for rng in generators])
+
+    def labels(self, physics, frames):
+        return {"material_rgb": self._grey[:, frames]}

@@ -1,0 +1,53 @@
+"""The examples of docs/extending.md: each registers one thing of the user's own, and a public command uses it."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "docs" / "examples" / "extending"
+SHORT = ["--level", "random", "--episodes", "2", "--max-steps", "3", "--size", "16", "--workers", "1"]
+
+
+def load(name: str):
+    """Import an example as users import a module of their own, once."""
+    module = f"extending_{name}"
+    if module not in sys.modules:
+        spec = importlib.util.spec_from_file_location(module, EXAMPLES / f"{name}.py")
+        sys.modules[module] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[module])
+    return sys.modules[module]
+
+
+def run(*arguments) -> str:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_an_example_is_short_and_shown(path):
+    assert len(path.read_text().splitlines()) < 30
+    assert f"examples/extending/{path.name}" in (ROOT / "docs" / "extending.md").read_text()
+
+
+def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
+    load("distractor")
+    run("rollout", "walker-walk", "--distractor", "grey_hard", *SHORT, "--out", tmp_path / "r")
+    run("verify", tmp_path / "r")
+    subset = open_release(tmp_path / "r")["walker-walk/random/grey_hard"]
+    colors = subset.read("exogenous/material_rgb")
+    assert (colors == colors[:, :1, :1, :1]).all() and (np.abs(colors - 0.5) <= 0.3).all()
+    assert len(np.unique(colors)) == 2  # one grey an episode
+    assert (subset.read("exogenous/background_video") == -1).all()  # what it does not give is the task's own
+    run("card", tmp_path / "r")
+    assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
