@@ -101,8 +101,8 @@ def protocol(
 
 
 def renderer_choice(subset: Subset) -> dict[str, Any]:
-    """Name and samples of the renderer: the data's own, or the default one where they were painted elsewhere."""
-    if subset.record.imported:
+    """Name and samples of the renderer: the data's own, or the default one if another program painted them or nobody."""
+    if subset.record.imported or not subset.record.renderer:
         default = RendererChoice()
         return {"name": default.backend, "samples": default.samples}
     return {"name": subset.record.renderer["name"], "samples": subset.record.renderer.get("samples")}
