@@ -101,7 +101,7 @@ def protocol(
 
 
 def renderer_choice(subset: Subset) -> dict[str, Any]:
-    """Name and samples of the renderer: the data's own, or the default one if another program painted them or nobody."""
+    """Name and samples of the renderer: the data's own, or the default one if the record names none of ours."""
     if subset.record.imported or not subset.record.renderer:
         default = RendererChoice()
         return {"name": default.backend, "samples": default.samples}
