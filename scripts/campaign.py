@@ -2,6 +2,7 @@
 
     python scripts/campaign.py --minutes 60 --seed 1                 # a line a history, then a table
     python scripts/campaign.py --seed 1 --history 17 --count 1       # the same history again
+    python scripts/campaign.py --races --seed 1 --table races.json   # every pair of commands on one release at once
 
 A history makes a release (walker or a maze), then damages, repairs, repaints, publishes, fetches and exports it, and
 strikes commands and files with faults. After every step: what was committed is there, with the bytes of a release that
@@ -35,6 +36,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from tests.faults import races  # noqa: E402
 from tests.faults.commands import Command, Ended, session  # noqa: E402
 from tests.faults.tiny import shrink  # noqa: E402
 
@@ -154,21 +156,21 @@ class World:
         proxy = [sys.executable, "-m", "tests.faults.proxy", f"127.0.0.1:{port}"]
         self._processes.append(subprocess.Popen(proxy, stdout=subprocess.PIPE, text=True, **quiet))
         self.s3 = f"http://127.0.0.1:{int(self._processes[1].stdout.readline())}"
-        self._direct = f"http://127.0.0.1:{port}"
+        self.direct = f"http://127.0.0.1:{port}"
         for attempt in range(300):
             with contextlib.suppress(OSError):
-                urllib.request.urlopen(self._direct).close()
+                urllib.request.urlopen(self.direct).close()
                 break
             time.sleep(0.1 + 0 * attempt)
-        urllib.request.urlopen(urllib.request.Request(f"{self._direct}/bucket", method="PUT")).close()
+        urllib.request.urlopen(urllib.request.Request(f"{self.direct}/bucket", method="PUT")).close()
 
     def spoil(self, kinds: list[str], share: float, seed: int, times: int = 10**9) -> None:
         body = json.dumps(dict(kinds=kinds, share=share, seed=seed, times=times)).encode()
         urllib.request.urlopen(urllib.request.Request(f"{self.s3}/__faults__", body, method="POST")).close()
 
     def empty_bucket(self) -> None:
-        urllib.request.urlopen(urllib.request.Request(f"{self._direct}/moto-api/reset", method="POST")).close()
-        urllib.request.urlopen(urllib.request.Request(f"{self._direct}/bucket", method="PUT")).close()
+        urllib.request.urlopen(urllib.request.Request(f"{self.direct}/moto-api/reset", method="POST")).close()
+        urllib.request.urlopen(urllib.request.Request(f"{self.direct}/bucket", method="PUT")).close()
 
     def close(self) -> None:
         for process in self._processes:
@@ -592,6 +594,21 @@ def tell_history(world: World, seed: int, number: int, steps: int) -> str | None
     return wrong
 
 
+def race(options: argparse.Namespace) -> int:
+    """Every pair of commands at once, of those that are asked for."""
+    pairs = [pair for pair in races.all_pairs() if any(name in pair.name for name in options.pair or [""])]
+    pairs = pairs[options.history : options.history + options.count]
+    warm()
+    with tempfile.TemporaryDirectory(prefix="races-", dir=MEMORY) as folder:
+        world = World(Path(folder), Table()) if any(pair.place == "bucket" for pair in pairs) else None
+        try:
+            wrong = races.campaign(pairs, Path(folder), world and world.direct, options.seed, options.table)
+        finally:
+            if world:
+                world.close()
+    return 1 if wrong else 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10)
@@ -601,13 +618,20 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=9, help="operations a history at most")
     parser.add_argument("--table", type=Path, help="JSON of the counts: read at the start if there, kept up to date")
     parser.add_argument("--summary", action="store_true", help="print a summary of --table and leave")
+    parser.add_argument("--races", action="store_true", help="race every pair of commands on one release instead")
+    parser.add_argument("--pair", action="append", metavar="NAME", help="with --races: only pairs with NAME in theirs")
     options = parser.parse_args()
+    if options.summary and options.races:
+        print(races.summary(options.table))
+        return 0
     if options.summary:
         table = Table()
         table.load(options.table)
         print(table.summary())
         return 0
     os.environ |= {"AWS_ACCESS_KEY_ID": "someone", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}
+    if options.races:
+        return race(options)
     table = Table()
     if options.table:
         table.load(options.table)

@@ -171,3 +171,10 @@ def test_reading_a_store_needs_no_simulator():
     code = "import sys, dmcvb_gen.dataset, dmcvb_gen.spec; print([m for m in ('mujoco', 'torch') if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_the_architecture_names_every_package_and_no_other():
+    text = (ROOT.parent / "docs" / "architecture.md").read_text()
+    table = text.split("```text")[1].split("```")[0]
+    named = {line.split()[0] for line in table.splitlines() if line}
+    assert named == {path.parent.name for path in ROOT.glob("*/__init__.py")}
