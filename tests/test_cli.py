@@ -130,7 +130,7 @@ def broken_policy(tmp_path, kind):
         (["rollout", "walker-walk", "--level", "expert", "--behaviour", "TRUNCATED"], "not a whole policy file"),
         (["rollout", "walker-walk", "--level", "expert", "--behaviour", "NAN"], "not finite"),
         (["rollout", "cheetah-run", "--level", "expert", "--behaviour", "WALKER"], "not for cheetah-run"),
-        (["rollout", "walker-walk", "--goal", "hidden"], "ant-maze"),
+        (["rollout", "walker-walk", "--goal", "hidden"], "outside mazes"),
         (["rollout", "--recipe", "no-such-recipe"], "dmcvb-mini"),
         (["rollout"], "TASK"),
         (["rollout", "walker-walk", "--range", "5:2"], "A < B"),

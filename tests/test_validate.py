@@ -221,10 +221,10 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--agents", "bcc"), "state-bc"),
         ((release, "--benchmark", "b9"), "ablations"),
         ((release, "--benchmark", "b3"), "--fixed-goals"),
-        ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; leave it out"),
+        ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; remove it"),
         ((release, "--agents", "bc:k=5"), "leave them out"),
-        ((release, "--checks-only", "--agents", "bc"), "--checks-only trains nothing; leave out --agents"),
-        ((release, "--checks-only", "--benchmark", "b2"), "leave out --benchmark"),
+        ((release, "--checks-only", "--agents", "bc"), "--checks-only trains nothing; remove it"),
+        ((release, "--checks-only", "--benchmark", "b2"), "--benchmark has no effect"),
         ((release, "--only", "cheetah-run/*"), NAME),
         ((tmp_path,), "no release"),
     ):

@@ -134,7 +134,7 @@ def _check_heard(agent: Agent, name: str) -> None:
     if agent.pretrain != "id" and (agent.k != 1 or agent.sample_k):
         raise DmcvbError(f"agent {name!r}: k and sample are of inverse dynamics (id+bc:k=5); leave them out")
     if agent.unbounded and agent.policy != "td3-bc":
-        raise DmcvbError(f"agent {name!r}: only the critics of td3-bc can be unbounded; leave it out")
+        raise DmcvbError(f"agent {name!r}: only the critics of td3-bc can be unbounded; remove it")
     if agent.sample_k and agent.k == 1:
         raise DmcvbError(f"agent {name!r}: sample draws k from 1 to a largest one; give it, k=2 or more")
 

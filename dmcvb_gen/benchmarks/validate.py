@@ -177,7 +177,7 @@ def _plan(
     if benchmarks and idle:
         raise DmcvbError(
             f"{' and '.join(benchmarks)} set agents with a pre-trained encoder beside bc, and {', '.join(idle)} "
-            "has none; leave it out, or add --benchmark b1"
+            "has none; remove it, or add --benchmark b1"
         )
     return cells, missing
 

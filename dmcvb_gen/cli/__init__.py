@@ -1,7 +1,8 @@
-"""The `dmcvb-gen` command: each sub-command is a thin face over a public function, loaded when called."""
+"""The `dmcvb-gen` command. Each sub-command calls one public function, which is imported when it is called."""
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import signal
 import sys
@@ -14,32 +15,44 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import cure
 from dmcvb_gen.version import __version__
 
-COMMANDS = {
-    "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of painted episodes."),
-    "status": ("cluster:status", "Show how far a release is that is being made, here or on many machines."),
-    "info": ("rollout:info", "Show what a release holds, returns beside the paper's."),
-    "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
-    "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
-    "show-maze": ("maze:show_maze", "Picture a maze, its distances to a goal and the path there."),
-    "list": ("rollout:list_command", "List tasks, levels, distractors, behaviours, recipes, renderers."),
-    "verify": ("release:verify", "Check that a release is what it says."),
-    "validate": ("validate:validate", "Check a release, run the paper's benchmarks, report both."),
-    "claims": ("validate:claims", "Test the paper's claims, and the rank of its scores, on reports of validate."),
-    "regenerate": ("release:regenerate", "Make a release again from its manifest: check, repair or beside."),
-    "paint": ("paint:paint", "Fill in the pictures of a release that travelled without."),
-    "repaint": ("release:repaint", "New pixels from stored physics states: distractor, size, renderer."),
-    "diff": ("release:diff_command", "Which subsets, episodes and digests differ between two releases."),
-    "card": ("release:card", "Write a release's card: README.md, croissant.json, pictures."),
-    "publish": ("release:publish", "Put a release at a URL: s3://, gs://, hf://, file: or any other of fsspec."),
-    "fetch": ("fetch:fetch", "Bring a published release, or a part of it."),
-    "export": ("release:export", "Write subsets in another format: HDF5, npz, Minari, LeRobot, RLDS, Zarr 2."),
-    "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
-    "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
-    "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
-    "select-checkpoints": ("behaviours:select_checkpoints", "Pick a run's expert, medium and mixed checkpoints."),
-    "evaluate-behaviour": ("behaviours:evaluate_behaviour", "Returns of behaviour policies, beside the paper's."),
+GROUPS = {
+    "Make data": {
+        "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of episodes."),
+        "status": ("cluster:status", "Show the progress of a release that is being made."),
+        "paint": ("paint:paint", "Render the images of a release stored without pixels."),
+        "repaint": ("release:repaint", "Render stored episodes again: other distractors, size or renderer."),
+        "regenerate": ("release:regenerate", "Generate a release again from its manifest: check, repair or copy."),
+        "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
+    },
+    "Train policies": {
+        "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
+        "select-checkpoints": ("behaviours:select_checkpoints", "Pick the expert, medium and mixed checkpoints."),
+        "evaluate-behaviour": ("behaviours:evaluate_behaviour", "Measure the returns of behaviour policies."),
+    },
+    "Look and check": {
+        "list": ("rollout:list_command", "List tasks, levels, distractors, recipes and renderers."),
+        "info": ("rollout:info", "Show what a release holds, beside the paper's returns."),
+        "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
+        "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
+        "show-maze": ("maze:show_maze", "Draw a maze, its distances to a goal and the path there."),
+        "verify": ("release:verify", "Check every file, value, state and image of a release."),
+        "validate": ("validate:validate", "Train the paper's agents on a release and report their scores."),
+        "claims": ("validate:claims", "Test the paper's claims, and its ranking, on reports of validate."),
+        "diff": ("release:diff_command", "Compare two releases: subsets, episodes and digests."),
+    },
+    "Share": {
+        "card": ("release:card", "Write the card of a release: README.md, croissant.json, images."),
+        "publish": ("release:publish", "Upload a release: s3://, gs://, hf:// or any fsspec URL."),
+        "fetch": ("fetch:fetch", "Download a published release, or a part of it."),
+    },
+    "Convert": {
+        "export": ("release:export", "Write subsets in another format: HDF5, Minari, LeRobot, RLDS, ..."),
+        "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
+    },
 }
-"""Command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""
+"""Heading -> command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""
+COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in commands.items()}
+"""Command -> ("module:attribute", short help)."""
 
 
 ALIASES = {"questions": "claims"}
@@ -59,9 +72,17 @@ class LazyGroup(click.Group):
         module, attribute = COMMANDS[name][0].split(":")
         return getattr(importlib.import_module(f"dmcvb_gen.cli.{module}"), attribute)
 
+    def resolve_command(self, ctx, args):
+        if args and args[0] not in COMMANDS | ALIASES and not args[0].startswith("-"):
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else " `dmcvb-gen --help` lists the commands."
+            ctx.fail(f"unknown command {args[0]!r}.{hint}")
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx, formatter):
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+        for heading, commands in GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name, text) for name, (_, text) in commands.items()], col_max=20)
 
     def invoke(self, ctx):
         _asked_to_stop.clear()

@@ -5,23 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.table import Table
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, print_table
 
 
 @click.command("train-behaviour")
 @click.argument("task")
-@click.option("--out", type=OutPath(path_type=Path), help="The run's folder.  [default: runs/TASK]")
+@click.option("--out", type=OutPath(path_type=Path), help="Folder of the run.  [default: runs/TASK]")
 @click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
-@click.option("--seed", type=click.IntRange(0), help="[default: 0]")
+@click.option("--seed", type=click.IntRange(0), help="Random seed.  [default: 0]")
 @click.option("--algo", help="sac, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac]")
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="Override a setting. Repeatable.")
 @click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
-@click.option("--init-from", metavar="RUN|FILE", help="Start from (guided: be guided by) another run or a policy file.")
+@click.option("--init-from", metavar="RUN|FILE", help="Run or policy file to start from; guided: the guide.")
 @click.option("--evaluate-every", type=click.IntRange(1), help="Agent steps between evaluations while returns are low.")
-@click.option("--resume", is_flag=True, help="Go on with the run in --out; what is not given is as it was.")
+@click.option("--resume", is_flag=True, help="Resume the run in --out with its own settings.")
 @json_option
 def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, resume, as_json):
     """Train a behaviour policy online on states.
@@ -48,7 +46,7 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     folder = out or Path("runs") / task
     found = read_config(folder) if resume else None
     if resume and found is None:
-        raise DmcvbError(f"{folder} holds no run to go on with; give its folder with --out, or leave out --resume")
+        raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
     algorithm = algo or (found.algorithm if found else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
     configuration = run_config(task, algorithm, parse_settings(pairs, config, algorithm), found, **given)
@@ -75,9 +73,11 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
 
 @click.command("select-checkpoints")
 @click.argument("run", type=click.Path(path_type=Path))
-@click.option("--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes a pick.")
+@click.option(
+    "--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes to score each pick."
+)
 @click.option("--seed", type=click.IntRange(0), default=20_000, show_default=True)
-@click.option("--sample", is_flag=True, help="Judge drawn actions instead of mean ones.")
+@click.option("--sample", is_flag=True, help="Score sampled actions instead of the policy mean.")
 @click.option("--converged", type=float, help="Return at convergence, of a longer run.  [default: from the curve]")
 @json_option
 def select_checkpoints(run, episodes, seed, sample, converged, as_json):
@@ -95,26 +95,20 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     picked = module.select_checkpoints(run, episodes, seed, not sample, converged)
     if as_json:
         return print_json(module.selection_json(picked))
-    console = Console()
-    state = "converged" if picked.convergence.converged else f"not converged ({picked.convergence.reason})"
     end = picked.convergence
-    console.print(f"{picked.task}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
-    table = Table()
-    for column in ("pick", "agent step", "aimed at", "mean", "std"):
-        table.add_column(column, justify="right" if column != "pick" else "left")
-    for picks in picked.picks.values():
-        for pick in picks:
-            table.add_row(
-                pick.name,
-                f"{pick.step:,}",
-                pick.target,
-                f"{pick.evaluation.mean:.1f}",
-                f"{pick.evaluation.std:.1f}",
-            )
-    console.print(table)
+    state = "converged" if end.converged else f"not converged ({end.reason})"
+    click.echo(f"{picked.task}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
+    picks = [pick for level in picked.picks.values() for pick in level]
+    print_table(
+        ("pick", "agent step", "<aimed at", "mean", "std"),
+        [
+            (pick.name, f"{pick.step:,}", pick.target, f"{pick.evaluation.mean:.1f}", f"{pick.evaluation.std:.1f}")
+            for pick in picks
+        ],
+    )
     for level, reason in picked.reasons.items():
-        console.print(f"{level} cannot be picked yet: {reason}", style="yellow")
-    console.print(f"wrote {run}/selected, {run}/selection.json, {run}/curve.png")
+        click.echo(f"{level} cannot be picked yet: {reason}")
+    click.echo(f"wrote {run}/selected, {run}/selection.json, {run}/curve.png")
 
 
 @click.command("evaluate-behaviour")
@@ -122,16 +116,16 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
 @click.option(
     "--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: all bundled]"
 )
-@click.option("--behaviour", metavar="FILE|RUN", help="A policy file or a run's picks instead of the bundled ones.")
+@click.option("--behaviour", metavar="FILE|RUN", help="Policy file or run to evaluate instead of the bundled policies.")
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
-@click.option("--sample", is_flag=True, help="Draw actions instead of taking mean ones.")
-@click.option("--pictures", type=OutPath(path_type=Path), help="A folder for pictures of ten paths a maze.")
+@click.option("--sample", is_flag=True, help="Sample actions instead of using the policy mean.")
+@click.option("--pictures", type=OutPath(path_type=Path), help="Folder for drawings of ten paths in each maze.")
 @json_option
 def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, pictures, as_json):
-    """Returns of behaviour policies over fresh episodes, beside the paper's.
+    """Measure the returns of behaviour policies over fresh episodes, beside the paper's.
 
-    Without TASK: every bundled policy, and random actions in its task; with --behaviour, that policy or run.
+    Without TASK: every bundled policy and random actions. With --behaviour: that policy or run.
 
     \b
     dmcvb-gen evaluate-behaviour
@@ -183,18 +177,21 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
 def _show_returns(rows, episodes, seed):
     """Print returns, the paper's under each."""
     mazes = any("success" in row for row in rows)
-    table = Table(title=f"{episodes} episodes each, seed {seed}, {rows[0]['mode']} actions")
-    columns = ("mean", "std", "min", "p25", "median", "p75", "max")
-    for column in ("task", "level", *columns, *(("success", "to goal m/s", "rms m/s") if mazes else ())):
-        table.add_column(column, justify="left" if column in ("task", "level") else "right")
+    statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
+    scores = ("success", "to goal m/s", "rms m/s") if mazes else ()
+    lines = []
     for row in rows:
-        extra = []
+        extra = [""] * len(scores)
         if "success" in row:
-            extra = [f"{row['success']:.0%}", "-" if row["speed"] is None else f"{row['speed']:.2f}"]
-            extra.append(f"{row['running_speed']:.2f}")
-        table.add_row(row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in columns), *extra)
+            speed = "-" if row["speed"] is None else f"{row['speed']:.2f}"
+            extra = [f"{row['success']:.0%}", speed, f"{row['running_speed']:.2f}"]
+        lines.append((row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in statistics), *extra))
         if row["paper"]:
-            table.add_row("", "  DMC-VB paper", *(f"{row['paper'][key]:.1f}" for key in columns), style="dim")
-    console = Console()
-    console.width = max(console.width, 130 if mazes else 110)
-    console.print(table)
+            numbers = [f"{row['paper'][key]:.1f}" for key in statistics]
+            lines.append(("  DMC-VB paper", row["level"], *numbers, *[""] * len(scores)))
+    print_table(
+        ("task", "<level", *statistics, *scores),
+        lines,
+        title=f"{episodes} episodes each, seed {seed}, {rows[0]['mode']} actions",
+        optional=(("p25", "p75"), ("rms m/s",), ("min", "max"), ("to goal m/s",)),
+    )

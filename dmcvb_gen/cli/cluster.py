@@ -7,35 +7,37 @@ import shlex
 
 import click
 from click.core import ParameterSource
-from rich.console import Console
-from rich.table import Table
 
-from dmcvb_gen.cli.common import format_duration, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import format_duration, json_option, print_json, print_table, remote_option
 from dmcvb_gen.parallel import Ray, Workers
 
 executor_option = click.option(
-    "--executor", type=click.Choice(["processes", "ray"]), default="processes", show_default=True, help="Who works."
+    "--executor",
+    type=click.Choice(["processes", "ray"]),
+    default="processes",
+    show_default=True,
+    help="Executor that runs the jobs: local processes or Ray.",
 )
 ray_option = click.option(
-    "--ray-address", metavar="ADDRESS", help="With ray: the cluster.  [default: RAY_ADDRESS, here]"
+    "--ray-address", metavar="ADDRESS", help="Address of the Ray cluster.  [default: RAY_ADDRESS, or a local one]"
 )
 
 
 def make_executor(workers: int, executor: str, address: str | None) -> Workers:
-    """Who works, as the options say.
+    """The executor that the options ask for.
 
     Raises:
-      click.UsageError: an option that says nothing about this kind of workers.
+      click.UsageError: an option has no effect with this executor.
     """
     if executor == "ray":
         context = click.get_current_context(silent=True)
         if context and context.get_parameter_source("workers") == ParameterSource.COMMANDLINE:
             raise click.UsageError(
-                "--workers are processes; a Ray cluster has as many as it has cores, so leave it out."
+                "--workers has no effect with --executor ray, which uses every core of the cluster: remove it."
             )
         return Ray(address)
     if address:
-        raise click.UsageError("--ray-address is for --executor ray.")
+        raise click.UsageError("--ray-address has no effect without --executor ray: remove it.")
     return workers
 
 
@@ -122,9 +124,9 @@ def _given(context, without) -> list[str]:
 @remote_option
 @json_option
 def status(place, options, as_json):
-    """Show how far a release is that is being made: shards done and overtaken, steps/s, time left.
+    """Show the progress of a release that is being made: shards done and late, steps/s, time left.
 
-    All is told from the commit records, so it works from any machine.
+    It reads the commit records, so it works from any machine.
 
     \b
     dmcvb-gen status s3://bucket/mine
@@ -135,20 +137,22 @@ def status(place, options, as_json):
     found = progress_of(site_of(place, options))
     if as_json:
         return print_json(found.facts())
-    table = Table(title=f"{found.name}: {found.done:,} of {found.total:,} shards")
-    for column in ("subset", "done", "late", "open"):
-        table.add_column(column, justify="left" if column == "subset" else "right")
-    for subset in found.subsets:
-        table.add_row(subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done:,}")
-    Console().print(table)
+    print_table(
+        ("subset", "done", "late", "open"),
+        [
+            (subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done:,}")
+            for subset in found.subsets
+        ],
+        title=f"{found.name}: {found.done:,} of {found.total:,} shards",
+    )
     if found.steps_per_second:
         last, left = format_duration(found.silence), format_duration(found.seconds_left)
         rate = f"{found.steps_per_second:,.0f} steps/s"
         click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")
     if found.late:
         click.echo(
-            f"{found.late} shards are late: later ones are done, so they are still in flight or their worker was lost; "
-            "the same command makes them"
+            f"{found.late} shards are late: later ones are done. They are still in progress or their worker died; "
+            "rerun the same command to make them"
         )
     if found.done == found.total:
-        click.echo("complete" if found.complete else "all shards are there; finish with --finish")
+        click.echo("complete" if found.complete else "All shards are done; finish the release with --finish.")

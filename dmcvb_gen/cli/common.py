@@ -1,10 +1,11 @@
-"""What the commands share: the --json option, folders and tables."""
+"""Options, progress bars and tables that the commands share."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,76 @@ from tqdm import tqdm
 from dmcvb_gen.errors import DmcvbError
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
+
+
+class GroupedCommand(click.Command):
+    """A command whose --help lists its options under headings.
+
+    Args:
+      option_groups: heading -> names of the options below it, as the function's parameters. Options that no heading
+        names come last, under "Other".
+    """
+
+    def __init__(self, *arguments: Any, option_groups: dict[str, tuple[str, ...]], **options: Any):
+        super().__init__(*arguments, **options)
+        self.option_groups = option_groups
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        options = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
+        records = {option.name: record for option in options if (record := option.get_help_record(ctx)) is not None}
+        for heading, names in self.option_groups.items():
+            with formatter.section(heading):
+                formatter.write_dl([records.pop(name) for name in names])
+        with formatter.section("Other"):
+            formatter.write_dl(list(records.values()))
+
+
+def print_table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], title: str = "", optional: Sequence[tuple[str, ...]] = ()
+) -> None:
+    """Print a table that no terminal cuts: names on the left, numbers on the right.
+
+    A table that is wider than the terminal (80 columns in a pipe) loses groups of `optional` columns, the first
+    group first, and says so. If it is still too wide, the first column gets a line of its own above the others.
+
+    Args:
+      columns: headings; "<name" aligns a column to the left, as the first one always is.
+      rows: texts, one for each column. A row whose first text begins with a space is printed dim.
+    """
+    from rich.console import Console
+    from rich.text import Text
+
+    console, heads = Console(highlight=False), [column.removeprefix("<") for column in columns]
+    left = {i for i, column in enumerate(columns) if i == 0 or column.startswith("<")}
+    lines, shown, stacked = [list(map(str, row)) for row in rows], list(range(len(heads))), False
+    widths = [max(len(line[i]) for line in [heads, *lines]) for i in range(len(heads))]
+
+    def width() -> int:
+        cells = [widths[i] for i in shown[stacked:]]
+        return sum(cells) + 2 * (len(cells) - 1) + 2 * stacked
+
+    hidden = []
+    for names in optional:
+        if width() > console.width:
+            shown = [i for i in shown if heads[i] not in names]
+            hidden += [name for name in names if name in heads]
+    stacked = width() > console.width
+
+    def line_of(line: Sequence[str]) -> str:
+        cells = [line[i].ljust(widths[i]) if i in left else line[i].rjust(widths[i]) for i in shown[stacked:]]
+        return ("  " * stacked + "  ".join(cells)).rstrip()
+
+    def put(line: Sequence[str], style: str) -> None:
+        for text in ([line[0]] if stacked else []) + [line_of(line)]:
+            console.print(Text(text, style), soft_wrap=True)
+
+    if title:
+        console.print(Text(title, "bold"), soft_wrap=False)
+    put(heads, "bold")
+    for line in lines:
+        put(line, "dim" if line[0].startswith(" ") else "")
+    if hidden:
+        console.print(Text(f"(not shown: {', '.join(hidden)}; a wider terminal or --json shows them)", "dim"))
 
 
 def print_json(value: Any) -> None:
@@ -39,13 +110,13 @@ class ProgressBar(tqdm):
         super().__init__(disable=as_json, **options)
 
     def __call__(self, done: int | str = 1) -> None:
-        """As a tick: how much was done since the last call, or the name of one thing that is at hand."""
+        """Progress callback: how much was done since the last call, or the name of the item in progress."""
         if isinstance(done, str):
             self.set_description(done, refresh=False)
         self.update(1 if isinstance(done, str) else done)
 
     def expect(self, count: float) -> None:
-        """How much will have been done at the end; may change on the way."""
+        """Set the expected total, which may change later."""
         self.total = count
 
     def refresh(self, *args: Any, **options: Any) -> bool | None:
@@ -128,5 +199,5 @@ remote_option = click.option(
     multiple=True,
     metavar="NAME=VALUE",
     callback=parse_options,
-    help="Of the file system (fsspec), e.g. endpoint_url=http://localhost:9000. Repeatable.",
+    help="Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000. Repeatable.",
 )

@@ -16,17 +16,17 @@ from dmcvb_gen.cli.render_options import override_options, overrides_of, painted
 @click.argument("url")
 @only_option
 @episodes_option
-@click.option("--paint", "painting", is_flag=True, help="Fill in pictures that travelled without, a shard as it comes.")
+@click.option("--paint", "painting", is_flag=True, help="Render the images of each shard as it arrives.")
 @override_options
-@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the release here.")
+@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Local folder for the release.")
 @remote_option
 @transfers_option
 @json_option
 @click.pass_context
 def fetch(context, url, only, episodes, painting, size, views, goal, out, options, workers, as_json):
-    """Bring a published release, or only the shards that hold some episodes; run again, it goes on or adds.
+    """Download a published release, or a part of it. Rerun the command to resume or to add more.
 
-    With --paint, a shard is painted while the next ones come; exit code 1 where pictures are not the published ones.
+    With --paint, images are rendered during the download; the exit code is 1 if they differ from the published ones.
 
     \b
     dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini

@@ -18,8 +18,8 @@ from dmcvb_gen.cli.render_options import override_options, overrides_of, painted
 @workers_option
 @executor_option
 @ray_option
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
-@click.option("--backgrounds", metavar="FOLDER", help="Where the videos are, if the release has no copies.")
+@click.option("--device", default="cpu", show_default=True, help="Device that renders: cpu, or cuda with warp.")
+@click.option("--backgrounds", metavar="FOLDER", help="Folder of the background videos, if the release has no copies.")
 @json_option
 @click.pass_context
 def paint(

@@ -27,9 +27,11 @@ from dmcvb_gen.text import pluralize
 
 @click.command()
 @click.argument("path", metavar="RELEASE|URL")
-@click.option("--all", "everything", is_flag=True, help="At a URL, read every file; a sample by default.")
-@click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
-@click.option("--workers", type=click.IntRange(1), help="Processes; at a URL, files at once.  [default: 1; 8]")
+@click.option("--all", "everything", is_flag=True, help="At a URL: read every file instead of a sample.")
+@click.option("--backgrounds", metavar="FOLDER", help="Folder of the background videos, if it has moved.")
+@click.option(
+    "--workers", type=click.IntRange(1), help="Worker processes; at a URL: parallel downloads.  [default: 1; 8]"
+)
 @executor_option
 @ray_option
 @remote_option
@@ -99,11 +101,13 @@ def parse_episodes(context, parameter, text):
         raise click.UsageError(error.message.replace("--range", "--episodes")) from None
 
 
-only_option = click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets. Repeatable.")
+only_option = click.option("--only", multiple=True, metavar="PATTERN", help="Use only these subsets. Repeatable.")
 episodes_option = click.option(
-    "--episodes", metavar="A:B", callback=parse_episodes, help="Only the shards that hold episodes A to B - 1."
+    "--episodes", metavar="A:B", callback=parse_episodes, help="Use only the shards with episodes A to B - 1."
 )
-workers_option = click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+workers_option = click.option(
+    "--workers", type=click.IntRange(1), default=1, show_default=True, help="Worker processes."
+)
 
 
 def frames_bar(as_json):
@@ -116,14 +120,14 @@ def frames_bar(as_json):
 @click.option(
     "--manifest",
     type=click.Path(exists=True, dir_okay=False),
-    help="A manifest alone, instead of a release.",
+    help="Manifest file, instead of a release.",
 )
 @only_option
 @episodes_option
-@click.option("--check", is_flag=True, help="Only compare digests; change nothing.")
-@click.option("--out", metavar="FOLDER", type=OutPath(), help="Make the shards beside, in this folder.")
-@click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
-@click.option("--device", help="Paint on cpu or cuda instead of where the manifest says.")
+@click.option("--check", is_flag=True, help="Compare digests and change nothing.")
+@click.option("--out", metavar="FOLDER", type=OutPath(), help="Write the shards to this folder instead.")
+@click.option("--backgrounds", metavar="FOLDER", help="Folder of the background videos, if it has moved.")
+@click.option("--device", help="Render on cpu or cuda instead of the manifest's device.")
 @workers_option
 @executor_option
 @ray_option
@@ -189,13 +193,21 @@ def regenerate(
 @only_option
 @click.option("--distractor", help="none, static or dynamic.  [default: as each subset has]")
 @click.option("--difficulty", type=click.Choice(DIFFICULTIES), help="[default: as each subset has]")
-@click.option("--size", type=int, help="Pixels a side.  [default: as each subset has]")
+@click.option("--size", type=int, help="Width and height in pixels.  [default: as each subset has]")
 @click.option("--renderer", help="native, warp or opengl.  [default: as each subset has]")
-@click.option("--samples", type=click.IntRange(1, 8), help="Samples a pixel: 1, 2, 4 or 8.")
-@click.option("--backgrounds", metavar="FOLDER", help="builtin, or a folder of videos.  [default: the recipe's]")
-@click.option("--split", type=click.Choice(SPLITS), help="Videos and styles.  [default: the recipe's]")
-@click.option("--label", "labels", multiple=True, type=click.Choice(list(LABEL_TYPES)), help="Store these too.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
+@click.option("--samples", type=click.IntRange(1, 8), help="Samples per pixel: 1, 2, 4 or 8.")
+@click.option(
+    "--backgrounds", metavar="FOLDER", help="Background videos: builtin, or a folder.  [default: the recipe's]"
+)
+@click.option("--split", type=click.Choice(SPLITS), help="Background videos and maze styles.  [default: the recipe's]")
+@click.option(
+    "--label",
+    "labels",
+    multiple=True,
+    type=click.Choice(list(LABEL_TYPES)),
+    help="Also store depth or segmentation. Repeatable.",
+)
+@click.option("--device", default="cpu", show_default=True, help="Device that renders: cpu, or cuda with warp.")
 @click.option("--name", help="Name of the new release.  [default: NAME-repainted]")
 @click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
 @workers_option
@@ -223,7 +235,7 @@ def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **o
 
 
 transfers_option = click.option(
-    "--workers", type=click.IntRange(1), default=8, show_default=True, help="Files at once."
+    "--workers", type=click.IntRange(1), default=8, show_default=True, help="Parallel transfers."
 )
 
 
@@ -231,9 +243,9 @@ transfers_option = click.option(
 @click.argument("path", metavar="RELEASE")
 @click.argument("url")
 @remote_option
-@click.option("--take-over", is_flag=True, help="Go on although another publisher's claim is there.")
+@click.option("--take-over", is_flag=True, help="Publish even if another upload has claimed the URL.")
 @transfers_option
-@click.option("--no-pixels", is_flag=True, help="Leave the pictures behind; their digests travel, `paint` restores.")
+@click.option("--no-pixels", is_flag=True, help="Publish without images; `paint` renders them again.")
 @json_option
 def publish(path, url, options, take_over, workers, no_pixels, as_json):
     """Put a complete release at a URL: every file checked, the manifest last, a published version never changed.
@@ -288,9 +300,9 @@ def _left_behind(path):
 
 @click.command()
 @click.argument("path", metavar="RELEASE")
-@click.option("--check", is_flag=True, help="Only compare the card with the release; write nothing.")
+@click.option("--check", is_flag=True, help="Compare the card with the release and write nothing.")
 @click.option("--out", metavar="FOLDER", type=OutPath(), help="Folder of the card.  [default: the release]")
-@click.option("--url", help="Where the release is (or will be) published.  [default: as the card there says]")
+@click.option("--url", help="URL of the published release.  [default: the card's]")
 @json_option
 @click.pass_context
 def card(context, path, check, out, url, as_json):
@@ -325,15 +337,15 @@ def card(context, path, check, out, url, as_json):
 @click.argument("path", metavar="RELEASE|URL")
 @click.option("--to", required=True, help="Format, for example hdf5, minari, lerobot, rlds or rerun.")
 @only_option
-@click.option("--episodes", metavar="A:B", callback=parse_episodes, help="Only the episodes A to B - 1.")
-@click.option("--merge", is_flag=True, help="lerobot: all subsets as the tasks of one data set.")
-@click.option("--video", is_flag=True, help="lerobot: pictures as mp4, smaller and with losses, not as PNG.")
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes, a subset each.")
+@click.option("--episodes", metavar="A:B", callback=parse_episodes, help="Export only episodes A to B - 1.")
+@click.option("--merge", is_flag=True, help="lerobot: write all subsets as the tasks of one data set.")
+@click.option("--video", is_flag=True, help="lerobot: store images as mp4 (smaller, lossy) instead of PNG.")
+@click.option(
+    "--workers", type=click.IntRange(1), default=1, show_default=True, help="Worker processes, one subset each."
+)
 @executor_option
 @ray_option
-@click.option(
-    "--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the exports, a folder a subset."
-)
+@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Output folder, one folder per subset.")
 @remote_option
 @json_option
 def export(path, to, only, episodes, merge, video, workers, executor, ray_address, out, options, as_json):
@@ -358,11 +370,11 @@ def export(path, to, only, episodes, merge, video, workers, executor, ray_addres
 
 @click.command("import")
 @click.argument("folder")
-@click.option("--task", help="What a single folder holds, where its path does not say it.")
-@click.option("--level", help="Likewise.")
-@click.option("--setting", help="Likewise: none, static_medium, dynamic_medium, ...")
+@click.option("--task", help="Task of a folder whose path does not name it.")
+@click.option("--level", help="Level of such a folder.")
+@click.option("--setting", help="Setting of such a folder: none, static_medium, dynamic_medium, ...")
 @click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
-@click.option("--partial", is_flag=True, help="Take the files that are there, though their names say there are more.")
+@click.option("--partial", is_flag=True, help="Import the files that are there, even if some are missing.")
 @click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
 @json_option
 def import_command(folder, task, level, setting, name, partial, out, as_json):

@@ -1,4 +1,4 @@
-"""What `paint` and `fetch --paint` share: options of the pictures, what is told before painting and after."""
+"""Options and messages that `paint` and `fetch --paint` share."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from dmcvb_gen.spec import GOAL_PICTURES
 from dmcvb_gen.text import pluralize
 
 _OPTIONS = (
-    click.option("--size", type=click.IntRange(1), help="Pixels a side.  [default: the manifest's]"),
-    click.option("--views", metavar="A,B", help="Mazes: only these views, e.g. egocentric.  [default: all]"),
-    click.option("--goal", type=click.Choice(GOAL_PICTURES), help="Mazes: only such pictures.  [default: both]"),
+    click.option("--size", type=click.IntRange(1), help="Width and height in pixels.  [default: the manifest's]"),
+    click.option("--views", metavar="A,B", help="Mazes: render only these views, e.g. egocentric.  [default: all]"),
+    click.option(
+        "--goal",
+        type=click.Choice(GOAL_PICTURES),
+        help="Mazes: render only images with, or without, the goal.  [default: both]",
+    ),
 )
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import textwrap
 import time
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.table import Table
 
 from dmcvb_gen.cli.cluster import executor_option, make_executor, parse_bytes, parse_part, ray_option, slurm_script
 from dmcvb_gen.cli.common import (
+    GroupedCommand,
     OutPath,
     ProgressBar,
     background_source,
@@ -20,6 +20,7 @@ from dmcvb_gen.cli.common import (
     format_duration,
     json_option,
     print_json,
+    print_table,
     remote_option,
 )
 from dmcvb_gen.cli.unused_options import check_exclusive_options, check_maze_options, given_options, is_given, rewarded
@@ -41,67 +42,111 @@ def _out_default(name: str) -> str:
     return str(Path("releases") / name)
 
 
-@click.command()
+OPTION_GROUPS = {
+    "What": ("recipe", "only", "levels", "settings", "difficulty", "behaviour", "sample", "independent", "seed"),
+    "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
+    "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
+    "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "no_pixels"),
+    "Where": ("out", "options", "scratch", "scratch_size"),
+    "Workers and many machines": (
+        *("workers", "executor", "ray_address", "init", "part", "finishing", "other_versions", "slurm_script"),
+    ),
+}
+"""Heading -> options of `rollout --help`."""
+
+
+@click.command(cls=GroupedCommand, option_groups=OPTION_GROUPS)
 @click.argument("tasks", nargs=-1, metavar="[TASK]...")
-@click.option("--recipe", metavar="FILE|NAME", help="A YAML recipe, or a shipped one (see `dmcvb-gen list`).")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/*/static'.")
+@click.option("--recipe", metavar="FILE|NAME", help="Recipe: a YAML file or the name of a shipped one.")
+@click.option(
+    "--only", multiple=True, metavar="PATTERN", help="Roll out only these subsets, e.g. 'walker-walk/*/static'."
+)
 @click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
 @click.option("--distractor", "settings", multiple=True, help="none, static, dynamic. Repeatable.  [default: none]")
-@click.option("--difficulty", type=click.Choice(DIFFICULTIES), default="medium", show_default=True)
+@click.option(
+    "--difficulty",
+    type=click.Choice(DIFFICULTIES),
+    default="medium",
+    show_default=True,
+    help="Strength of the distractors.",
+)
 @click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
 @click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
-@click.option("--episodes-per-goal", type=click.IntRange(1), default=10, show_default=True, help="With --fixed-goals.")
-@click.option("--layout", "layouts", multiple=True, help="Mazes: a layout's name or text file, instead of TASK.")
-@click.option("--reward", type=click.Choice(REWARDS), help="Mazes: DMC-VB's distance, or the path's.")
-@click.option("--episodes", type=click.IntRange(1), help="Episodes a subset.  [default: 20]")
-@click.option("--steps", type=click.IntRange(1), help="Steps a subset, instead of --episodes.")
-@click.option("--max-steps", type=click.IntRange(1), help="Time limit of an episode.  [default: 500, mazes 600]")
-@click.option("--range", "episode_range", metavar="A:B", help="Only the shards that hold episodes A to B - 1.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--size", type=int, default=64, show_default=True, help="Pixels a side.")
-@click.option("--renderer", default="native", help="native, warp or opengl.  [default: native; --device cuda: warp]")
+@click.option(
+    "--episodes-per-goal",
+    type=click.IntRange(1),
+    default=10,
+    show_default=True,
+    help="Mazes: episodes of each fixed pair.",
+)
+@click.option("--layout", "layouts", multiple=True, help="Mazes: name or text file of a layout, instead of TASK.")
+@click.option(
+    "--reward", type=click.Choice(REWARDS), help="Mazes: DMC-VB's distance to the goal, or the shortest path."
+)
+@click.option("--episodes", type=click.IntRange(1), help="Episodes per subset.  [default: 20]")
+@click.option("--steps", type=click.IntRange(1), help="Steps per subset, instead of --episodes.")
+@click.option("--max-steps", type=click.IntRange(1), help="Longest episode, in steps.  [default: 500, mazes 600]")
+@click.option("--range", "episode_range", metavar="A:B", help="Generate only the shards with episodes A to B - 1.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed of the release.")
+@click.option("--size", type=int, default=64, show_default=True, help="Width and height of the images, in pixels.")
+@click.option(
+    "--renderer", default="native", help="native, warp or opengl.  [default: native; with --device cuda: warp]"
+)
 @click.option(
     "--samples",
     type=click.IntRange(1, 8),
-    help="Samples a pixel: 1, 2, 4 or 8; native: 4.  [default: warp 2, others 4]",
+    help="Samples per pixel: 1, 2, 4 or 8; native has 4.  [default: warp 2, others 4]",
 )
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda, for warp.")
-@click.option("--backgrounds", default="builtin", show_default=True, help="builtin, or a folder of videos.")
-@click.option("--split", type=click.Choice(SPLITS), default="train", help="Videos and styles: train or val.")
-@click.option("--behaviour", metavar="FILE|RUN", help="A policy file or training run, instead of the bundled one.")
-@click.option("--sample", is_flag=True, help="Draw actions instead of taking the policies' mean ones.")
-@click.option("--no-pixels", is_flag=True, help="Leave pictures out; `paint` fills them in where they are wanted.")
-@click.option("--independent", is_flag=True, help="Own episodes for each distractor, instead of shared ones.")
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option("--device", default="cpu", show_default=True, help="Device that renders: cpu, or cuda with warp.")
+@click.option("--backgrounds", default="builtin", show_default=True, help="Background videos: builtin, or a folder.")
+@click.option(
+    "--split", type=click.Choice(SPLITS), default="train", help="Background videos and maze styles: train or val."
+)
+@click.option("--behaviour", metavar="FILE|RUN", help="Policy file or training run, instead of the bundled policy.")
+@click.option("--sample", is_flag=True, help="Sample actions instead of using the policy mean.")
+@click.option("--no-pixels", is_flag=True, help="Store no images; `paint` renders them later.")
+@click.option("--independent", is_flag=True, help="Simulate separate episodes for each distractor.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Worker processes.")
 @executor_option
 @ray_option
-@click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes a file.  [default: 50, mazes 10]")
-@click.option("--out", help="The release's folder, or a URL: s3://bucket/name, gs://, ...  [default: releases/NAME]")
+@click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes per shard.  [default: 50, mazes 10]")
+@click.option("--out", help="Folder or URL (s3://bucket/name, gs://, ...).  [default: releases/NAME]")
 @remote_option
-@click.option("--scratch", type=OutPath(), help="With a URL: where shards are made.  [default: the system's]")
-@click.option("--scratch-size", metavar="BYTES", callback=parse_bytes, help="Bound of it, e.g. 20GB.  [default: half]")
-@click.option("--init", is_flag=True, help="Only begin the release; make nothing.")
-@click.option("--part", metavar="K/N", callback=parse_part, help="Make only every N-th job, from the K-th on.")
-@click.option("--finish", "finishing", is_flag=True, help="Only finish the release: write its digests.")
-@click.option("--other-versions", is_flag=True, help="Go on although packages differ from where it was begun.")
-@click.option("--slurm-script", type=click.IntRange(1), metavar="N", help="Print a script for an array of N tasks.")
+@click.option(
+    "--scratch", type=OutPath(), help="With a URL: local folder for unfinished shards.  [default: the system's]"
+)
+@click.option(
+    "--scratch-size",
+    metavar="BYTES",
+    callback=parse_bytes,
+    help="Maximum scratch space, e.g. 20GB.  [default: half of what is free]",
+)
+@click.option("--init", is_flag=True, help="Create the release without generating any episodes.")
+@click.option(
+    "--part", metavar="K/N", callback=parse_part, help="Run only part K of N: every N-th job, starting with the K-th."
+)
+@click.option("--finish", "finishing", is_flag=True, help="Finish the release: write its digests. Generates nothing.")
+@click.option("--other-versions", is_flag=True, help="Resume even if package versions have changed.")
+@click.option(
+    "--slurm-script", type=click.IntRange(1), metavar="N", help="Print a Slurm script for an array of N tasks."
+)
 @click.option(
     "--dry-run",
     is_flag=True,
-    help="Show the plan: jobs, steps, bytes, time, as --workers would take it. Writes nothing.",
+    help="Show jobs, steps, bytes and time for --workers, and write nothing.",
 )
 @json_option
 @click.pass_context
 def rollout(
     context, only, episode_range, out, workers, device, init, part, finishing, dry_run, no_pixels, as_json, **options
 ):
-    """Roll out behaviour policies into a release of painted episodes.
+    """Roll out behaviour policies into a release of episodes.
 
-    The same command goes on where it stopped: what is committed is kept. With --recipe, TASKs, --level, --distractor
-    and --goal keep a part of the recipe, and other options take the place of its values. Without both, the release at
-    --out goes on from its own manifest.
+    Rerun the same command to resume: finished shards are kept. With --recipe, the options TASK, --level, --distractor
+    and --goal select a part of the recipe, and other options override its values. Without TASK and --recipe, the
+    release at --out resumes from its own manifest.
 
-    On many machines: once --init, then --part 1/N to --part N/N anywhere, then --finish; see docs/scale.md.
+    On many machines: run --init once, then --part 1/N to --part N/N anywhere, then --finish; see docs/scale.md.
 
     \b
     dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8
@@ -131,7 +176,7 @@ def rollout(
     where = device if chosen or is_given(context, "device") else None  # else where it was begun
     plan = make_plan(chosen, site, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
     if by_warp and chosen:
-        click.echo(f"warp paints, as native does not on {device}", err=True)
+        click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
     if dry_run:
         return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
     shared = init or bool(part)
@@ -165,7 +210,7 @@ def _run(plan, workers, as_json, whole=True):
     from dmcvb_gen.generate.plan import finish
 
     started, steps, seconds = time.time(), 0, {}
-    with _told_when_stopped(), _progress(plan, as_json) as bar:
+    with _interruption_message(), _progress(plan, as_json) as bar:
         finished = 0
         for result in run_jobs(plan.jobs, workers, bar):
             finished += sum(commit.episode_count for commit in result.commits)
@@ -244,7 +289,7 @@ NOT_WITH_RECIPE = {
 
 
 def _changed_recipe(recipe, tasks, options, given):
-    """A recipe, narrowed and overridden by the options that were given beside it; none goes unheard."""
+    """A recipe, narrowed and overridden by the options that were given beside it; none is ignored."""
     from dmcvb_gen.generate.recipe import narrow, override
 
     for name, cure in NOT_WITH_RECIPE.items():
@@ -344,11 +389,11 @@ def _progress(plan, as_json):
 
 
 @contextlib.contextmanager
-def _told_when_stopped():
+def _interruption_message():
     try:
         yield
     except KeyboardInterrupt:
-        click.echo("\nstopped; what was committed is safe, the same command goes on from there", err=True)
+        click.echo("\nInterrupted. Finished shards are saved; rerun the same command to resume.", err=True)
         raise
 
 
@@ -387,9 +432,6 @@ def _show_plan(plan, cost, workers, as_json):
             )
         )
         return
-    table = Table(title=f"{plan.manifest.name} {plan.manifest.version} -> {plan.site.place}")
-    for column in ("subset", "episodes", "steps", "bytes", "core-hours"):
-        table.add_column(column, justify="left" if column == "subset" else "right")
     rows: dict[str, list[float]] = {}
     for job in plan.jobs:
         for record in job.subsets:
@@ -400,17 +442,23 @@ def _show_plan(plan, cost, workers, as_json):
             row[1] += steps
             row[2] += steps * rate.bytes_per_step
             row[3] += steps * rate.seconds_per_step / 3600
-    for name, (episodes, steps, size, hours) in rows.items():
-        table.add_row(name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
-    console = Console()
-    console.width = max(console.width, 110)  # names of subsets are not cut, piped into a file either
-    console.print(table)
+    print_table(
+        ("subset", "episodes", "steps", "bytes", "core-hours"),
+        [
+            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
+            for name, (episodes, steps, size, hours) in rows.items()
+        ],
+        title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
+    )
     spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
-    console.print(
+    click.echo(f"release: {plan.site.place}")
+    click.echo(
         f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; "
-        f"{cost.steps:,} steps, {format_bytes(cost.bytes)}, "
+        f"{cost.steps:,} steps, {format_bytes(cost.bytes)}"
+    )
+    click.echo(
         f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
-        f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64."
+        f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64"
     )
 
 
@@ -419,7 +467,7 @@ def _show_plan(plan, cost, workers, as_json):
 @remote_option
 @json_option
 def info(path, options, as_json):
-    """Show what a release holds: subsets, episodes, bytes, returns beside the paper's.
+    """Show the subsets, episodes, bytes and returns of a release beside the paper's.
 
     \b
     dmcvb-gen info releases/demo
@@ -429,48 +477,52 @@ def info(path, options, as_json):
     facts = describe_release(path, options)
     if as_json:
         return print_json(facts)
-    table = Table(title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"))
-    columns = ("subset", "episodes", "steps", "size", "B/step", "mean", "std", "min", "p25", "median", "p75", "max")
-    for column in columns:
-        table.add_column(column, justify="left" if column == "subset" else "right", no_wrap=True)
+    statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
+    rows = []
     for subset in facts["subsets"]:
-        values = subset["returns"]
-        table.add_row(
-            subset["name"],
-            f"{subset['episodes']:,}" + ("" if subset["complete"] else f"/{subset['episodes_planned']:,}"),
-            f"{subset['steps']:,}",
-            format_bytes(subset["bytes"]),
-            f"{subset['bytes_per_step']:,.0f}",
-            *(f"{values[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max")),
+        planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
+        rows.append(
+            (
+                subset["name"],
+                f"{subset['episodes']:,}{planned}",
+                f"{subset['steps']:,}",
+                format_bytes(subset["bytes"]),
+                f"{subset['bytes_per_step']:,.0f}",
+                *(f"{subset['returns'][key]:.1f}" for key in statistics),
+            )
         )
-        paper = subset["paper"]
-        if paper:
-            numbers = (f"{paper[key]:.1f}" for key in ("mean", "std", "min", "p25", "median", "p75", "max"))
-            table.add_row("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers, style="dim")
-    console = Console()
-    console.width = max(console.width, 152)  # a cut number is worse than a wrapped line
-    console.print(table)
-    console.print(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
+        if paper := subset["paper"]:
+            numbers = (f"{paper[key]:.1f}" for key in statistics)
+            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers))
+    print_table(
+        ("subset", "episodes", "steps", "size", "B/step", *statistics),
+        rows,
+        title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
+        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
+    )
+    click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
     if facts["digest"]:
-        console.print(f"digest {facts['digest']}", highlight=False)
+        click.echo(f"digest {facts['digest']}")
 
 
 @click.command()
 @click.argument("path")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets.")
-@click.option("--out", type=OutPath(path_type=Path), help="Folder of the files.  [default: PATH/preview]")
-@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes of each subset.")
+@click.option("--only", multiple=True, metavar="PATTERN", help="Show only these subsets.")
+@click.option("--out", type=OutPath(path_type=Path), help="Output folder.  [default: PATH/preview]")
+@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes per subset.")
 @click.option("--scale", type=click.IntRange(1, 8), help="Enlarge the images.  [default: 2; videos of 512 pixels]")
-@click.option("--frames", type=click.IntRange(1), default=200, show_default=True, help="Of the video, 20 a second.")
-@click.option("--episode", type=click.IntRange(0), help="The one in the video.  [default: the first of each subset]")
+@click.option(
+    "--frames", type=click.IntRange(1), default=200, show_default=True, help="Frames of the video, at 20 per second."
+)
+@click.option("--episode", type=click.IntRange(0), help="Episode of the video.  [default: the first of each subset]")
 @click.option(
     "--video",
     type=click.Choice(["mp4", "webp", "gif"]),
-    help="Kind of video.  [default: mp4, or webp where imageio-ffmpeg is not installed]",
+    help="Format of the video.  [default: mp4, or webp without imageio-ffmpeg]",
 )
 @json_option
 def preview(path, only, out, as_json, **options):
-    """Write a contact sheet (PNG) and a video of what is in a release.
+    """Write a contact sheet (PNG) and a video of a release.
 
     \b
     dmcvb-gen preview releases/demo
@@ -489,7 +541,7 @@ def preview(path, only, out, as_json, **options):
 @remote_option
 @json_option
 def list_command(remote, options, as_json):
-    """List tasks, levels, distractors, bundled behaviours, recipes and the renderers usable here."""
+    """List tasks, levels, distractors, bundled policies, recipes and the renderers that work here."""
     from dmcvb_gen.generate.info import describe_package
 
     if remote:
@@ -497,28 +549,33 @@ def list_command(remote, options, as_json):
     facts = describe_package()
     if as_json:
         return print_json(facts)
-    console = Console()
-    console.width = max(console.width, 120)
-    table = Table(title="tasks")
-    for column in ("task", "state", "action", "steps", "views", "bundled behaviours"):
-        table.add_column(column)
-    for task in facts["tasks"]:
-        table.add_row(
-            task["id"],
-            str(task["state"]),
-            str(task["action"]),
-            str(task["max_steps"]),
-            ", ".join(task["views"]),
-            ", ".join(task["behaviours"]) or "-",
-        )
-    console.print(table)
-    console.print(f"tasks of dm_control's suite: {', '.join(facts['suite_tasks'])}")
-    console.print(f"levels: {', '.join(facts['levels'])}")
-    console.print(f"distractors: {', '.join(facts['distractors'])} (difficulty {', '.join(facts['difficulties'])})")
-    console.print(f"maze goals: {', '.join(facts['maze_settings'])}")
-    console.print(f"recipes: {', '.join(facts['recipes'])}")
+    print_table(
+        ("task", "state", "action", "steps", "<views", "<bundled behaviours"),
+        [
+            (
+                task["id"],
+                str(task["state"]),
+                str(task["action"]),
+                str(task["max_steps"]),
+                ", ".join(task["views"]),
+                ", ".join(task["behaviours"]) or "-",
+            )
+            for task in facts["tasks"]
+        ],
+        title="tasks",
+        optional=(("views",),),
+    )
+    for heading, names in (
+        ("tasks of dm_control's suite", facts["suite_tasks"]),
+        ("levels", facts["levels"]),
+        ("distractors", facts["distractors"]),
+        ("difficulties", facts["difficulties"]),
+        ("maze goals", facts["maze_settings"]),
+        ("recipes", facts["recipes"]),
+    ):
+        click.echo(textwrap.fill(f"{heading}: {', '.join(names)}", 80, break_on_hyphens=False))
     for name, reason in facts["renderers"].items():
-        console.print(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
+        click.echo(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
 
 
 def _list_remote(url, options, as_json) -> None:
@@ -527,12 +584,10 @@ def _list_remote(url, options, as_json) -> None:
     found = releases_at(url, options)
     if as_json:
         return print_json(found)
-    table = Table(title=public(url))
-    for column in ("release", "name", "version", "subsets", "episodes", "complete", "digest"):
-        table.add_column(column)
-    for facts in found:
-        shown = ("url", "name", "version", "subsets", "episodes", "complete")
-        table.add_row(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12])
-    console = Console()
-    console.width = max(console.width, 120)
-    console.print(table)
+    shown = ("url", "name", "version", "subsets", "episodes", "complete")
+    print_table(
+        ("release", "<name", "<version", "subsets", "episodes", "complete", "<digest"),
+        [(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12]) for facts in found],
+        title=public(url),
+        optional=(("subsets",), ("name",)),
+    )

@@ -1,6 +1,6 @@
-"""Options that would go unheard, most of them of `rollout`: a command line in, a refusal by name out.
+"""Refuse options that would have no effect.
 
-What an option means for the subsets of a recipe is checked in `rollout.recipe.check_heard`, once there is one.
+`generate.recipe` checks the options that depend on the subsets of a recipe.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ def given_options(context: click.Context) -> set[str]:
 
 
 def check_exclusive_options(context: click.Context) -> None:
-    """Refuse options that say where or how, and that the others leave nothing to do.
+    """Refuse options that say where or how, and that have no effect beside the others.
 
     Raises:
-      click.UsageError: one of them would go unheard.
+      click.UsageError: one of them has no effect.
     """
     values, given = context.params, given_options(context)
     for name in sorted(given):
         if values[name] == "":
-            raise click.UsageError(f"{_flag(context, name)} is empty; give it a value, or leave it out.")
+            raise click.UsageError(f"{_flag(context, name)} is empty: give it a value or remove it.")
     if sum(name in given for name in ("init", "part", "finishing")) > 1:
         raise click.UsageError("Give one of --init, --part and --finish.")
     if "slurm_script" in given:
@@ -56,7 +56,7 @@ def refuse(context: click.Context, given: set[str], names: tuple[str, ...], reas
     """
     for name in names:
         if name in given:
-            raise click.UsageError(f"{reason}; leave out {_flag(context, name)}.")
+            raise click.UsageError(f"{_flag(context, name)} has no effect: {reason}; remove it.")
 
 
 def _flag(context: click.Context, name: str) -> str:
@@ -71,26 +71,28 @@ def check_maze_options(tasks: tuple[str, ...], options: dict, given: set[str]) -
       options: all of the command line, `given` of them by itself.
 
     Raises:
-      click.UsageError: one of them would go unheard.
+      click.UsageError: one of them has no effect.
     """
     if all(is_maze(task) for task in tasks):
         if options["settings"]:
-            raise click.UsageError("Mazes vary in style, not by --distractor; use --goal visible|hidden.")
+            raise click.UsageError(
+                "--distractor has no effect in mazes, which vary in style: use --goal visible|hidden."
+            )
         if "difficulty" in given:
-            raise click.UsageError("--difficulty is of distractors, and mazes vary in style; leave it out.")
+            raise click.UsageError("--difficulty has no effect in mazes, which have no distractors: remove it.")
         fixed = bool(options["fixed_goals"]) or FIXED in options["goals"]
         if "episodes_per_goal" in given and not fixed:
             raise click.UsageError(
-                "--episodes-per-goal is of fixed goals; give --fixed-goals too, or --episodes instead."
+                "--episodes-per-goal has no effect without --fixed-goals: add it, or use --episodes."
             )
         if fixed and not set(options["goals"]) - {FIXED} and (options["episodes"] or options["steps"]):
-            raise click.UsageError("Of fixed goals there are --episodes-per-goal; --episodes, --steps are for --goal.")
+            raise click.UsageError("--episodes and --steps have no effect with fixed goals: use --episodes-per-goal.")
         return
     if options["goals"] or options["fixed_goals"]:
-        raise click.UsageError("--goal and --fixed-goals are for ant-maze tasks.")
+        raise click.UsageError("--goal and --fixed-goals have no effect outside mazes: remove them.")
     for name, flag in (("episodes_per_goal", "--episodes-per-goal"), ("reward", "--reward")):
         if name in given:
-            raise click.UsageError(f"{flag} is for ant-maze tasks; leave it out.")
+            raise click.UsageError(f"{flag} has no effect outside mazes: remove it.")
     if "difficulty" in given and all("_" in name or name == "none" for name in options["settings"]):
         raise click.UsageError("--difficulty is for --distractor static or dynamic without one of their own; give one.")
 
@@ -105,5 +107,5 @@ def rewarded(task: str, reward: str | None) -> str:
     if maze is None or reward is None or maze.reward == reward:
         return task
     if maze.reward:
-        raise click.UsageError(f"{task} has a reward of its own; leave out --reward, or the task's @{maze.reward}.")
+        raise click.UsageError(f"{task} names its own reward: remove --reward, or the task's @{maze.reward}.")
     return f"{task}@{reward}" if reward == "geodesic" else task

@@ -22,16 +22,18 @@ TRAINING = (
 
 @click.command()
 @click.argument("path")
-@click.option("--profile", default="smoke", show_default=True, help="smoke (no scores), brief, quick, paper.")
-@click.option("--scale", type=click.FloatRange(0, min_open=True), default=1.0, help="Times the profile's steps.")
+@click.option("--profile", default="smoke", show_default=True, help="Budget: smoke (no scores), brief, quick or paper.")
+@click.option("--scale", type=click.FloatRange(0, min_open=True), default=1.0, help="Multiply the profile's steps.")
 @click.option("--benchmark", "benchmarks", multiple=True, help="b1, b2, b3, ablations. Repeatable.  [default: b1]")
-@click.option("--agents", default="", metavar="A,B", help="Names such as bc,state-bc,id+bc instead of all.")
+@click.option("--agents", default="", metavar="A,B", help="Agents to train, e.g. bc,state-bc,id+bc.  [default: all]")
 @click.option("--agent", "own", multiple=True, metavar="MODULE:NAME", help="Also score your own agent. Repeatable.")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Only these subsets, e.g. 'walker-walk/expert/*'.")
-@click.option("--out", type=OutPath(path_type=Path, file_okay=False), help="Folder.  [default: reports/NAME]")
-@click.option("--checks-only", is_flag=True, help="Structure checks and report, no training.")
-@click.option("--strict", is_flag=True, help="Exit with 1 on warnings too (data unlike the paper's).")
-@click.option("--train-unsound", is_flag=True, help="Run the benchmarks even where a structure check fails.")
+@click.option("--only", multiple=True, metavar="PATTERN", help="Use only these subsets, e.g. 'walker-walk/expert/*'.")
+@click.option(
+    "--out", type=OutPath(path_type=Path, file_okay=False), help="Folder of the report.  [default: reports/NAME]"
+)
+@click.option("--checks-only", is_flag=True, help="Check the structure and train nothing.")
+@click.option("--strict", is_flag=True, help="Exit with 1 on warnings (data unlike the paper's).")
+@click.option("--train-unsound", is_flag=True, help="Run the benchmarks even if a check fails.")
 @click.option("--workers", type=click.IntRange(1), help="Cells side by side.  [default: 2, on one core 1]")
 @executor_option
 @ray_option
@@ -42,13 +44,15 @@ TRAINING = (
     type=click.Choice(["auto", "float32", "bfloat16"]),
     default="auto",
     show_default=True,
-    help="Of networks that see pictures; auto: bfloat16 if the processor computes in it.",
+    help="Precision of networks that see images; auto: bfloat16 if the processor computes in it.",
 )
-@click.option("--compile", is_flag=True, help="torch.compile the losses (pays on CUDA and in long runs).")
-@click.option("--memory", type=click.FloatRange(0), metavar="GB", help="Of all workers; ray: of each.  [default: half]")
+@click.option("--compile", is_flag=True, help="Compile the losses with torch.compile (for CUDA and long runs).")
+@click.option(
+    "--memory", type=click.FloatRange(0), metavar="GB", help="Memory of all workers; ray: of each.  [default: half]"
+)
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
-@click.option("--dino-weights", type=click.Path(path_type=Path), help="A safetensors file, for dino+bc.")
-@click.option("--backgrounds", metavar="FOLDER", help="Where the release's background videos are now, if they moved.")
+@click.option("--dino-weights", type=click.Path(path_type=Path), help="Safetensors file with the weights of dino+bc.")
+@click.option("--backgrounds", metavar="FOLDER", help="Folder of the background videos, if it has moved.")
 @json_option
 @click.pass_context
 def validate(

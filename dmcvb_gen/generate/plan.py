@@ -143,13 +143,11 @@ def _check_goes_on(there: Manifest, site: Site, device: str | None, pixels: bool
     painted = any(record.pixels for record in there.subsets)
     if not pixels and painted:
         raise StoreError(
-            f"{site.place} was begun with pictures and goes on with them; leave out --no-pixels, or give TASKs or "
+            f"{site.place} was begun with images and keeps storing them; remove --no-pixels, or give TASKs or "
             "--recipe with another --out"
         )
     if device not in (None, "cpu") and not painted:
-        raise StoreError(
-            f"{site.place} was begun without pictures, so none are painted on {device}; leave out --device"
-        )
+        raise StoreError(f"{site.place} was begun without images, so none are rendered on {device}; remove --device")
 
 
 def _count(jobs: Sequence[Job]) -> int:

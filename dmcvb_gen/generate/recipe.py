@@ -348,7 +348,7 @@ def check_heard(recipe: Recipe, given: Collection[str]) -> None:
     }
     for name, (heard, cure) in cures.items():
         if name in given and not heard:
-            raise RecipeError(f"--{name} changes nothing here: {cure}, or leave it out")
+            raise RecipeError(f"--{name} has no effect here: {cure}, or remove it")
 
 
 # -- recipes in files -----------------------------------------------------------------------------
@@ -364,9 +364,12 @@ def load_recipe(source: str | Path) -> Recipe:
     """A recipe from a YAML file, or a shipped one by its name.
 
     Raises:
+      UnknownNameError: a plain name that is no shipped recipe's.
       RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
     """
     path = Path(source)
+    if not path.exists() and not path.suffix and path.name == str(source) and str(source) not in shipped_recipes():
+        raise UnknownNameError("recipe", source, shipped_recipes())
     shipped = not path.exists() and str(source) in shipped_recipes()
     try:
         data = read_yaml(

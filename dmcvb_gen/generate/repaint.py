@@ -111,7 +111,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
     pairs: dict[str, Repainted] = {}
     names = select(list(release.subsets), list(request.only))
     for name in [name for name in names if not release[name].record.imported]:
-        pair = _repainted(release, release[name], request)
+        pair = _pair(release, release[name], request)
         taken = pairs.setdefault(pair.record.name, pair)
         if taken is not pair:
             raise RecipeError(
@@ -120,7 +120,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
             )
     if not pairs:
         raise StoreError(f"{request.root} was imported and has no physics states to paint from")
-    _refuse_unused(request, [pair.record for pair in pairs.values()])
+    _check_heard(request, [pair.record for pair in pairs.values()])
     new = _new_manifest(release, pairs, request)
     _check_out(out, new)
     manifest = start_release(out, new)
@@ -140,16 +140,16 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
     return finish_together(out)
 
 
-def _refuse_unused(request: Repainting, records: Sequence[SubsetRecord]) -> None:
-    """Raises RecipeError for options of distractors that none of the new subsets has."""
+def _check_heard(request: Repainting, records: Sequence[SubsetRecord]) -> None:
+    """Refuse options of distractors that none of the new subsets has."""
     kinds = {record.distractor.kind for record in records}
     for name in ("difficulty", "backgrounds"):
         if getattr(request, name) and kinds <= {"none"}:
-            raise RecipeError(f"--{name} has no effect here: no new subset has a distractor; remove it")
+            raise RecipeError(f"--{name} has no effect here: these subsets have no distractors; remove it")
 
 
 def _check_out(out: Path, new: Manifest) -> None:
-    """Raises StoreError for a folder that holds another release than this very repaint, started before."""
+    """Refuse a folder that holds any release but this very repaint, begun before."""
     if not (out / MANIFEST).exists():
         return
     _, there = load_manifest(out)
@@ -158,7 +158,7 @@ def _check_out(out: Path, new: Manifest) -> None:
 
 
 def _source(request: Repainting) -> Release:
-    """The release to repaint, after checking everything that can be wrong with the request as a whole."""
+    """The release to repaint, once all that can be wrong with the request as a whole has been looked at."""
     release = open_release(request.root)
     if Path(request.out).resolve() == release.path.resolve():
         raise StoreError(f"--out {request.out} is the release itself; give another folder")
@@ -174,7 +174,7 @@ def _source(request: Repainting) -> Release:
     return release
 
 
-def _repainted(release: Release, subset: Subset, request: Repainting) -> Repainted:
+def _pair(release: Release, subset: Subset, request: Repainting) -> Repainted:
     old = subset.record
     setting = _new_setting(subset, request.distractor, request.difficulty)
     backend, samples = request.renderer or old.renderer["name"], request.samples
@@ -198,7 +198,7 @@ def _repainted(release: Release, subset: Subset, request: Repainting) -> Repaint
 
 
 def _old_backgrounds(release: Release, old: SubsetRecord) -> str:
-    """The source of a release's videos: the subset's own, or those of its recipe."""
+    """Where the videos of a release are: the subset's own, or those of its recipe."""
     recipe = {"source": release.manifest.recipe_of(old.name).get("backgrounds", BUILTIN)}
     return video_source(release.path, old.model_copy(update={"backgrounds": old.backgrounds or recipe}))
 
@@ -207,14 +207,14 @@ def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None)
     if distractor is None and difficulty is None:
         return subset.setting
     if is_maze(subset.task):
-        raise RecipeError(f"{subset.name} varies in style, not by distractor; leave --distractor away or use --only")
+        raise RecipeError(f"{subset.name} varies in style, not by distractor; remove --distractor or use --only")
     old = Distractor.parse(subset.setting)
     given = Distractor.parse(distractor) if distractor else old
     return Distractor(given.kind, difficulty or given.difficulty).name
 
 
 def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Repainting) -> Manifest:
-    """The manifest of the new release. Subsets that a second recipe added to the source are additions here, too."""
+    """The manifest of the new release; subsets that another recipe added there are additions here, too."""
     old = release.manifest
     groups: list[tuple[Recipe, list[SubsetRecord]]] = []
     for pair in pairs.values():
@@ -256,7 +256,7 @@ def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Rep
 
 
 def _new_recipe(old: Manifest, recipe: Recipe, records: Sequence[SubsetRecord], request: Repainting) -> Recipe:
-    """The recipe of the repainted subsets that came from one recipe."""
+    """The recipe that asks for repainted subsets of one recipe."""
     first, splits = records[0], {record.split for record in records}
     shown = {record.backgrounds["source"] for record in records if record.backgrounds}
     return make_recipe(

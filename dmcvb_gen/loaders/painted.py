@@ -1,9 +1,8 @@
-"""Render pictures when they are read, for subsets that are stored without pictures or are to show others.
+"""Pictures painted when they are read: a subset without (or with other) pictures in, the same subset with them out.
 
-Nothing is stored. An episode's pictures are rendered from its physics states and labels when they are first read, and
-kept while there is room. With fresh distractors, every epoch shows the same episodes from other cameras, in other
-colors, before other videos. These are drawn from named random streams: an augmentation that keeps states, actions and
-rewards true.
+Nothing is stored: an episode's pictures are painted from its physics states and labels when they are first asked for,
+and kept while there is room. With fresh distractors every epoch sees the same episodes from other cameras, in other
+colors, before other videos, all drawn from named streams: augmentation that keeps states, actions and rewards true.
 """
 
 from __future__ import annotations

@@ -1,0 +1,85 @@
+"""What people see in a terminal of 80 columns, in a pipe, and in --help."""
+
+from __future__ import annotations
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from dmcvb_gen.cli import COMMANDS, GROUPS, main
+from dmcvb_gen.cli.common import GroupedCommand, print_table
+from tests.conftest import TINY_MAZE
+
+
+def screen(arguments, columns=80):
+    """The lines that a command prints on a terminal of some columns."""
+    run = CliRunner(env={"COLUMNS": str(columns), "NO_COLOR": "1"}).invoke(main, list(map(str, arguments)))
+    assert run.exit_code == 0, run.output
+    assert "\x1b" not in run.stdout, "colors, although NO_COLOR is set"
+    return run.stdout.splitlines()
+
+
+def plans(folder):
+    common = ["--level", "random", "--episodes", 1, "--max-steps", 4, "--size", 16, "--dry-run", "--out"]
+    yield ["rollout", "walker-walk", "--distractor", "static", *common, folder / "w"]
+    yield ["rollout", "ant-maze-medium7x7a", *common, folder / "m"]
+
+
+def test_tables_fit_80_columns_and_cut_no_word(small_release, small_mazes, tmp_path):
+    evaluate = ["evaluate-behaviour", "walker-walk", "ant-maze-medium7x7a", "--level", "random", "--episodes", 2]
+    words = {
+        ("list",): ["ant-maze-medium7x7a", "bundled behaviours", "dmcvb-mini"],
+        ("info", small_release): ["walker-walk/random/dynamic", "episodes", "mean"],
+        ("info", small_mazes): ["ant-maze-tiny/random/visible", "episodes", "mean"],
+        ("status", small_release): ["walker-walk/random/dynamic", "done", "open"],
+        tuple(evaluate): ["ant-maze-medium7x7a", "success", "DMC-VB paper"],
+    } | {tuple(plan): [f"{plan[1]}/random/", "core-hours"] for plan in plans(tmp_path)}
+    for arguments, expected in words.items():
+        lines = screen(arguments)
+        wide = [line for line in lines if len(line) > 80 and str(tmp_path) not in line]
+        assert not wide, (arguments, wide)
+        for word in expected:
+            assert any(word in line for line in lines), (arguments, word, lines)
+
+
+def test_a_wide_terminal_shows_every_column(small_release):
+    text = "\n".join(screen(["info", small_release], columns=200))
+    assert all(name in text for name in ("B/step", "p25", "median", "p75")) and "not shown" not in text
+
+
+def test_a_table_that_fits_nowhere_gives_its_names_a_line_of_their_own(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "30")
+    print_table(("subset", "steps", "bytes"), [("a-very-long-name/of/a/subset", "1,000,000", "20.0 GB")])
+    assert capsys.readouterr().out.splitlines()[2:] == ["a-very-long-name/of/a/subset", "  1,000,000  20.0 GB"]
+
+
+def test_every_command_is_in_one_group_of_the_help():
+    text = "\n".join(screen(["--help"]))
+    assert all(f"{heading}:" in text for heading in GROUPS)
+    assert all(f"  {name} " in text for name in COMMANDS)
+    assert sum(map(len, GROUPS.values())) == len(COMMANDS)
+
+
+def test_the_options_of_rollout_have_headings():
+    command = main.get_command(click.Context(main), "rollout")
+    assert isinstance(command, GroupedCommand)
+    named = [name for names in command.option_groups.values() for name in names]
+    assert len(named) == len(set(named))
+    assert {p.name for p in command.params if isinstance(p, click.Option)} == {*named, "dry_run", "as_json"}
+    lines = screen(["rollout", "--help"])
+    assert all(f"{heading}:" in lines for heading in command.option_groups)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["rolout"], "Did you mean 'rollout'?"),
+        (["rollout", "--recipe", "dmcvb-mni"], "Did you mean 'dmcvb-mini'?"),
+        (["rollout", "walker-wlk"], "Did you mean 'walker-walk'?"),
+        (["rollout", TINY_MAZE, "--level", "randm"], "Did you mean 'random'?"),
+        (["rollout", "walker-walk", "--distracter", "none"], "Did you mean '--distractor'?"),
+    ],
+)
+def test_near_names_are_suggested(arguments, hint):
+    run = CliRunner().invoke(main, arguments)
+    assert run.exit_code == 2 and hint in run.stderr
