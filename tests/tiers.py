@@ -36,6 +36,15 @@ def compiled() -> set[tuple[str, int]]:
     return {(str(path), path.stat().st_mtime_ns) for folder in COMPILED for path in folder.glob("*.nb?")}
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that `slow.txt` lists, single cases of a parametrized test among them."""
+    listed = set((Path(__file__).parent / "slow.txt").read_text().splitlines())
+    for item in items:
+        if item.nodeid in listed:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     before, known = processor_seconds(), compiled()
