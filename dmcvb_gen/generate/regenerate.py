@@ -411,7 +411,7 @@ class _Digests:
         """What is wrong with a shard, in words; None if every byte is as committed and its pictures can be read."""
         wrong = damage(self.root, record, shard, self._digests)
         commit = None if wrong else read_commit(self.root, record, shard)
-        return wrong or (commit and self._wrong_pictures(record, commit))
+        return wrong or (self._wrong_pictures(record, commit) if commit else None)
 
     def _wrong_pictures(self, record: SubsetRecord, commit: CommitRecord) -> str | None:
         """Which pictures of a shard do not fit their array, e.g. because they have another size."""

@@ -250,7 +250,9 @@ def card_text(
 
     manifest = release.manifest
     loader = PackageLoader("dmcvb_gen.release", "data")
-    rules = dict(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined)
+    rules: dict[str, Any] = dict(
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined
+    )
     return (
         Environment(loader=loader, **rules)
         .get_template("card.md.jinja")
@@ -300,7 +302,7 @@ def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
     for record in manifest.subsets:
         if record.goal_mode is None:
             settings.setdefault(record.setting, record.distractor)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, setting in settings.items():
         if setting.kind == "none":
             rows.append((name, "the model's own camera, colors and sky", "", "", ""))
@@ -402,7 +404,9 @@ def plot_returns(release: Release, path: Path) -> None:
     groups: dict[tuple[str, str, bool], list[np.ndarray]] = {}
     for subset in release.subsets.values():
         groups.setdefault((subset.task, subset.level, subset.setting == FIXED), []).append(subset.returns)
-    boxes, labels, shades = [], [], []
+    boxes: list[dict[str, Any]] = []
+    labels: list[str] = []
+    shades: list[str] = []
     marks: dict[int, np.ndarray] = {}
     for (task, level, fixed), values in groups.items():
         returns = np.concatenate(values)

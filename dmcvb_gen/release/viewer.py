@@ -12,11 +12,11 @@ import io
 import json
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from PIL import Image
@@ -185,7 +185,8 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
 
 
 def _state_columns(subset: SubsetReader, state: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    fields = subset.group[subset.paths["state"]].attrs.get("fields") or {"state": [0, state.shape[1]]}
+    whole = {"state": (0, state.shape[1])}
+    fields = cast(Mapping[str, Any], subset.group[subset.paths["state"]].attrs.get("fields") or whole)
     for name, (first, last) in fields.items():
         for column in range(first, last):
             yield (name if last - first == 1 else f"{name} {column - first}"), state[:, column]

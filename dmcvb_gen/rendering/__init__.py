@@ -68,7 +68,7 @@ def make_renderer(
     Raises:
       UnknownNameError, RenderingError: no such renderer, or it cannot start here.
     """
-    chosen = renderer_class(name)
+    chosen: Callable[..., Renderer] = renderer_class(name)
     return chosen(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha, device=device, samples=samples)
 
 

@@ -66,6 +66,24 @@ class Renderer(abc.ABC):
         """The frames as `render` paints them, and the same with `hide_goal`."""
         return self.render(physics, exogenous, views), self.render(physics, exogenous, views, hide_goal=True)
 
+    def render_labels(
+        self,
+        physics: np.ndarray,
+        exogenous: DistractorState,
+        views: Sequence[str] | None = None,
+        hide_goal: bool = False,
+    ) -> dict[str, np.ndarray]:
+        """Depth and segmentation of frames, arguments as `render`.
+
+        Returns:
+          "depth" -> (frame, view, size, size) float32 in meters (0: sky); "segmentation" -> the same shape, int16
+          ids of geoms (-1: sky).
+
+        Raises:
+          RenderingError: this renderer has no labels.
+        """
+        raise RenderingError(f"the {self.name} renderer has no depth or segmentation; use --renderer native")
+
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
         """Name, version and every setting that decides a pixel, for the manifest."""

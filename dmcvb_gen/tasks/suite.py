@@ -111,7 +111,7 @@ class SuiteTask(Task):
         self.unstored_fields = self._fields_of_accelerations()
 
     @property
-    def model(self) -> mujoco.MjModel:  # type: ignore[override]
+    def model(self) -> mujoco.MjModel:
         return self._model
 
     def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
@@ -248,7 +248,7 @@ class SuiteBatch(EpisodeBatch):
         self._stale[self._moved] = True
 
     def state(self):
-        for sim in np.flatnonzero(self._stale):
+        for sim in np.flatnonzero(self._stale).tolist():
             observation = self._tasks[sim].get_observation(self._look_at(sim))
             self._states[sim] = np.concatenate([np.ravel(part) for part in observation.values()])
         self._stale[:] = False
@@ -256,7 +256,7 @@ class SuiteBatch(EpisodeBatch):
 
     def _control_reward(self):
         reward, self._ended = np.zeros(self.size), np.zeros(self.size, bool)
-        for sim in self._moved:
+        for sim in self._moved.tolist():
             physics, task = self._look_at(sim), self._tasks[sim]
             task.after_step(physics)
             reward[sim] = task.get_reward(physics)
