@@ -12,7 +12,6 @@ import fnmatch
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
 
 from dmcvb_gen.errors import UnknownNameError
 
@@ -175,6 +174,8 @@ class Distractor:
 
 def distractor_kinds() -> tuple[str, ...]:
     """All kinds of distractors: DMC-VB's, then those that users registered or whose packages are installed."""
+    from importlib import metadata  # slow to import, and `--help` needs no distractors
+
     installed = [point.name for point in metadata.entry_points(group=DISTRACTOR_ENTRY_POINTS)]
     return tuple(dict.fromkeys([*DISTRACTOR_KINDS, *sorted(own_distractors), *installed]))
 
