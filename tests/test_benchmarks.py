@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
-from dmcvb_gen.benchmarks.setup import Setup, choose_precision, fingerprint, open_data, pretraining_of
+from dmcvb_gen.benchmarks.setup import Setup, fingerprint, open_data, pretraining_of
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
@@ -535,11 +535,6 @@ def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
     assert not report._groups([result("b1", "ant-maze-empty7x7", "expert", -9.0, scores=False)])
 
 
-def test_precision_is_what_the_processor_computes_in_unless_it_is_given(monkeypatch):
-    for has, found in ((True, "bfloat16"), (False, "float32")):
-        for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"):
-            monkeypatch.setattr(torch.cpu, name, lambda has=has: has, raising=False)
-        assert choose_precision("auto", "cpu") == found
-    assert choose_precision("bfloat16", "cpu") == "bfloat16"
+def test_only_networks_that_see_pictures_compute_in_bfloat16():
     setup = Setup(root="r", out="o", profile=PROFILES["brief"], precision="bfloat16")
     assert train_settings(setup, 10).half and not train_settings(setup, 10, pixels=False).half

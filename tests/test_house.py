@@ -26,6 +26,7 @@ FLOORS = (
         "parallel",
         "distractor_state",
         "arithmetic",
+        "precision",
     ),  # the ground
     ("tasks",),
     ("storage",),

@@ -19,8 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from dmcvb_gen.agents.catalog import Agent
 from dmcvb_gen.agents.dino import dino_digest
 from dmcvb_gen.benchmarks.evaluate import protocol
@@ -70,19 +68,6 @@ class Setup:
     @property
     def encoders(self) -> Path:
         return Path(self.out) / "encoders"
-
-
-def choose_precision(asked: str, device: str) -> str:
-    """ "float32" or "bfloat16"; "auto" takes bfloat16 if the processor (or accelerator) computes in it.
-
-    Without such instructions a processor emulates bfloat16, which takes a multiple of the time of float32.
-    """
-    if asked != "auto":
-        return asked
-    if device.startswith("cuda"):
-        return "bfloat16" if torch.cuda.is_bf16_supported() else "float32"
-    checks = (getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))
-    return "bfloat16" if any(check and check() for check in checks) else "float32"
 
 
 def open_data(setup: Setup) -> Release:

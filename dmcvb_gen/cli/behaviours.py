@@ -19,9 +19,16 @@ from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, 
 @click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
 @click.option("--init-from", metavar="RUN|FILE", help="Run or policy file to start from; guided: the guide.")
 @click.option("--evaluate-every", type=click.IntRange(1), help="Agent steps between evaluations while returns are low.")
+@click.option(
+    "--precision",
+    type=click.Choice(["auto", "float32", "bfloat16"]),
+    default="auto",
+    show_default=True,
+    help="sac: precision of hidden layers; auto times both.",
+)
 @click.option("--resume", is_flag=True, help="Resume the run in --out with its own settings.")
 @json_option
-def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, resume, as_json):
+def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, precision, resume, as_json):
     """Train a behaviour policy online on states.
 
     \b
@@ -49,7 +56,9 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
     algorithm = algo or (found.algorithm if found else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
-    configuration = run_config(task, algorithm, parse_settings(pairs, config, algorithm), found, **given)
+    settings = parse_settings(pairs, config, algorithm)
+    settings |= _precision(precision, algorithm, settings, found)
+    configuration = run_config(task, algorithm, settings, found, **given)
     run = open_run(folder, configuration, resume)
     torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
     done = (run.saved() or {"step": 0})["step"]
@@ -69,6 +78,26 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     if as_json:
         return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1)))
     click.echo(f"{folder}: trained to {run.step:,} agent steps. Next: dmcvb-gen select-checkpoints {folder}")
+
+
+def _precision(asked, algorithm, settings, found):
+    """The setting that --precision decides, told in one line; none if a run is resumed or has one of its own."""
+    from dmcvb_gen.precision import choose_precision, dense_product
+    from dmcvb_gen.training.sac import SacSettings
+
+    if algorithm != "sac":
+        if asked != "auto":
+            raise click.UsageError(f"--precision has no effect with --algo {algorithm}: remove it.")
+        return {}
+    if asked == "auto" and (found or "bfloat16" in settings):
+        return {}
+    if "bfloat16" in settings:
+        raise click.UsageError("Give --precision or --set bfloat16, not both.")
+    sizes = SacSettings(**settings)
+    precision = choose_precision(asked, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
+    if asked == "auto":
+        click.echo(f"Computing in {precision}, the faster one on this processor.", err=True)
+    return {"bfloat16": precision == "bfloat16"}
 
 
 @click.command("select-checkpoints")

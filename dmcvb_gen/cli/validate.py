@@ -44,7 +44,7 @@ TRAINING = (
     type=click.Choice(["auto", "float32", "bfloat16"]),
     default="auto",
     show_default=True,
-    help="Precision of networks that see images; auto: bfloat16 if the processor computes in it.",
+    help="Precision of networks that see images; auto times both.",
 )
 @click.option("--compile", is_flag=True, help="Compile the losses with torch.compile (for CUDA and long runs).")
 @click.option(
@@ -69,10 +69,11 @@ def validate(
     """
     from dmcvb_gen.benchmarks.profiles import get_profile
     from dmcvb_gen.benchmarks.run import default_threads, default_workers
-    from dmcvb_gen.benchmarks.setup import Setup, choose_precision
+    from dmcvb_gen.benchmarks.setup import Setup
     from dmcvb_gen.benchmarks.validate import Progress
     from dmcvb_gen.benchmarks.validate import validate as run
     from dmcvb_gen.errors import DmcvbError
+    from dmcvb_gen.precision import choose_precision, image_product
 
     if checks_only:
         refuse(context, given_options(context), TRAINING, "--checks-only trains nothing")
@@ -81,6 +82,10 @@ def validate(
 
         if not torch.cuda.is_available():
             raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    asked = options["precision"]
+    precision = "float32" if checks_only else choose_precision(asked, image_product(), options["device"])
+    if asked == "auto" and not checks_only:
+        click.echo(f"Networks that see images compute in {precision}, the faster one here.", err=True)
     workers = options.pop("workers") or default_workers(options["device"])
     memory, weights = options.pop("memory"), options.pop("dino_weights")
     executor = make_executor(workers, options.pop("executor"), options.pop("ray_address"))
@@ -95,7 +100,7 @@ def validate(
         **options
         | {
             "threads": options["threads"] or threads,
-            "precision": choose_precision(options["precision"], options["device"]),
+            "precision": precision,
         },
     )
     with ProgressBar(as_json, unit=" checks", desc="structure") as bar:

@@ -182,11 +182,11 @@ def pick_checkpoints(
         return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
     found: dict[str, tuple[Pick, ...] | str] = {}
     if medium is None:
-        found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check, errors=2)
+        found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check)
     else:
         # Returns of mazes are costs: 95 % of the way from the random policy's would be half again as much as the end's.
         goal = convergence.value / EXPERT_SHARE
-        found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check, errors=0)
+        found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check)
     if not convergence.converged:
         found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
     last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
@@ -203,17 +203,13 @@ def pick_checkpoints(
     return Selection(task, base, convergence, picks, {level: why for level, why in found.items() if level not in picks})
 
 
-def _expert(
-    curve: Sequence[Point], goal: float, slack: float, check: Callable, errors: float
-) -> tuple[Pick, ...] | str:
-    """The first checkpoint that returns `goal` or more, by so many standard errors, or why there is none."""
+def _expert(curve: Sequence[Point], goal: float, slack: float, check: Callable) -> tuple[Pick, ...] | str:
+    """The first checkpoint whose mean return is `goal` or more (paper, section 3.1), or why there is none."""
     # Returns of the curve's few episodes are noisy: start a little below the line, fresh episodes decide.
     candidates = [point for point in curve if point[1] >= goal - slack]
     for step, value, path in candidates:
         evaluation = check(path)
-        # Beyond sampling error: a policy that falls now and then has a wide spread and is not an expert yet.
-        error = evaluation.std / np.sqrt(evaluation.episodes)
-        if evaluation.mean - errors * error >= goal:
+        if evaluation.mean >= goal:
             return (Pick("expert", f"return {goal:.1f}", step, value, str(path), evaluation),)
     return f"none of {len(candidates)} candidates held {goal:.1f} over fresh episodes; train longer (--resume)"
 
