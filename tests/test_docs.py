@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 RUN = {"bash", "python"}
-SHOWN = {"text", "yaml", "console", ""}
+SHOWN = {"text", "yaml", "toml", "console", ""}
 """What is not run: layouts and formulas, and set-up that needs another machine (console)."""
 SET_UP = ("pip install ", "bash scripts/", ". .venv/", "uvx ", "sbatch ", "ray ", "python -m venv ", "apt-get install ")
 

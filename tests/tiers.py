@@ -1,9 +1,10 @@
 """Pytest plugin of the two tiers of tests: it measures each test's processor time and fails slow tests without a mark.
 
-`bash scripts/test.sh` runs the tests without `@pytest.mark.slow`, `bash scripts/test.sh --all` all of them. Both give
-`--cpu-limit 5`: a test without the mark fails if its own time is over 5 seconds. Its own time is the processor time of
-its body, in this process and in children that it waited for. The clock on the wall is not used, because machines are
-shared; fixtures do not count, because many tests share them.
+`bash scripts/test.sh` runs the tests without `@pytest.mark.slow` and gives `--cpu-limit 5`: a test without the mark
+fails if its own time is over 5 seconds. `bash scripts/test.sh --all` runs all tests without a limit, because it asks
+whether the project works, on machines of any speed. A test's own time is the processor time of its body, in this
+process and in children that it waited for. The clock on the wall is not used, because machines are shared; fixtures do
+not count, because many tests share them.
 """
 
 from __future__ import annotations

@@ -57,9 +57,12 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     algorithm = algo or (found.algorithm if found else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
     settings = parse_settings(pairs, config, algorithm)
-    settings |= _precision(precision, algorithm, settings, found)
-    configuration = run_config(task, algorithm, settings, found, **given)
+    chosen = _precision(precision, algorithm, settings, found)
+    configuration = run_config(task, algorithm, settings | chosen, found, **given)
     run = open_run(folder, configuration, resume)
+    if chosen and precision == "auto":
+        name = "bfloat16" if chosen["bfloat16"] else "float32"
+        click.echo(f"Computing in {name}, the faster one on this processor.", err=True)
     torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
     done = (run.saved() or {"step": 0})["step"]
     expert = paper_returns(task, "expert")
@@ -81,7 +84,7 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
 
 
 def _precision(asked, algorithm, settings, found):
-    """The setting that --precision decides, told in one line; none if a run is resumed or has one of its own."""
+    """The setting that --precision decides; none if a run is resumed or has one of its own."""
     from dmcvb_gen.precision import choose_precision, dense_product
     from dmcvb_gen.training.sac import SacSettings
 
@@ -95,8 +98,6 @@ def _precision(asked, algorithm, settings, found):
         raise click.UsageError("Give --precision or --set bfloat16, not both.")
     sizes = SacSettings(**settings)
     precision = choose_precision(asked, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
-    if asked == "auto":
-        click.echo(f"Computing in {precision}, the faster one on this processor.", err=True)
     return {"bfloat16": precision == "bfloat16"}
 
 
