@@ -43,7 +43,7 @@ class LevelStatistics:
     """How the policies of a level move.
 
     Attributes:
-      speed: mean horizontal speed of the root, m/s.
+      speed: mean horizontal speed of the root, m/s; None if the task has no root that moves.
       height: mean height of body or head in meters; None if the state has none.
       success: share of episodes that reached their goal; None for tasks without one.
     """
@@ -51,7 +51,7 @@ class LevelStatistics:
     task: str
     level: str
     episodes: int
-    speed: float
+    speed: float | None
     height: float | None
     success: float | None
 
@@ -118,16 +118,19 @@ def level_statistics(release: Release) -> list[LevelStatistics]:
     return out
 
 
-def _speed(task: Task, subset: Subset) -> float:
+def _speed(task: Task, subset: Subset) -> float | None:
     """Mean horizontal speed of the root over all steps in m/s; from the states if there are no physics states."""
-    (position, velocity), states = _root_columns(task.model), task.state_slices
+    columns, states = _root_columns(task.model), task.state_slices
+    if columns is None:
+        return None
+    position, velocity = columns
     if "physics" in subset.arrays:
         moved = _moved(subset, "physics", 1 + position)  # time comes first
     elif POSITION in states:
         moved = _moved(subset, "state", states[POSITION].start + np.arange(2))
     else:
-        columns = states[VELOCITY].start + velocity
-        return _mean_length([rows[:, columns] for rows in _episodes(subset, "state")])
+        fields = states[VELOCITY].start + velocity
+        return _mean_length([rows[:, fields] for rows in _episodes(subset, "state")])
     return _mean_length(moved) / (ACTION_REPEAT * task.control_timestep)
 
 
@@ -140,12 +143,15 @@ def _mean_length(vectors: list[np.ndarray]) -> float:
     return float(np.sqrt((np.concatenate(vectors) ** 2).sum(axis=1)).mean())
 
 
-def _root_columns(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Where the root's horizontal motion lies in qpos and in qvel: x and y of a free joint, or the slide along x."""
+def _root_columns(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where the root's horizontal motion lies in qpos and in qvel: x and y of a free joint, or the slide along x.
+
+    None if the model has neither (a finger, an arm that is fixed to its base).
+    """
     for joint in range(model.njnt):
         position, velocity = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             return position + np.arange(2), velocity + np.arange(2)
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and model.jnt_axis[joint][0]:
             return np.array([position]), np.array([velocity])
-    raise ValueError("the model has no root that moves")
+    return None
