@@ -27,6 +27,7 @@ FLOORS = (
         "distractor_state",
         "arithmetic",
         "precision",
+        "own_code",
     ),  # the ground
     ("tasks",),
     ("storage",),

@@ -46,6 +46,7 @@ GROUPS = {
         "fetch": ("fetch:fetch", "Download a published release, or a part of it."),
     },
     "Convert": {
+        "convert-policy": ("behaviours:convert_policy", "Convert a policy of Stable-Baselines3 or torch (CleanRL)."),
         "export": ("release:export", "Write subsets in another format: HDF5, Minari, LeRobot, RLDS, ..."),
         "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
     },

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, print_table
+from dmcvb_gen.cli.common import OutPath, ProgressBar, behaviour_source, json_option, print_json, print_table
 
 
 @click.command("train-behaviour")
@@ -41,9 +41,9 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     import torch
 
     from dmcvb_gen.errors import DmcvbError
+    from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.tasks import get_task
-    from dmcvb_gen.tasks.own import allow
     from dmcvb_gen.training.defaults import parse_settings, run_config
     from dmcvb_gen.training.runs import read_config
     from dmcvb_gen.training.training import open_run
@@ -141,12 +141,72 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     click.echo(f"wrote {run}/selected, {run}/selection.json, {run}/curve.png")
 
 
+@click.command("convert-policy")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("task")
+@click.option("--out", type=OutPath(path_type=Path), required=True, help="Policy file to write (.safetensors).")
+@click.option("--level", type=click.Choice(["expert", "medium", "mixed"]), help="Level to note in the file.")
+@click.option("--hidden", metavar="N,N,...", help="Widths that the hidden layers must have.  [default: as they are]")
+@click.option(
+    "--activation",
+    type=click.Choice(["relu", "tanh", "elu", "gelu"]),
+    help="Of hidden layers.  [default: the program's]",
+)
+@click.option(
+    "--actions",
+    "distribution",
+    type=click.Choice(["tanh", "clip"]),
+    help="Plain networks: how the output becomes an action in [-1, 1].",
+)
+@click.option(
+    "--statistics", type=click.Path(path_type=Path), help='.npz with "mean" and "std" of normalized observations.'
+)
+@json_option
+def convert_policy(source, task, out, level, hidden, activation, distribution, statistics, as_json):
+    """Convert another program's policy to a policy file: a Stable-Baselines3 zip or a torch state dict (CleanRL).
+
+    Weights are read without unpickling anything. Data of a converted policy regenerate bit for bit. CleanRL's SAC keeps
+    its mean alone, and SB3's VecNormalize needs --statistics.
+
+    \b
+    dmcvb-gen convert-policy model.zip walker-run --out walker-run.safetensors
+    dmcvb-gen convert-policy ppo.pt hopper-hop --hidden 64,64 --statistics observations.npz --out hopper-hop.safetensors
+    dmcvb-gen rollout walker-run --level expert --behaviour walker-run.safetensors --episodes 20
+    """
+    from dmcvb_gen.own_code import allow
+    from dmcvb_gen.policies.convert import convert_file
+
+    allow([task])  # a person typed its name, so its code may run
+    try:
+        widths = [int(width) for width in hidden.split(",")] if hidden else None
+    except ValueError:
+        raise click.UsageError(f"--hidden {hidden!r} is no list of widths such as 256,256.") from None
+    header = convert_file(
+        source,
+        task,
+        out,
+        level=level,
+        hidden=widths,
+        activation=activation,
+        distribution=distribution and {"tanh": "deterministic", "clip": "gaussian"}[distribution],
+        statistics=statistics,
+    )
+    if as_json:
+        return print_json(header.model_dump(mode="json"))
+    layers = " x ".join(map(str, (header.observation_size, *header.hidden, header.action_size)))
+    click.echo(f"wrote {out}: {layers}, {header.activation}, {header.distribution}")
+
+
 @click.command("evaluate-behaviour")
 @click.argument("tasks", nargs=-1, metavar="[TASK]...")
 @click.option(
     "--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: all bundled]"
 )
-@click.option("--behaviour", metavar="FILE|RUN", help="Policy file or run to evaluate instead of the bundled policies.")
+@click.option(
+    "--behaviour",
+    metavar="FILE|RUN|MODULE:FUNCTION",
+    help="What to evaluate instead of the bundled policies, as in rollout.",
+)
 @click.option("--episodes", type=click.IntRange(2), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @click.option("--sample", is_flag=True, help="Sample actions instead of using the policy mean.")
@@ -164,8 +224,9 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
     """
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.generate.info import return_statistics
+    from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.actor import random_policy
-    from dmcvb_gen.policies.bundled import bundled_levels, levels_of, resolve_policies
+    from dmcvb_gen.policies.bundled import CONVERTED, bundled_levels, levels_of, resolve_policies
     from dmcvb_gen.policies.evaluation import maze_scores, running_speed, walked_paths
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.policies.policy_file import load_policy, read_header
@@ -174,7 +235,12 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
     from dmcvb_gen.tasks import get_task, task_ids
     from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
 
-    if behaviour:
+    behaviour = behaviour_source(behaviour)
+    if behaviour and (is_own(behaviour) or Path(behaviour).suffix in CONVERTED):
+        levels = levels or ["expert"]
+        if len(tasks) != 1:
+            raise click.UsageError(f"Give the one TASK that {behaviour} is for.")
+    elif behaviour:
         levels = levels or levels_of(behaviour)
         named = [level for level in levels if level != "random"]
         files = [path for level in named for path in resolve_policies("", level, behaviour)]

@@ -160,6 +160,18 @@ def background_source(given: str) -> str:
     return given if given == "builtin" else str(Path(given).resolve())
 
 
+def behaviour_source(given: str | None) -> str | None:
+    """--behaviour as a recipe has it: an absolute path, or "<module>:<function>", whose code may then run."""
+    from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
+
+    if not given:
+        return None
+    if is_own(given):
+        allow([given], BEHAVIOURS)  # a person typed its name
+        return given
+    return str(Path(given).resolve())
+
+
 def format_bytes(count: float) -> str:
     """1536 -> "1.5 kB" (powers of 1000)."""
     for unit in ("B", "kB", "MB", "GB", "TB"):

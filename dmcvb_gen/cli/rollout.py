@@ -16,6 +16,7 @@ from dmcvb_gen.cli.common import (
     OutPath,
     ProgressBar,
     background_source,
+    behaviour_source,
     format_bytes,
     format_duration,
     json_option,
@@ -102,7 +103,12 @@ OPTION_GROUPS = {
 @click.option(
     "--split", type=click.Choice(SPLITS), default="train", help="Background videos and maze styles: train or val."
 )
-@click.option("--behaviour", metavar="FILE|RUN", help="Policy file or training run, instead of the bundled policy.")
+@click.option(
+    "--behaviour",
+    metavar="FILE|RUN|MODULE:FUNCTION",
+    help="Policy instead of the bundled one: a policy file, a training run, an SB3 zip, a torch state dict (.pt), or a "
+    "function of your own.",
+)
 @click.option("--sample", is_flag=True, help="Sample actions instead of using the policy mean.")
 @click.option("--no-pixels", is_flag=True, help="Store no images; `paint` renders them later.")
 @click.option("--independent", is_flag=True, help="Simulate separate episodes for each distractor.")
@@ -264,7 +270,7 @@ def _recipe(context, options, going_on):
 
     given = given_options(context)
     tasks = (*options["tasks"], *(_layout_task(layout) for layout in options["layouts"]))
-    from dmcvb_gen.tasks.own import allow
+    from dmcvb_gen.own_code import allow, is_own
 
     allow(tasks)  # a person typed these names, so their code may run
     if not options["recipe"] and not tasks:
@@ -278,6 +284,8 @@ def _recipe(context, options, going_on):
     else:
         recipe = _recipe_from_options(tasks, options, given)
     check_heard(recipe, given)
+    if "sample" in given and is_own(options["behaviour"] or ""):
+        raise click.UsageError("--sample has no effect here: a function of your own draws by itself. Remove it.")
     return recipe
 
 
@@ -324,8 +332,10 @@ RECIPE_OPTIONS |= {"independent"}
 
 def _translated(options):
     """Places of files as the recipe has them."""
-    behaviour = options["behaviour"] and str(Path(options["behaviour"]).resolve())
-    return {"behaviour": behaviour, "backgrounds": background_source(options["backgrounds"])}
+    return {
+        "behaviour": behaviour_source(options["behaviour"]),
+        "backgrounds": background_source(options["backgrounds"]),
+    }
 
 
 def _recipe_from_options(tasks, options, given):
@@ -363,9 +373,9 @@ def _recipe_from_options(tasks, options, given):
 
 def _default_renderer(tasks: tuple[str, ...]) -> str:
     """The renderer of tasks that are rolled out together: the first one that is not native, if any."""
+    from dmcvb_gen.own_code import allow
     from dmcvb_gen.rendering import default_renderer
     from dmcvb_gen.tasks import get_task
-    from dmcvb_gen.tasks.own import allow
 
     allow(tasks)  # a person typed these names, so their code may run
     chosen = [default_renderer(get_task(task)) for task in tasks]

@@ -148,7 +148,14 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
       digests: of the policies, so that a file that was replaced is read again.
     """
     task = get_task(task_name)
-    return [load_policy(path, task) for path in files] or [random_policy(task)]
+    loaded = [load_policy(path, task) for path in files]
+    for path, policy, digest in zip(files, loaded, digests, strict=True):
+        if policy.digest != digest:
+            raise StoreError(
+                f"{path} is not the policy that the release names (digest {policy.digest[:12]}, asked for "
+                f"{digest[:12]}); bring back the file as it was, or give another --out"
+            )
+    return loaded or [random_policy(task)]
 
 
 def stored_episodes(job: Job) -> Episodes:

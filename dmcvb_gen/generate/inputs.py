@@ -12,6 +12,7 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.bundled import resolve_policies
+from dmcvb_gen.policies.header import OWN_CODE
 
 BUILTIN = "builtin"
 """The videos that the package brings."""
@@ -47,13 +48,16 @@ def release_inputs(root: Path, records: Iterable[SubsetRecord], backgrounds: str
 
 
 def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:
-    """Files of a subset's policies: the release's own copies, else the bundled ones, by digest.
+    """Files of a subset's policies: the release's own copies, else the bundled ones, by digest; names of own code.
 
     Raises:
       StoreError: neither is there.
     """
     found = []
     for policy in record.policies:
+        if policy.header.get("algorithm") == OWN_CODE:
+            found.append(policy.name)  # its digest is checked when it is loaded, and its code is let run there
+            continue
         candidates = [root / policy.path] if policy.path else []
         with contextlib.suppress(DmcvbError):  # the release's own copy is enough
             candidates += resolve_policies(record.task, record.level)

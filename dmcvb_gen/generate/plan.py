@@ -45,6 +45,7 @@ from dmcvb_gen.generate.render import check_renderer, renderer_for
 from dmcvb_gen.generate.site import CONNECTIONS, BucketSite, FolderSite, Site
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.policies.bundled import resolve_policies
+from dmcvb_gen.policies.header import OWN_CODE
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import SPLITS
 from dmcvb_gen.storage.remote import local_path, storage_errors
@@ -220,6 +221,8 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
 def _policy_record(path: Path, task: Task) -> PolicyRecord:
     policy = load_policy(path, task)
     header = policy.header.without_local_paths().model_dump(mode="json")
+    if policy.header.algorithm == OWN_CODE:
+        return PolicyRecord(name=str(path), digest=policy.digest, header=header)
     copy = f"{POLICIES}{policy.digest[:16]}.safetensors"
     return PolicyRecord(name=path.stem, digest=policy.digest, path=copy, header=header)
 
@@ -248,7 +251,7 @@ def _without_local_paths(
     for request in requests:
         if request.policy:
             found = copies.setdefault(request.policy, {})
-            found |= dict.fromkeys(str(policy.path) for policy in records[request.name].policies)
+            found |= dict.fromkeys(policy.path or policy.name for policy in records[request.name].policies)
     data = recipe.model_dump(mode="json")
     for pattern in data["subsets"]:
         pattern["policies"] = {level: ",".join(copies[given]) for level, given in pattern["policies"].items()}

@@ -8,8 +8,12 @@ from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
+from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.spec import TRAINED_LEVELS
+
+CONVERTED = (".zip", ".pt", ".pth")
+"""Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
 
 
 def bundled_folder() -> Path:
@@ -69,7 +73,8 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
     """Policy files of a level: bundled ones, or those of `behaviour`.
 
     Args:
-      behaviour: a policy file, a run folder in which checkpoints were selected, or a folder of level files.
+      behaviour: a policy file, another program's (`policies.convert`), a run folder in which checkpoints were selected,
+        a folder of level files, or "<module>:<function>".
 
     Raises:
       DmcvbError: there is nothing for that level.
@@ -77,10 +82,14 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
     if behaviour is None:
         return bundled_policies(task_id, level)
     path = Path(behaviour)
-    if path.is_file():
+    if path.suffix in CONVERTED and path.is_file():
+        from dmcvb_gen.policies.convert import converted
+
+        return [converted(path, task_id, level)]
+    if path.is_file() or is_own(str(behaviour)):
         return [path]
     if not path.is_dir():
-        raise PolicyFileError(f"{behaviour} is neither a policy file nor a run folder")
+        raise PolicyFileError(f"{behaviour} is neither a policy file, a run folder nor <module>:<function>")
     for folder in (path / "selected", path):
         files = level_files(folder, level)
         if files:

@@ -22,6 +22,8 @@ Mode = Annotated[
     pydantic.BeforeValidator(lambda mode: "mean" if mode == "deterministic" else mode),
 ]
 """Which actions were taken; "deterministic" is what version 0.1 wrote for "mean"."""
+OWN_CODE = "own-code"
+"""Algorithm of a behaviour that is a function of the user's."""
 ORIGINS = {
     "sac": "by soft actor-critic (SAC)",
     "guided": "on a policy of the open maze, by imitation of a guide that knows the way (DAgger)",
@@ -29,6 +31,9 @@ ORIGINS = {
     "td3": "by Stable-Baselines3's TD3",
     "tqc": "by sb3-contrib's TQC",
     "ppo": "by Stable-Baselines3's PPO",
+    "sb3": "by Stable-Baselines3, outside of this package",
+    "cleanrl": "by CleanRL, outside of this package",
+    "torch": "by other programs (a torch state dict)",
 }
 """Algorithm -> how a policy of it was trained, after "trained ..."."""
 Width = Annotated[int, pydantic.Field(gt=0, le=MAX_WIDTH)]

@@ -17,6 +17,7 @@ from safetensors.numpy import save as dump_safetensors
 
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.files import parse_json, write_bytes
+from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
 from dmcvb_gen.spec import is_maze
@@ -67,11 +68,16 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
     """Load a policy file.
 
     Args:
+      path: a policy file, or "<module>:<function>" (see `policies.own`), which needs a task.
       task: the task it must be for; the header's own by default.
 
     Raises:
       PolicyFileError: the file is not whole, is for another task, or its shapes or values do not fit.
     """
+    if is_own(str(path)) and task is not None:
+        from dmcvb_gen.policies.own import own_policy
+
+        return own_policy(str(path), task)
     path = Path(path)
     header, weights, digest = _read(path)
     if task is not None and header.task != task.id and not _same_family(header.task, task.id):

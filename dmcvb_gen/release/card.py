@@ -27,7 +27,7 @@ from dmcvb_gen.files import remove_partial, replacing, write_text
 from dmcvb_gen.generate.info import describe_release
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
-from dmcvb_gen.policies.header import origin_of
+from dmcvb_gen.policies.header import OWN_CODE, origin_of
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
@@ -372,11 +372,14 @@ def _limits(release: Release) -> list[str]:
         )
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
-    if algorithms := {
-        str(policy.header.get("algorithm", "unknown means"))
-        for record in manifest.subsets
-        for policy in record.policies
-    }:
+    policies = {policy.digest: policy for record in manifest.subsets for policy in record.policies}.values()
+    own = [policy for policy in policies if policy.header.get("algorithm") == OWN_CODE]
+    limits += [
+        f"Behaviour `{policy.name}` is code (SHA-256 of its source file: `{policy.digest}`): its data are not "
+        "regenerable without that code."
+        for policy in own
+    ]
+    if algorithms := {str(policy.header.get("algorithm", "unknown means")) for policy in policies} - {OWN_CODE}:
         limits.append(f"{trained(algorithms)}; the paper's by MPO. Compare the returns above.")
     steps = {name: subset.steps for name, subset in release.subsets.items()}
     small = [name for name, count in steps.items() if count < 1_000_000]

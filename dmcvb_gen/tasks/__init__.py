@@ -12,11 +12,12 @@ from collections.abc import Callable
 from importlib import metadata
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.own_code import is_own
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
-from dmcvb_gen.tasks.own import is_own, own_task
+from dmcvb_gen.tasks.own import own_task
 from dmcvb_gen.tasks.suite import suite_ids, suite_task
 
 ENTRY_POINTS = "dmcvb_gen.tasks"

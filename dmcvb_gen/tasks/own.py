@@ -1,39 +1,16 @@
 """Tasks of your own: "<module>:<function>" names a function that returns a dm_control `Environment`.
 
-The function's code runs, so a task id that was read from a file is refused: only ids that a person gave to `allow` (the
-command line does, for the tasks that are typed there) or in the environment variable `DMCVB_GEN_TASKS` are run.
+Its code runs only if a person named it, see `own_code`.
 """
 
 from __future__ import annotations
 
-import importlib
-import os
-import re
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.own_code import TASKS, find_function
 from dmcvb_gen.tasks.suite import SuiteTask, import_suite
-
-ALLOWED = "DMCVB_GEN_TASKS"
-"""Environment variable with the task ids whose code may run, joined by commas; worker processes inherit it."""
-
-_OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-
-
-def is_own(task_id: str) -> bool:
-    """Whether a task id has the form "<module>:<function>"."""
-    return _OWN_ID.fullmatch(task_id) is not None
-
-
-def allow(task_ids: Iterable[str]) -> None:
-    """Let the code of these tasks run in this process and its children."""
-    own = [task_id for task_id in task_ids if is_own(task_id)]
-    if own:
-        before = [task_id for task_id in os.environ.get(ALLOWED, "").split(",") if task_id]
-        os.environ[ALLOWED] = ",".join(dict.fromkeys([*before, *own]))
 
 
 def own_task(task_id: str) -> SuiteTask:
@@ -42,18 +19,8 @@ def own_task(task_id: str) -> SuiteTask:
     Raises:
       DmcvbError: its code may not run, cannot be found, fails, or gives no usable environment.
     """
-    if task_id not in os.environ.get(ALLOWED, "").split(","):
-        raise DmcvbError(f"{task_id} is code of your own; to let it run, set {ALLOWED}={task_id}")
-    module, _, name = task_id.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    import_suite()
-    try:
-        make = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise DmcvbError(
-            f"cannot find task {task_id} ({error}); give <module>:<function>, run from its folder"
-        ) from None
+    import_suite()  # before the task's own import of it, whose warnings nobody needs
+    make = find_function(task_id, TASKS, "task")
     return SuiteTask(task_id, make)
 
 

@@ -1,0 +1,62 @@
+"""Code of your own: "<module>:<function>" names a function, of a task or of a behaviour policy.
+
+The function's code runs, so a name that was read from a file is refused: only names that a person gave to `allow` (the
+command line does, for what is typed there) or in an environment variable are run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from dmcvb_gen.errors import DmcvbError
+
+TASKS = "DMCVB_GEN_TASKS"
+BEHAVIOURS = "DMCVB_GEN_BEHAVIOURS"
+"""Environment variables with the names whose code may run, joined by commas; worker processes inherit them."""
+
+_OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+
+def is_own(name: str) -> bool:
+    """Whether a name has the form "<module>:<function>"."""
+    return _OWN_ID.fullmatch(name) is not None
+
+
+def allow(names: Iterable[str], variable: str = TASKS) -> None:
+    """Let the code of these names run in this process and its children; other names are left out.
+
+    Args:
+      variable: `TASKS` or `BEHAVIOURS`.
+    """
+    own = [name for name in names if is_own(name)]
+    if own:
+        before = [name for name in os.environ.get(variable, "").split(",") if name]
+        os.environ[variable] = ",".join(dict.fromkeys([*before, *own]))
+
+
+def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
+    """The function "<module>:<function>"; its module is imported from the path or the current folder.
+
+    Args:
+      variable: the environment variable that lets it run.
+      kind: what it is, for messages: "task" or "behaviour".
+
+    Raises:
+      DmcvbError: its code may not run, or cannot be found.
+    """
+    if name not in os.environ.get(variable, "").split(","):
+        raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={name}")
+    module, _, function = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise DmcvbError(
+            f"cannot find {kind} {name} ({error}); give <module>:<function>, run from its folder"
+        ) from None

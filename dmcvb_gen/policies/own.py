@@ -1,0 +1,98 @@
+"""Behaviours of your own: "<module>:<function>" names a function of observations and a generator that gives actions.
+
+::
+
+    def behaviour(observations, generator):  # (n, observation) float32 in; (n, action) in [-1, 1] out
+        return generator.uniform(-1, 1, size=(len(observations), 6))
+
+Data from such code are marked: they are not regenerable without it. Its source file's digest stands in the manifest.
+The code runs only if a person named it, see `own_code`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.own_code import BEHAVIOURS, find_function
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
+from dmcvb_gen.tasks.base import Task
+
+MARK = "not regenerable without that code"
+
+
+class RowGenerator:
+    """A numpy `Generator` for a batch: row i of what it draws comes from the stream of episode i alone.
+
+    Every method of `numpy.random.Generator` that takes `size` is there; `size` is named, and begins with the number of
+    rows: `generator.normal(size=(n, 6))`.
+    """
+
+    def __init__(self, streams: Sequence[np.random.Generator]):
+        self._streams = streams
+
+    def __getattr__(self, name: str) -> Callable[..., np.ndarray]:
+        def draw(*args: Any, size: tuple[int, ...] = (), **kwargs: Any) -> np.ndarray:
+            if not isinstance(size, tuple) or not size or size[0] != len(self._streams):
+                raise ValueError(f"draw with {name}(..., size=({len(self._streams)}, ...)), one row an observation")
+            rows = [getattr(stream, name)(*args, size=size[1:], **kwargs) for stream in self._streams]
+            return np.stack(rows)
+
+        return draw
+
+
+class OwnPolicy(Policy):
+    """A behaviour policy that is a function of the user's; the function draws its own noise, if it wants any."""
+
+    def __init__(self, name: str, function: Callable[..., Any], task: Task, digest: str):
+        header = PolicyHeader(
+            task=task.id,
+            observation=task.observation,
+            observation_size=task.behaviour_size,
+            action_size=task.action_size,
+            algorithm=OWN_CODE,
+            agent_step=0,
+            hidden=(),
+            training={"behaviour": name, "source_sha256": digest, "note": MARK},
+        )
+        super().__init__(header, {}, digest)
+        self._name, self._function = name, function
+
+    def act(self, observation, generators=None, deterministic=False):
+        asked = (len(observation), self.header.action_size)
+        try:
+            action = np.asarray(self._function(np.array(observation, np.float32), RowGenerator(generators or ())))
+        except Exception as error:  # the code of somebody else
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise PolicyFileError(f"behaviour {self._name} failed ({type(error).__name__}: {reason})") from error
+        if action.shape != asked or action.dtype.kind not in "fiu":
+            raise PolicyFileError(
+                f"behaviour {self._name} gave {action.dtype} of shape {action.shape}, {self.header.task} takes numbers "
+                f"of shape {asked}; return one row of {asked[1]} actions an observation"
+            )
+        if not np.isfinite(action).all():
+            raise PolicyFileError(f"behaviour {self._name} gave actions that are not finite; return numbers in [-1, 1]")
+        return np.clip(action, -1, 1).astype(np.float32)
+
+
+def own_policy(name: str, task: Task) -> OwnPolicy:
+    """The behaviour policy of a function "<module>:<function>", tried on two observations of zeros.
+
+    Raises:
+      DmcvbError: its code may not run, cannot be found, fails, or gives no actions of the task.
+    """
+    function = find_function(name, BEHAVIOURS, "behaviour")
+    source = getattr(importlib.import_module(name.partition(":")[0]), "__file__", None)
+    if source is None or not callable(function):
+        raise PolicyFileError(
+            f"behaviour {name} is no function of a module with a source file; give <module>:<function>"
+        )
+    policy = OwnPolicy(name, function, task, sha256_file(source))
+    policy.act(np.zeros((2, task.behaviour_size), np.float32), [np.random.default_rng(row) for row in range(2)])
+    return policy

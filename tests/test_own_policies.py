@@ -1,0 +1,269 @@
+"""Policies from elsewhere: functions of one's own, Stable-Baselines3 zips, torch state dicts; walker and a maze."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import zipfile
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from stable_baselines3 import PPO, SAC, TD3
+from torch import nn
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate import engine
+from dmcvb_gen.own_code import BEHAVIOURS
+from dmcvb_gen.policies.convert import convert
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.release.card import write_card
+from dmcvb_gen.tasks import get_task
+from tests.conftest import TINY_MAZE
+
+WALKER = "walker-walk"
+TASKS = [WALKER, TINY_MAZE]
+TINY = ["--level", "expert", "--episodes", "2", "--max-steps", "4", "--size", "16"]
+CODE = """
+import numpy as np
+
+def noisy(observations, generator):
+    drawn = generator.normal(size=(len(observations), {actions}))
+    return np.tanh(observations[:, :1] + drawn)
+
+def narrow(observations, generator):
+    return np.zeros((len(observations), 2))
+
+def broken(observations, generator):
+    raise KeyError("no such thing")
+"""
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def done(*arguments):
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def refused(*arguments):
+    """The one line that a command is refused with."""
+    result = run(*arguments)
+    assert result.exit_code and isinstance(result.exception, SystemExit | None), result.exception
+    [line] = [line for line in result.output.splitlines() if line.lower().startswith("error")]
+    return line
+
+
+@pytest.fixture(params=TASKS, ids=["walker", "maze"])
+def task(request):
+    return get_task(request.param)
+
+
+class Space(gymnasium.Env):
+    """The spaces of a task's behaviour, which is all that SB3 needs to make a model."""
+
+    def __init__(self, task):
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.behaviour_size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (task.action_size,), np.float32)
+
+
+def model(algorithm, task, **arguments):
+    return algorithm("MlpPolicy", Space(task), seed=0, device="cpu", **arguments)
+
+
+def goes_the_whole_way(task, behaviour, folder):
+    """Roll out, verify and regenerate with a behaviour: the release."""
+    done("rollout", task.id, *TINY, "--behaviour", behaviour, "--out", folder)
+    assert json.loads(done("verify", folder, "--json"))["sound"]
+    assert "same digest" in done("regenerate", folder, "--check")
+    return open_release(folder)
+
+
+# -- functions ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def code(task, tmp_path, monkeypatch):
+    """Name of a module with behaviours for the task; the environment variable is put back afterwards."""
+    name = f"own_{hashlib.sha256(str(tmp_path).encode()).hexdigest()[:8]}"
+    (tmp_path / f"{name}.py").write_text(CODE.format(actions=task.action_size))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(BEHAVIOURS, "")
+    return name
+
+
+def test_data_of_a_function_are_verified_regenerated_and_marked(task, code, tmp_path, monkeypatch):
+    release = goes_the_whole_way(task, f"{code}:noisy", tmp_path / "r")
+    [subset] = release.subsets.values()
+    [policy] = subset.record.policies
+    source = (tmp_path / f"{code}.py").read_bytes()
+    assert policy.digest == hashlib.sha256(source).hexdigest() and policy.path is None
+    assert policy.header["training"]["note"] == "not regenerable without that code"
+    write_card(tmp_path / "r")
+    card = (tmp_path / "r" / "README.md").read_text()
+    assert f"`{code}:noisy`" in card and policy.digest in card and "not regenerable without that code" in card
+    engine._policies.cache_clear()  # as in a new process
+    monkeypatch.setenv(BEHAVIOURS, "")  # and on somebody else's machine: a manifest lets no code run
+    assert BEHAVIOURS in refused("regenerate", tmp_path / "r", "--check")
+    assert json.loads(done("verify", tmp_path / "r", "--json"))["sound"]
+
+
+def test_a_functions_noise_comes_from_each_episodes_own_stream(task, code, tmp_path, monkeypatch):
+    done("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--out", tmp_path / "a")
+    alone = [*TINY, "--episodes-per-shard", "1", "--behaviour", f"{code}:noisy", "--out", tmp_path / "b"]
+    done("rollout", task.id, *alone)
+    [first], [second] = (list(open_release(tmp_path / name).subsets.values()) for name in "ab")
+    np.testing.assert_array_equal(first.read("action"), second.read("action"))
+
+
+def test_other_code_of_the_same_name_is_refused(code, task, tmp_path, monkeypatch):
+    done("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--out", tmp_path / "r")
+    (tmp_path / f"{code}.py").write_text(CODE.format(actions=task.action_size) + "\n# changed\n")
+    engine._policies.cache_clear()  # as in a new process
+    assert "is not the policy that the release names" in refused("regenerate", tmp_path / "r", "--check")
+
+
+@pytest.mark.parametrize(
+    "function, words",
+    [
+        ("narrow", "of shape (2, 2)"),
+        ("broken", "failed (KeyError: 'no such thing')"),
+        ("missing", "cannot find behaviour"),
+    ],
+)
+def test_functions_that_give_no_actions_are_refused_in_one_line(task, code, tmp_path, function, words):
+    line = refused("rollout", task.id, *TINY, "--behaviour", f"{code}:{function}", "--out", tmp_path / "r")
+    assert words in line and not (tmp_path / "r").exists()
+    assert "no effect" in refused("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--sample")
+
+
+# -- Stable-Baselines3 ----------------------------------------------------------------------------
+
+SB3 = {
+    "sac": (SAC, {"policy_kwargs": {"net_arch": [8, 8]}, "buffer_size": 10}),
+    "td3": (TD3, {"policy_kwargs": {"net_arch": [8], "activation_fn": nn.ELU}, "buffer_size": 10}),
+    "ppo": (PPO, {"policy_kwargs": {"net_arch": {"pi": [8, 8], "vf": [4]}}, "n_steps": 8, "batch_size": 8}),
+}
+
+
+@pytest.mark.parametrize("name", SB3)
+def test_an_sb3_policy_acts_as_sb3_does(task, name, tmp_path):
+    algorithm, arguments = SB3[name]
+    made = model(algorithm, task, **arguments)
+    made.save(tmp_path / "model.zip")
+    header, weights = convert(tmp_path / "model.zip", task.id)
+    save_policy(tmp_path / "p.safetensors", header, weights)
+    seen = np.random.default_rng(0).normal(size=(5, task.behaviour_size)).astype(np.float32)
+    theirs, _ = made.predict(seen, deterministic=True)
+    np.testing.assert_allclose(load_policy(tmp_path / "p.safetensors").act(seen, None, True), theirs, atol=1e-5)
+
+
+def test_data_of_an_sb3_zip_regenerate_bit_for_bit(task, tmp_path):
+    model(SAC, task, **SB3["sac"][1]).save(tmp_path / "model.zip")
+    release = goes_the_whole_way(task, tmp_path / "model.zip", tmp_path / "r")
+    [policy] = next(iter(release.subsets.values())).record.policies
+    assert policy.header["algorithm"] == "sb3" and (tmp_path / "r" / policy.path).is_file()
+    (tmp_path / "model.zip").unlink()  # the release has its own copy of the weights
+    assert "same digest" in done("regenerate", tmp_path / "r", "--check")
+
+
+class Evil:
+    def __reduce__(self):
+        return os.mkdir, ("/tmp/dmcvb-gen-evil-pickle",)
+
+
+@pytest.mark.parametrize("kind", ["zip", "pt"])
+def test_nothing_is_unpickled(kind, tmp_path):
+    path = tmp_path / f"evil.{kind}"
+    if kind == "zip":
+        torch.save({"a": Evil()}, tmp_path / "policy.pth")
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.write(tmp_path / "policy.pth", "policy.pth")
+            archive.writestr("data", "{}")
+    else:
+        path.write_bytes(pickle.dumps({"a": Evil()}))
+    with pytest.raises(DmcvbError, match="without running code"):
+        convert(path, WALKER)
+    assert not os.path.exists("/tmp/dmcvb-gen-evil-pickle")
+
+
+# -- state dicts ----------------------------------------------------------------------------------
+
+
+def mlp(*sizes):
+    layers = [layer for fan in zip(sizes, sizes[1:], strict=False) for layer in (nn.Linear(*fan), nn.Tanh())]
+    return nn.Sequential(*layers[:-1])
+
+
+class CleanRlSac(nn.Module):
+    """Names and shapes of the actor in CleanRL's sac_continuous_action.py; its mean action."""
+
+    def __init__(self, observations, actions):
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(observations, 8), nn.Linear(8, 8)
+        self.fc_mean, self.fc_logstd = nn.Linear(8, actions), nn.Linear(8, actions)
+        self.register_buffer("action_scale", torch.ones(1, actions))
+        self.register_buffer("action_bias", torch.zeros(1, actions))
+
+    def forward(self, x):
+        return torch.tanh(self.fc_mean(torch.relu(self.fc2(torch.relu(self.fc1(x))))))
+
+
+class CleanRlPpo(nn.Module):
+    """Names and shapes of the agent in CleanRL's ppo_continuous_action.py; its mean action, clipped."""
+
+    def __init__(self, observations, actions):
+        super().__init__()
+        self.critic, self.actor_mean = mlp(observations, 8, 8, 1), mlp(observations, 8, 8, actions)
+        self.actor_logstd = nn.Parameter(torch.zeros(1, actions))
+
+    def forward(self, x):
+        return self.actor_mean(x).clip(-1, 1)
+
+
+@pytest.mark.parametrize("kind", [CleanRlSac, CleanRlPpo])
+def test_a_cleanrl_state_dict_acts_as_cleanrl_does_and_regenerates(task, kind, tmp_path):
+    torch.manual_seed(0)
+    actor = kind(task.behaviour_size, task.action_size)
+    torch.save(actor.state_dict(), tmp_path / "actor.pt")
+    statistics = {"mean": np.full(task.behaviour_size, 0.5), "std": np.full(task.behaviour_size, 2.0)}
+    np.savez(tmp_path / "seen.npz", **statistics)
+    options = ["--hidden", "8,8", "--statistics", tmp_path / "seen.npz", "--out", tmp_path / "p.safetensors"]
+    done("convert-policy", tmp_path / "actor.pt", task.id, *options)
+    seen = np.random.default_rng(0).normal(size=(5, task.behaviour_size)).astype(np.float32)
+    with torch.no_grad():
+        theirs = actor((torch.from_numpy(seen) - 0.5) / 2).numpy()
+    ours = load_policy(tmp_path / "p.safetensors").act(seen, None, True)
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    goes_the_whole_way(task, tmp_path / "p.safetensors", tmp_path / "r")
+
+
+def test_policies_that_do_not_fit_are_refused_in_one_line(tmp_path):
+    task, out = get_task(WALKER), tmp_path / "p.safetensors"
+    sizes, small = (task.behaviour_size, task.action_size), tmp_path / "small.pt"
+    torch.save(CleanRlPpo(sizes[0], sizes[1] - 1).state_dict(), small)
+    line = refused("convert-policy", small, WALKER, "--out", out)
+    assert "24 x 8 x 8 x 5" in line and "24 x 8 x 8 x 6" in line
+    assert "24 x 8 x 8 x 5" in refused("rollout", WALKER, *TINY, "--behaviour", small, "--out", tmp_path / "r")
+    plain = tmp_path / "plain.pt"
+    torch.save(mlp(sizes[0], 8, sizes[1]).state_dict(), plain)
+    assert "give --activation and --actions" in refused("convert-policy", plain, WALKER, "--out", out)
+    done("convert-policy", plain, WALKER, "--activation", "tanh", "--actions", "tanh", "--out", out)
+    wide = ["--activation", "tanh", "--actions", "tanh", "--hidden", "9", "--out", out]
+    assert "24 x 9 x 6" in refused("convert-policy", plain, WALKER, *wide)
+    torch.save({"conv.weight": torch.zeros(3, 3, 3, 3)}, plain)
+    assert "none of the actors that are known" in refused("convert-policy", plain, WALKER, "--out", out)
+    model(SAC, task, use_sde=True, buffer_size=10).save(tmp_path / "sde.zip")
+    assert "use_sde" in refused("convert-policy", tmp_path / "sde.zip", WALKER, "--out", out)
+    (tmp_path / "text.zip").write_text("no zip")
+    assert "without running code" in refused("convert-policy", tmp_path / "text.zip", WALKER, "--out", out)
+    assert "cannot read" in refused("convert-policy", tmp_path / "no.pt", WALKER, "--out", out)
