@@ -204,7 +204,7 @@ def test_bad_requests(tmp_path):
         (["--layout", "no-such"], "ant-maze-empty7x7"),
         (["ant-maze-empty7x7", "--distractor", "dynamic"], "--goal"),
         (["ant-maze-empty7x7", "--goal", "seen"], "visible"),
-        (["walker-walk", "--goal", "hidden"], "ant-maze"),
+        (["walker-walk", "--goal", "hidden"], "no effect outside mazes"),
         (["ant-maze-empty7x7", "--fixed-goals", "100000"], "fixed-goals"),
         (["ant-maze-empty7x7", "--steps", "100"], "episodes"),
     ]:

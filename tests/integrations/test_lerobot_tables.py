@@ -97,7 +97,7 @@ def test_videos_have_a_frame_a_step(stored, tmp_path):
 
 def test_odd_sizes_make_no_videos(stored, tmp_path, monkeypatch):
     one = stored["walker-walk/random/static"]
-    from dmcvb_gen.release.export import lerobot
+    from dmcvb_gen.release.export.formats import lerobot
 
     monkeypatch.setattr(lerobot, "_shape", lambda source: ())
     real = lerobot._Layout.__init__

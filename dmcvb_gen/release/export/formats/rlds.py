@@ -11,7 +11,6 @@ import numpy as np
 from dmcvb_gen.release.dmcvb_names import picture_feature, state_feature
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
-from dmcvb_gen.release.tfrecord import encode_example, record
 
 EPISODES_PER_FILE = 50
 _FEATURES = "tensorflow_datasets.core.features"
@@ -36,6 +35,8 @@ def write(source: Source, folder: Path) -> None:
     observation; its action is zeros and means nothing (RLDS). An episode has its `episode_index` and, of fixed goals,
     its `goal_pair`.
     """
+    from dmcvb_gen.release.tfrecord import encode_example, record
+
     subset, version = source.subset, source.manifest.version
     name = subset.name.replace("/", "_").replace("-", "_").replace(".", "_")
     target = folder / version
