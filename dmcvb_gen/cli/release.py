@@ -117,11 +117,7 @@ def frames_bar(as_json):
 
 @click.command()
 @click.argument("path", metavar="[RELEASE]", required=False)
-@click.option(
-    "--manifest",
-    type=click.Path(exists=True, dir_okay=False),
-    help="Manifest file, instead of a release.",
-)
+@click.option("--manifest", metavar="NAME|FILE", help="A shipped manifest or a manifest's file, instead of a release.")
 @only_option
 @episodes_option
 @click.option("--check", is_flag=True, help="Compare digests and change nothing.")
@@ -145,19 +141,19 @@ def regenerate(
     \b
     dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
     dmcvb-gen regenerate releases/mini
-    dmcvb-gen regenerate --manifest dataset_cards/dmcvb-mini/manifest.json --only 'cheetah-run/*/none' --out part
+    dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --episodes 0:3 --out data/part
     """
     from dmcvb_gen.generate.regenerate import Regeneration
+    from dmcvb_gen.generate.shipped import manifest_source
 
     if (path is None) == (manifest is None):
-        raise click.UsageError("Give a RELEASE, or the file of a manifest with --manifest.")
+        raise click.UsageError("Give a RELEASE, or a manifest with --manifest.")
     if manifest and not out:
-        raise click.UsageError("A manifest alone has no shards to repair; say with --out where to make them.")
-    path = path or manifest
+        raise click.UsageError("A manifest alone has no shards to repair; add --out FOLDER.")
     if check and out:
         raise click.UsageError("Give --check or --out, not both.")
-    work = Regeneration(path, only, episodes, backgrounds, device, make_executor(workers, executor, ray_address))
-    with frames_bar(as_json) as bar:
+    with manifest_source(manifest) if manifest else contextlib.nullcontext(path) as source, frames_bar(as_json) as bar:
+        work = Regeneration(source, only, episodes, backgrounds, device, make_executor(workers, executor, ray_address))
         outcome = work.remake(out, bar) if out else (work.check if check else work.repair)(bar)
     if as_json:
         print_json(

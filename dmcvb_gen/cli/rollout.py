@@ -582,6 +582,7 @@ def list_command(remote, options, as_json):
         ("difficulties", facts["difficulties"]),
         ("maze goals", facts["maze_settings"]),
         ("recipes", facts["recipes"]),
+        ("manifests", facts["manifests"]),
     ):
         click.echo(textwrap.fill(f"{heading}: {', '.join(names)}", 80, break_on_hyphens=False))
     for name, reason in facts["renderers"].items():

@@ -62,6 +62,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
 def describe_package() -> dict[str, Any]:
     """Tasks, levels, distractors, bundled behaviours, recipes, and renderers with why they cannot start here."""
     from dmcvb_gen.generate.recipe import shipped_recipes
+    from dmcvb_gen.generate.shipped import shipped_manifests
     from dmcvb_gen.policies.bundled import bundled_levels
     from dmcvb_gen.rendering import available_renderers
     from dmcvb_gen.tasks import get_task, suite_ids, task_ids
@@ -88,5 +89,6 @@ def describe_package() -> dict[str, Any]:
         difficulties=list(DIFFICULTIES),
         maze_settings=list(GOAL_MODES),
         recipes=list(shipped_recipes()),
+        manifests=list(shipped_manifests()),
         renderers=available_renderers(),
     )

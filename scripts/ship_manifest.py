@@ -1,0 +1,15 @@
+"""Put the manifest and index of a release into the package, so that `regenerate --manifest NAME` finds them.
+
+python scripts/ship_manifest.py releases/quickstart
+"""
+
+import sys
+from pathlib import Path
+
+from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.generate.shipped import write_archive
+
+for release in sys.argv[1:]:
+    name = load_manifest(release)[1].name
+    out = Path(__file__).parents[1] / "dmcvb_gen/generate/data/manifests" / f"{name}.zip"
+    print(f"{out}: {write_archive(release, out):,} bytes")
