@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from dmcvb_gen.commands import export, fetch, paint, publish, regenerate, repaint, rollout, validate, verify
 from dmcvb_gen.loaders.register import register_with_gymnasium
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
     from dmcvb_gen.benchmarks.evaluate import Score
     from dmcvb_gen.loaders.release import ReleaseReader
-__all__ = ["__version__", "evaluate", "open"]
+__all__ = [
+    "__version__",
+    "evaluate",
+    "export",
+    "fetch",
+    "open",
+    "paint",
+    "publish",
+    "regenerate",
+    "repaint",
+    "rollout",
+    "validate",
+    "verify",
+]
 
 
 def open(path: str, storage_options: dict | None = None, *, paint: bool = False, **painting: Any) -> ReleaseReader:

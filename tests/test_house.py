@@ -40,6 +40,7 @@ FLOORS = (
     ("loaders",),
     ("release",),
     ("benchmarks",),
+    ("commands",),
     ("cli",),
 )
 """From the ground up; a module may import from its own floor (its own package there) and those below."""

@@ -11,9 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
+from dmcvb_gen.benchmarks.profiles import get_profile
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
 from dmcvb_gen.benchmarks.setup import Setup, open_data
@@ -23,6 +26,7 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.precision import choose_precision, image_product
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import local_path
@@ -93,6 +97,51 @@ def only(release: Release, patterns: Sequence[str]) -> Release:
     records = tuple(record for record in release.manifest.subsets if record.name in names)
     manifest = release.manifest.model_copy(update={"subsets": records})
     return Release(release.root, manifest, {name: subset for name, subset in release.subsets.items() if name in names})
+
+
+def make_setup(
+    path: str | Path,
+    *,
+    out: str | Path | None = None,
+    profile: str = "smoke",
+    scale: float = 1.0,
+    workers: Workers = 1,
+    threads: int | None = None,
+    device: str = "cpu",
+    precision: str = "auto",
+    memory: float | None = None,
+    dino_weights: str | Path | None = None,
+    training: bool = True,
+    **fields: Any,
+) -> Setup:
+    """What all cells of a validation share, from what a person gives.
+
+    Args:
+      path: the release's folder.
+      out: folder of the report, by default reports/<the release's folder>.
+      profile: "smoke", "brief", "quick" or "paper". scale: factor of its steps.
+      workers: that share the cores; each gets as many threads as are left, on a cluster one.
+      precision: "auto" times float32 and bfloat16 and takes the faster one.
+      memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
+      training: False if only the structure is checked, which needs no probe of the precision.
+      fields: others of `Setup`.
+
+    Raises:
+      DmcvbError: an unknown profile, or a device that is not here.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    return Setup(
+        root=str(path),
+        out=str(out or Path("reports") / Path(path).name),
+        profile=get_profile(profile).scaled(scale),
+        device=device,
+        precision=choose_precision(precision, image_product(), device) if training else "float32",
+        threads=threads or (default_threads(workers) if isinstance(workers, int) else 1),
+        memory=None if memory is None else int(memory * 1e9),
+        dino_weights=None if dino_weights is None else str(dino_weights),
+        **fields,
+    )
 
 
 def validate(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, behaviour_source, json_option, print_json, print_table
+from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, print_table
 
 
 @click.command("train-behaviour")
@@ -224,6 +224,7 @@ def evaluate_behaviour(tasks, levels, behaviour, episodes, seed, sample, picture
     """
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.generate.info import return_statistics
+    from dmcvb_gen.generate.request import behaviour_source
     from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.actor import random_policy
     from dmcvb_gen.policies.bundled import CONVERTED, bundled_levels, levels_of, resolve_policies

@@ -6,7 +6,6 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import click
@@ -153,23 +152,6 @@ class OutPath(click.Path):
         except DmcvbError as error:
             self.fail(f"{error}.", param, ctx)
         return super().convert(value, param, ctx)
-
-
-def background_source(given: str) -> str:
-    """--backgrounds as a recipe has it: "builtin", or an absolute folder."""
-    return given if given == "builtin" else str(Path(given).resolve())
-
-
-def behaviour_source(given: str | None) -> str | None:
-    """--behaviour as a recipe has it: an absolute path, or "<module>:<function>", whose code may then run."""
-    from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
-
-    if not given:
-        return None
-    if is_own(given):
-        allow([given], BEHAVIOURS)  # a person typed its name
-        return given
-    return str(Path(given).resolve())
 
 
 def format_bytes(count: float) -> str:

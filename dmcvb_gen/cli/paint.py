@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
-from dmcvb_gen.cli.common import OutPath, background_source, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, json_option, print_json
 from dmcvb_gen.cli.release import episodes_option, frames_bar, only_option, workers_option
 from dmcvb_gen.cli.render_options import override_options, overrides_of, painted_facts, show_painted, tell
 
@@ -36,6 +36,7 @@ def paint(
     dmcvb-gen paint releases/light --workers 2
     """
     from dmcvb_gen.generate.paint import RenderConfig, paint_release
+    from dmcvb_gen.generate.request import background_source
 
     videos = background_source(backgrounds) if backgrounds else None
     executor = make_executor(workers, executor, ray_address)

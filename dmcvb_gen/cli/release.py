@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shutil
-import tempfile
 from pathlib import Path
 
 import click
@@ -14,7 +12,6 @@ from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
 from dmcvb_gen.cli.common import (
     OutPath,
     ProgressBar,
-    background_source,
     format_bytes,
     json_option,
     print_json,
@@ -219,6 +216,7 @@ def repaint(path, out, as_json, backgrounds, workers, executor, ray_address, **o
     """
     from dmcvb_gen.generate.repaint import Repainting
     from dmcvb_gen.generate.repaint import repaint as run
+    from dmcvb_gen.generate.request import background_source
 
     request = Repainting(path, out, backgrounds=backgrounds and background_source(backgrounds), **options)
     with frames_bar(as_json) as bar:
@@ -253,45 +251,15 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
-    from dmcvb_gen.dataset.manifest import MANIFEST
-    from dmcvb_gen.release.export.publishing import export_format, publish_export
-    from dmcvb_gen.release.publish import publish as run
+    from dmcvb_gen.release.publishing import publish_folder
     from dmcvb_gen.storage.remote import public
 
-    exported = not (Path(path) / MANIFEST).exists() and export_format(path) is not None
-    if exported and (no_pixels or take_over):
-        raise click.UsageError("--no-pixels and --take-over are for releases; this is an export.")
-    with ProgressBar(as_json, unit=" files") as bar, contextlib.ExitStack() as stack:
-        if exported:
-            moved = publish_export(path, url, options=options, workers=workers, tick=bar)
-        else:
-            sent = stack.enter_context(_left_behind(path)) if no_pixels else path
-            moved = run(sent, url, options=options, take_over=take_over, workers=workers, tick=bar)
+    with ProgressBar(as_json, unit=" files") as bar:
+        given = dict(pixels=not no_pixels, take_over=take_over, options=options, workers=workers, tick=bar)
+        moved = publish_folder(path, url, **given)
     if as_json:
         return print_json(dataclasses.asdict(moved))
     click.echo(f"{public(url)}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
-
-
-@contextlib.contextmanager
-def _left_behind(path):
-    """A copy (of links) of a release without its pictures, beside it."""
-    from dmcvb_gen.dataset.index import CARD_FILES
-    from dmcvb_gen.generate.paint import without_pictures
-    from dmcvb_gen.release.card import README, write_card
-    from dmcvb_gen.storage.remote import storage_errors
-
-    folder = Path(path)
-    with storage_errors(folder, "write beside"):
-        made = tempfile.TemporaryDirectory(dir=folder.resolve().parent, prefix=f".{folder.name}-light-")
-    with made as light:
-        without_pictures(folder, light)
-        if (folder / README).is_file():  # its own card says what it has
-            with storage_errors(folder):
-                for name in CARD_FILES:  # the day and the place, the changes so far
-                    if name != README and (folder / name).is_file():
-                        shutil.copyfile(folder / name, Path(light) / name)
-            write_card(light)
-        yield light
 
 
 @click.command()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shlex
 import textwrap
-import time
 from pathlib import Path
 
 import click
@@ -15,8 +14,6 @@ from dmcvb_gen.cli.common import (
     GroupedCommand,
     OutPath,
     ProgressBar,
-    background_source,
-    behaviour_source,
     format_bytes,
     format_duration,
     json_option,
@@ -24,16 +21,11 @@ from dmcvb_gen.cli.common import (
     print_table,
     remote_option,
 )
-from dmcvb_gen.cli.unused_options import check_exclusive_options, check_maze_options, given_options, is_given, rewarded
+from dmcvb_gen.cli.unused_options import check_exclusive_options, given_options, is_given
 from dmcvb_gen.spec import (
     DIFFICULTIES,
-    FIXED,
     REWARDS,
     SPLITS,
-    Distractor,
-    MazeName,
-    is_maze,
-    task_folder,
 )
 from dmcvb_gen.storage.remote import is_url, public
 from dmcvb_gen.text import pluralize
@@ -44,7 +36,7 @@ def _out_default(name: str) -> str:
 
 
 OPTION_GROUPS = {
-    "What": ("recipe", "only", "levels", "settings", "difficulty", "behaviour", "sample", "independent", "seed"),
+    "What": ("recipe", "only", "levels", "distractors", "difficulty", "behaviour", "sample", "independent", "seed"),
     "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
     "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "no_pixels"),
@@ -63,7 +55,7 @@ OPTION_GROUPS = {
     "--only", multiple=True, metavar="PATTERN", help="Roll out only these subsets, e.g. 'walker-walk/*/static'."
 )
 @click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
-@click.option("--distractor", "settings", multiple=True, help="none, static, dynamic. Repeatable.  [default: none]")
+@click.option("--distractor", "distractors", multiple=True, help="none, static, dynamic. Repeatable.  [default: none]")
 @click.option(
     "--difficulty",
     type=click.Choice(DIFFICULTIES),
@@ -162,15 +154,14 @@ def rollout(
     """
     from dmcvb_gen.generate.estimate import raw_bytes
     from dmcvb_gen.generate.plan import describe, finish_site, make_plan, prepare
+    from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
     from dmcvb_gen.generate.site import site_of
 
     check_exclusive_options(context)
     executor = make_executor(workers, options["executor"], options["ray_address"])
-    by_warp = device != "cpu" and not options["recipe"] and not is_given(context, "renderer")
-    options["renderer"] = "warp" if by_warp else options["renderer"]
-    if device == "cpu" and options["tasks"] and not options["recipe"] and not is_given(context, "renderer"):
-        options["renderer"] = _default_renderer(options["tasks"])
-    chosen = _recipe(context, options, going_on=bool(out))
+    given = {name: context.params[name] for name in RECIPE_OPTIONS & given_options(context)}
+    resuming = bool(out) and not (options["tasks"] or options["layouts"] or options["recipe"] or given)
+    chosen = None if resuming else make_request(options["tasks"], options["recipe"], device=device, **given)
     if options["slurm_script"]:
         if chosen:
             describe(chosen, pixels=not no_pixels)  # or says why each task would be refused; this one needs no GPU
@@ -181,7 +172,7 @@ def rollout(
         return _finish(site, finish_site, as_json)
     where = device if chosen or is_given(context, "device") else None  # else where it was begun
     plan = make_plan(chosen, site, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
-    if by_warp and chosen:
+    if device != "cpu" and chosen and not options["recipe"] and "renderer" not in given:
         click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
     if dry_run:
         return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
@@ -212,28 +203,26 @@ def _finish(site, finish_site, as_json):
 
 
 def _run(plan, workers, as_json, whole=True):
-    from dmcvb_gen.generate.executors import run_jobs
-    from dmcvb_gen.generate.plan import finish
+    from dmcvb_gen.generate.rollout import run_plan
 
-    started, steps, seconds = time.time(), 0, {}
+    finished = 0
+
+    def count(result):
+        nonlocal finished
+        finished += sum(commit.episode_count for commit in result.commits)
+        bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
+
     with _interruption_message(), _progress(plan, as_json) as bar:
-        finished = 0
-        for result in run_jobs(plan.jobs, workers, bar):
-            finished += sum(commit.episode_count for commit in result.commits)
-            steps += result.steps
-            for part, value in result.seconds.items():
-                seconds[part] = seconds.get(part, 0.0) + value
-            bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
-    manifest = finish(plan) if whole else plan.manifest
-    elapsed, place = time.time() - started, plan.site.place
+        made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
+    manifest, steps, place = made.manifest, made.steps, plan.site.place
     if as_json:
         print_json(
             dict(
                 out=place,
                 complete=manifest.complete,
                 steps=steps,
-                seconds=round(elapsed, 2),
-                seconds_by_part={part: round(value, 2) for part, value in seconds.items()},
+                seconds=round(made.seconds, 2),
+                seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()},
                 already_done=plan.done,
                 digests={subset.name: subset.digest for subset in manifest.subsets},
             )
@@ -243,8 +232,8 @@ def _run(plan, workers, as_json, whole=True):
     if not whole:
         state = "finished with --finish when all parts are there"
     kept = f", {pluralize(plan.done, 'shards')} there already" if plan.done else ""
-    rate = f" at {steps / elapsed:,.0f} steps/s" if steps else ""
-    click.echo(f"{place}: {steps:,} steps in {elapsed:.0f} s{rate}{kept}; the release is {state}.")
+    rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
+    click.echo(f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}.")
     named = shlex.quote(str(place))
     painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
     click.echo(f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else ""))
@@ -262,130 +251,6 @@ def parse_range(text: str | None) -> tuple[int, int] | None:
     if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
         raise click.UsageError(f"--range {text!r} is not A:B with A < B, e.g. 100:150")
     return int(first), int(last)
-
-
-def _recipe(context, options, going_on):
-    """The recipe that a command line asks for; None where a release is to go on from its manifest."""
-    from dmcvb_gen.generate.recipe import check_heard, load_recipe
-
-    given = given_options(context)
-    tasks = (*options["tasks"], *(_layout_task(layout) for layout in options["layouts"]))
-    from dmcvb_gen.own_code import allow, is_own
-
-    allow(tasks)  # a person typed these names, so their code may run
-    if not options["recipe"] and not tasks:
-        if going_on and not RECIPE_OPTIONS & given:
-            return None
-        raise click.UsageError("Give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes.")
-    if options["steps"] and options["episodes"]:
-        raise click.UsageError("Give --episodes or --steps, not both.")
-    if options["recipe"]:
-        recipe = _changed_recipe(load_recipe(options["recipe"]), tasks, options, given)
-    else:
-        recipe = _recipe_from_options(tasks, options, given)
-    check_heard(recipe, given)
-    if "sample" in given and is_own(options["behaviour"] or ""):
-        raise click.UsageError("--sample has no effect here: a function of your own draws by itself. Remove it.")
-    return recipe
-
-
-NOT_WITH_RECIPE = {
-    "layouts": "--layout: name the maze by its TASK",
-    "reward": "--reward: ask for 'ant-maze-...@geodesic' in the recipe",
-    "difficulty": "--difficulty: ask for --distractor dynamic_hard",
-}
-
-
-def _changed_recipe(recipe, tasks, options, given):
-    """A recipe, narrowed and overridden by the options that were given beside it; none is ignored."""
-    from dmcvb_gen.generate.recipe import narrow, override
-
-    for name, cure in NOT_WITH_RECIPE.items():
-        if name in given:
-            raise click.UsageError(f"--recipe takes no {cure} instead.")
-    settings = [Distractor.parse(name).name for name in options["settings"]] + list(options["goals"])
-    if tasks or options["levels"] or settings:
-        recipe = narrow(recipe, tasks, options["levels"], settings)
-    changes = {name: options[name] for name in given & _OVERRIDES}
-    changes |= {name: value for name, value in _translated(options).items() if name in given}
-    if "renderer" in given or "samples" in given:
-        old = recipe.renderer
-        backend = options["renderer"] if "renderer" in given else old.backend
-        kept = old.samples if backend == old.backend else None
-        changes["renderer"] = {"backend": backend, "samples": options["samples"] if "samples" in given else kept}
-    if "sample" in given:
-        changes["deterministic"] = False
-    if "independent" in given:
-        changes["trajectories"] = "independent"
-    return override(recipe, **changes) if changes else recipe
-
-
-_OVERRIDES = {"episodes", "steps", "max_steps", "episodes_per_shard"}
-_OVERRIDES |= {"fixed_goals", "episodes_per_goal", "seed", "size", "split"}
-
-
-RECIPE_OPTIONS = _OVERRIDES | set(NOT_WITH_RECIPE)
-RECIPE_OPTIONS |= {"levels", "settings", "goals", "sample", "renderer", "samples", "backgrounds", "behaviour"}
-RECIPE_OPTIONS |= {"independent"}
-"""Options that say what to make, not where or how."""
-
-
-def _translated(options):
-    """Places of files as the recipe has them."""
-    return {
-        "behaviour": behaviour_source(options["behaviour"]),
-        "backgrounds": background_source(options["backgrounds"]),
-    }
-
-
-def _recipe_from_options(tasks, options, given):
-    from dmcvb_gen.generate.recipe import single_recipe
-
-    levels = options["levels"] or ("random",)
-    if len({is_maze(task) for task in tasks}) > 1:
-        raise click.UsageError("Mazes and locomotion tasks take different settings; roll them out by a --recipe.")
-    check_maze_options(tasks, options, given)
-    tasks = tuple(rewarded(task, options["reward"]) for task in tasks)
-    if is_maze(tasks[0]):
-        settings = tuple(dict.fromkeys([*options["goals"], *([FIXED] if options["fixed_goals"] else [])]))
-    else:
-        difficulty = options["difficulty"]
-        settings = [name if "_" in name else Distractor(name, difficulty).name for name in options["settings"]]
-    subset_fields = {name: options[name] for name in ("steps", "episodes_per_shard", "max_steps")}
-    subset_fields["episodes"] = options["episodes"] or (None if options["steps"] else 20)
-    subset_fields["deterministic"] = not options["sample"]
-    name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))
-    return single_recipe(
-        tasks,
-        levels,
-        settings,
-        name=name[:80].rstrip("-."),
-        subset_fields=subset_fields,
-        goals={name: options[name] for name in ("fixed_goals", "episodes_per_goal") if name in given},
-        seed=options["seed"],
-        size=options["size"],
-        renderer={"backend": options["renderer"], "samples": options["samples"]},
-        trajectories="independent" if options["independent"] else "shared",
-        split=options["split"],
-        **_translated(options),
-    )
-
-
-def _default_renderer(tasks: tuple[str, ...]) -> str:
-    """The renderer of tasks that are rolled out together: the first one that is not native, if any."""
-    from dmcvb_gen.own_code import allow
-    from dmcvb_gen.rendering import default_renderer
-    from dmcvb_gen.tasks import get_task
-
-    allow(tasks)  # a person typed these names, so their code may run
-    chosen = [default_renderer(get_task(task)) for task in tasks]
-    return next((name for name in chosen if name != "native"), "native")
-
-
-def _layout_task(layout: str) -> str:
-    from dmcvb_gen.tasks.ant_maze import layout_task_id
-
-    return layout_task_id(layout) if Path(layout).suffix or Path(layout).exists() else str(MazeName(layout))
 
 
 def _progress(plan, as_json):

@@ -1,6 +1,6 @@
 """Refuse options that would have no effect.
 
-`generate.recipe` checks the options that depend on the subsets of a recipe.
+`generate.request` checks the options that depend on what is made.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import click
 from click.core import ParameterSource
 
-from dmcvb_gen.spec import FIXED, MazeName, is_maze
 from dmcvb_gen.storage.remote import is_url
 
 
@@ -61,51 +60,3 @@ def refuse(context: click.Context, given: set[str], names: tuple[str, ...], reas
 
 def _flag(context: click.Context, name: str) -> str:
     return next(parameter.opts[-1] for parameter in context.command.params if parameter.name == name)
-
-
-def check_maze_options(tasks: tuple[str, ...], options: dict, given: set[str]) -> None:
-    """Refuse options of mazes that nothing in a command line without a recipe takes up, and those not for mazes.
-
-    Args:
-      tasks: of one family.
-      options: all of the command line, `given` of them by itself.
-
-    Raises:
-      click.UsageError: one of them has no effect.
-    """
-    if all(is_maze(task) for task in tasks):
-        if options["settings"]:
-            raise click.UsageError(
-                "--distractor has no effect in mazes, which vary in style: use --goal visible|hidden."
-            )
-        if "difficulty" in given:
-            raise click.UsageError("--difficulty has no effect in mazes, which have no distractors: remove it.")
-        fixed = bool(options["fixed_goals"]) or FIXED in options["goals"]
-        if "episodes_per_goal" in given and not fixed:
-            raise click.UsageError(
-                "--episodes-per-goal has no effect without --fixed-goals: add it, or use --episodes."
-            )
-        if fixed and not set(options["goals"]) - {FIXED} and (options["episodes"] or options["steps"]):
-            raise click.UsageError("--episodes and --steps have no effect with fixed goals: use --episodes-per-goal.")
-        return
-    if options["goals"] or options["fixed_goals"]:
-        raise click.UsageError("--goal and --fixed-goals have no effect outside mazes: remove them.")
-    for name, flag in (("episodes_per_goal", "--episodes-per-goal"), ("reward", "--reward")):
-        if name in given:
-            raise click.UsageError(f"{flag} has no effect outside mazes: remove it.")
-    if "difficulty" in given and all("_" in name or name == "none" for name in options["settings"]):
-        raise click.UsageError("--difficulty is for --distractor static or dynamic without one of their own; give one.")
-
-
-def rewarded(task: str, reward: str | None) -> str:
-    """A maze's task id with the reward of --reward.
-
-    Raises:
-      click.UsageError: the id names another one.
-    """
-    maze = MazeName.parse(task)
-    if maze is None or reward is None or maze.reward == reward:
-        return task
-    if maze.reward:
-        raise click.UsageError(f"{task} names its own reward: remove --reward, or the task's @{maze.reward}.")
-    return f"{task}@{reward}" if reward == "geodesic" else task

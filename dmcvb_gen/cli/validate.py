@@ -67,42 +67,19 @@ def validate(
     dmcvb-gen validate releases/mini --profile smoke
     dmcvb-gen validate releases/mini --profile quick --benchmark b1 --agents bc,state-bc,id+bc --out reports/mini
     """
-    from dmcvb_gen.benchmarks.profiles import get_profile
-    from dmcvb_gen.benchmarks.run import default_threads, default_workers
-    from dmcvb_gen.benchmarks.setup import Setup
-    from dmcvb_gen.benchmarks.validate import Progress
+    from dmcvb_gen.benchmarks.run import default_workers
+    from dmcvb_gen.benchmarks.validate import Progress, make_setup
     from dmcvb_gen.benchmarks.validate import validate as run
-    from dmcvb_gen.errors import DmcvbError
-    from dmcvb_gen.precision import choose_precision, image_product
 
     if checks_only:
         refuse(context, given_options(context), TRAINING, "--checks-only trains nothing")
-    if options["device"] == "cuda":
-        import torch
-
-        if not torch.cuda.is_available():
-            raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
-    asked = options["precision"]
-    precision = "float32" if checks_only else choose_precision(asked, image_product(), options["device"])
-    if asked == "auto" and not checks_only:
-        click.echo(f"Networks that see images compute in {precision}, the faster one here.", err=True)
     workers = options.pop("workers") or default_workers(options["device"])
-    memory, weights = options.pop("memory"), options.pop("dino_weights")
     executor = make_executor(workers, options.pop("executor"), options.pop("ray_address"))
-    threads = default_threads(workers) if isinstance(executor, int) else 1  # of a task on a cluster
     train_unsound = options.pop("train_unsound")
-    setup = Setup(
-        root=str(path),
-        out=str(out or Path("reports") / Path(path).name),
-        profile=get_profile(profile).scaled(scale),
-        memory=None if memory is None else int(memory * 1e9),
-        dino_weights=weights and str(weights),
-        **options
-        | {
-            "threads": options["threads"] or threads,
-            "precision": precision,
-        },
-    )
+    given = dict(out=out, profile=profile, scale=scale, workers=executor, training=not checks_only, **options)
+    setup = make_setup(path, **given)
+    if options["precision"] == "auto" and not checks_only:
+        click.echo(f"Networks that see images compute in {setup.precision}, the faster one here.", err=True)
     with ProgressBar(as_json, unit=" checks", desc="structure") as bar:
         progress = Progress(
             checking=bar,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -287,6 +287,16 @@ class Release:
 
     def __repr__(self) -> str:
         return f"<Release {self.manifest.name} {self.manifest.version}: {pluralize(len(self.subsets), 'subsets')}>"
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the subsets that have episodes here."""
+        return iter(self.subsets)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.subsets
+
+    def __len__(self) -> int:
+        return len(self.subsets)
 
     def __getitem__(self, name: str) -> Subset:
         if name in self.shortfalls and name not in self.subsets:

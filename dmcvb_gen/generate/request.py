@@ -1,0 +1,203 @@
+"""What a rollout is asked for, by a person: names and numbers in, a recipe out.
+
+`dmcvb-gen rollout` and `dmcvb_gen.rollout` ask here. No option is silently ignored: those that would change nothing are
+refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen.errors import RecipeError
+from dmcvb_gen.generate.recipe import Recipe, check_heard, load_recipe, narrow, override, single_recipe
+from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
+from dmcvb_gen.spec import FIXED, Distractor, MazeName, is_maze, task_folder
+
+EPISODES = 20
+"""Episodes of a subset if nobody says how many."""
+_OVERRIDES = {"episodes", "steps", "max_steps", "episodes_per_shard"}
+_OVERRIDES |= {"fixed_goals", "episodes_per_goal", "seed", "size", "split"}
+_NOT_WITH_RECIPE = {
+    "layouts": "--layout: name the maze by its TASK",
+    "reward": "--reward: ask for 'ant-maze-...@geodesic' in the recipe",
+    "difficulty": "--difficulty: ask for --distractor dynamic_hard",
+}
+RECIPE_OPTIONS = _OVERRIDES | set(_NOT_WITH_RECIPE)
+RECIPE_OPTIONS |= {"levels", "distractors", "goals", "sample", "renderer", "samples", "backgrounds", "behaviour"}
+RECIPE_OPTIONS |= {"independent"}
+"""Options that say what to make, not where or how."""
+
+
+def make_request(
+    tasks: Sequence[str] = (), recipe: str | Path | None = None, *, device: str = "cpu", **given: Any
+) -> Recipe:
+    """The recipe of what was asked for.
+
+    Args:
+      tasks: names; with a recipe, those that are taken of it.
+      recipe: a YAML file or the name of a shipped recipe.
+      device: that renders; other devices have another default renderer.
+      given: options of `RECIPE_OPTIONS` that somebody gave, and no defaults.
+
+    Raises:
+      DmcvbError: an unknown name, a value that is wrong, or an option that would have no effect.
+    """
+    tasks = (*tasks, *(_layout_task(layout) for layout in given.get("layouts", ())))
+    allow(tasks)  # a person typed these names, so their code may run
+    if not tasks and not recipe:
+        raise RecipeError("give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes")
+    if given.get("steps") and given.get("episodes"):
+        raise RecipeError("give --episodes or --steps, not both")
+    if recipe:
+        made = _changed_recipe(load_recipe(recipe), tasks, given)
+    else:
+        made = _recipe_from_options(tasks, given | {"renderer": given.get("renderer") or renderer_of(tasks, device)})
+    check_heard(made, given)
+    if given.get("sample") and is_own(str(given.get("behaviour") or "")):
+        raise RecipeError("--sample has no effect here: a function of your own draws by itself; remove it")
+    return made
+
+
+def background_source(given: str | Path) -> str:
+    """--backgrounds as a recipe has it: "builtin", or an absolute folder."""
+    return "builtin" if given == "builtin" else str(Path(given).resolve())
+
+
+def behaviour_source(given: str | Path | None) -> str | None:
+    """--behaviour as a recipe has it: an absolute path, or "<module>:<function>", whose code may then run."""
+    if not given:
+        return None
+    if is_own(str(given)):
+        allow([str(given)], BEHAVIOURS)  # a person typed its name
+        return str(given)
+    return str(Path(given).resolve())
+
+
+def renderer_of(tasks: Sequence[str], device: str = "cpu") -> str:
+    """The default renderer of tasks that are rolled out together: the first one that is not native, if any."""
+    from dmcvb_gen.rendering import default_renderer
+    from dmcvb_gen.tasks import get_task
+
+    if device != "cpu":
+        return "warp"
+    allow(tasks)
+    chosen = [default_renderer(get_task(task)) for task in tasks]
+    return next((name for name in chosen if name != "native"), "native")
+
+
+def _changed_recipe(recipe: Recipe, tasks: Sequence[str], given: Mapping[str, Any]) -> Recipe:
+    """A recipe, narrowed and overridden by the options that were given beside it; none is ignored."""
+    for name, cure in _NOT_WITH_RECIPE.items():
+        if name in given:
+            raise RecipeError(f"--recipe takes no {cure} instead")
+    settings = [Distractor.parse(name).name for name in given.get("distractors", ())] + list(given.get("goals", ()))
+    if tasks or given.get("levels") or settings:
+        recipe = narrow(recipe, tasks, given.get("levels", ()), settings)
+    changes = {name: given[name] for name in _OVERRIDES & given.keys()} | _sources(given)
+    if "renderer" in given or "samples" in given:
+        old = recipe.renderer
+        backend = given.get("renderer", old.backend)
+        kept = old.samples if backend == old.backend else None
+        changes["renderer"] = {"backend": backend, "samples": given.get("samples", kept)}
+    if given.get("sample"):
+        changes["deterministic"] = False
+    if given.get("independent"):
+        changes["trajectories"] = "independent"
+    return override(recipe, **changes) if changes else recipe
+
+
+def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
+    """Places of files as the recipe has them."""
+    found: dict[str, str | None] = {}
+    if "behaviour" in given:
+        found["behaviour"] = behaviour_source(given["behaviour"])
+    if "backgrounds" in given:
+        found["backgrounds"] = background_source(given["backgrounds"])
+    return found
+
+
+def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Recipe:
+    levels = tuple(given.get("levels") or ("random",))
+    if len({is_maze(task) for task in tasks}) > 1:
+        raise RecipeError("mazes and locomotion tasks take different settings; roll them out by a --recipe")
+    check_maze_options(tasks, given)
+    tasks = tuple(rewarded(task, given.get("reward")) for task in tasks)
+    goals, distractors = given.get("goals", ()), given.get("distractors", ())
+    if is_maze(tasks[0]):
+        settings = tuple(dict.fromkeys([*goals, *([FIXED] if given.get("fixed_goals") else [])]))
+    else:
+        difficulty = given.get("difficulty", "medium")
+        settings = tuple(name if "_" in name else Distractor(name, difficulty).name for name in distractors)
+    subset_fields = {name: given.get(name) for name in ("steps", "episodes_per_shard", "max_steps")}
+    subset_fields["episodes"] = given.get("episodes") or (None if given.get("steps") else EPISODES)
+    subset_fields["deterministic"] = not given.get("sample")
+    name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))
+    return single_recipe(
+        tasks,
+        levels,
+        settings,
+        name=name[:80].rstrip("-."),
+        subset_fields=subset_fields,
+        goals={name: given[name] for name in ("fixed_goals", "episodes_per_goal") if name in given},
+        renderer={"backend": given["renderer"], "samples": given.get("samples")},
+        trajectories="independent" if given.get("independent") else "shared",
+        **{name: given[name] for name in ("seed", "size", "split") if name in given},
+        **_sources(given),
+    )
+
+
+def _layout_task(layout: str | Path) -> str:
+    from dmcvb_gen.tasks.ant_maze import layout_task_id
+
+    return layout_task_id(layout) if Path(layout).suffix or Path(layout).exists() else str(MazeName(str(layout)))
+
+
+def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
+    """Refuse options of mazes that nothing in a request without a recipe takes up, and those not for mazes.
+
+    Args:
+      tasks: of one family.
+      given: the options that somebody gave.
+
+    Raises:
+      RecipeError: one of them has no effect.
+    """
+    if all(is_maze(task) for task in tasks):
+        _check_given_to_mazes(given)
+        return
+    if given.get("goals") or given.get("fixed_goals"):
+        raise RecipeError("--goal and --fixed-goals have no effect outside mazes: remove them")
+    for name, flag in (("episodes_per_goal", "--episodes-per-goal"), ("reward", "--reward")):
+        if name in given:
+            raise RecipeError(f"{flag} has no effect outside mazes: remove it")
+    if "difficulty" in given and all("_" in name or name == "none" for name in given.get("distractors", ())):
+        raise RecipeError("--difficulty is for --distractor static or dynamic without one of their own; give one")
+
+
+def _check_given_to_mazes(given: Mapping[str, Any]) -> None:
+    if given.get("distractors"):
+        raise RecipeError("--distractor has no effect in mazes, which vary in style: use --goal visible|hidden")
+    if "difficulty" in given:
+        raise RecipeError("--difficulty has no effect in mazes, which have no distractors: remove it")
+    goals: Collection[str] = given.get("goals", ())
+    fixed = bool(given.get("fixed_goals")) or FIXED in goals
+    if "episodes_per_goal" in given and not fixed:
+        raise RecipeError("--episodes-per-goal has no effect without --fixed-goals: add it, or use --episodes")
+    if fixed and not set(goals) - {FIXED} and (given.get("episodes") or given.get("steps")):
+        raise RecipeError("--episodes and --steps have no effect with fixed goals: use --episodes-per-goal")
+
+
+def rewarded(task: str, reward: str | None) -> str:
+    """A maze's task id with the reward that was asked for.
+
+    Raises:
+      RecipeError: the id names another one.
+    """
+    maze = MazeName.parse(task)
+    if maze is None or reward is None or maze.reward == reward:
+        return task
+    if maze.reward:
+        raise RecipeError(f"{task} names its own reward: remove --reward, or the task's @{maze.reward}")
+    return f"{task}@{reward}" if reward == "geodesic" else task

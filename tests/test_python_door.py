@@ -1,0 +1,123 @@
+"""Python is a door as good as the command line: every command of data is a function of the same name."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+import dmcvb_gen
+from dmcvb_gen.cli import COMMANDS, main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+
+FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")
+FAMILIES = {
+    "locomotion": dict(tasks="walker-walk", distractors=["none", "dynamic"]),
+    "suite": dict(tasks="cartpole-swingup", distractors="static"),
+    "maze": dict(tasks="ant-maze-empty7x7", goals="visible"),
+}
+TINY = dict(episodes=2, max_steps=8, size=32, episodes_per_shard=1, progress=False)
+PRINTING = {"as_json", "dry_run", "strict", "executor", "ray_address"}
+"""Options of commands that say how something is printed, or what `workers` says in Python."""
+MANY_MACHINES = {"episode_range", "scratch", "scratch_size", "init", "part", "finishing", "slurm_script"}
+RENAMED = {
+    "no_pixels": "pixels",
+    "options": "storage_options",
+    "path": "release",
+    "painting": "paint",
+    "own": "agents",
+    **dict.fromkeys(
+        ("scale", "threads", "device", "precision", "compile", "memory", "seed", "dino_weights", "backgrounds"),
+        "options",
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("door")
+    return folder, dmcvb_gen.rollout(out=folder / "r", **FAMILIES[request.param], **TINY)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_option_of_a_command_is_an_argument_of_its_function(name):
+    command = main.get_command(None, name)
+    signature = inspect.signature(getattr(dmcvb_gen, name)).parameters
+    assert name in COMMANDS and name in dmcvb_gen.__all__
+    for parameter in command.params:
+        if parameter.name in PRINTING | (MANY_MACHINES if name == "rollout" else set()):
+            continue
+        wanted = {parameter.name, RENAMED.get(parameter.name)}
+        assert wanted & set(signature), f"{name}() does not take {parameter.name}"
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_are_typed_and_documented(name):
+    function = getattr(dmcvb_gen, name)
+    signature = inspect.signature(function)
+    assert signature.return_annotation is not inspect.Signature.empty
+    assert all(parameter.annotation is not inspect.Parameter.empty for parameter in signature.parameters.values())
+    assert "Raises:" in function.__doc__
+
+
+def test_a_whole_release_goes_through_python(family):
+    folder, release = family
+    assert release.manifest.complete
+    assert dmcvb_gen.verify(folder / "r", progress=False).sound
+    assert dmcvb_gen.validate(folder / "r", checks_only=True, out=folder / "report", progress=False).sound
+    assert dmcvb_gen.regenerate(folder / "r", check=True, progress=False).sound
+    url = f"file:{folder / 'published'}"
+    assert dmcvb_gen.publish(folder / "r", url, pixels=False, progress=False).moved > 0
+    light = dmcvb_gen.fetch(url, folder / "light", progress=False)
+    assert light.manifest.digest is not None and open_release(folder / "light").manifest.subsets[0].digest is not None
+    painted = dmcvb_gen.paint(folder / "light", progress=False)
+    assert painted.known == painted.shards > 0 and not painted.differing
+    name = next(iter(release))
+    one, other = release[name].episode(0), dmcvb_gen.open(str(folder / "light"))[name].episode(0)
+    for key in one:
+        np.testing.assert_array_equal(np.asarray(one[key]), np.asarray(other[key]))
+    larger = dmcvb_gen.repaint(folder / "r", out=folder / "large", size=24, progress=False)
+    assert {subset.size for subset in larger.manifest.subsets} == {24}
+    [*folders] = dmcvb_gen.export(folder / "r", "hdf5", folder / "h5", progress=False)
+    assert len(folders) == len(release.manifest.subsets) and all(path.is_dir() for path in folders)
+
+
+def test_the_command_line_makes_the_same_bytes(tmp_path):
+    from click.testing import CliRunner
+
+    words = "rollout walker-walk --level expert --distractor dynamic --episodes 1 --max-steps 5 --size 16 --out"
+    assert CliRunner().invoke(main, [*words.split(), str(tmp_path / "cli")]).exit_code == 0
+    given = dict(levels="expert", distractors="dynamic", episodes=1, max_steps=5, size=16, progress=False)
+    made = dmcvb_gen.rollout("walker-walk", out=tmp_path / "python", **given)
+    assert made.manifest.digest == open_release(tmp_path / "cli").manifest.digest
+    assert dmcvb_gen.rollout(out=tmp_path / "python", progress=False).manifest.digest == made.manifest.digest
+
+
+def test_shipped_recipes_and_manifests_by_name(tmp_path):
+    given = dict(levels="random", distractors="none", episodes=1, max_steps=4, size=16, progress=False)
+    made = dmcvb_gen.rollout(recipe="quickstart", out=tmp_path / "r", **given)
+    assert list(made) == ["walker-walk/random/none"]
+    with pytest.raises(UnknownNameError, match="quickstart"):
+        dmcvb_gen.regenerate(manifest="quickstrat", out=tmp_path / "x", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda out: dmcvb_gen.rollout("walker-wlak", out=out), "walker-walk"),
+        (lambda out: dmcvb_gen.rollout(), "recipe"),
+        (lambda out: dmcvb_gen.rollout("ant-maze-empty7x7", distractors="dynamic", out=out), "goal"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", episodes=2, steps=9, out=out), "not both"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", sample=True, out=out), "level random is always drawn"),
+        (lambda out: dmcvb_gen.regenerate(manifest="quickstart"), "out=FOLDER"),
+        (lambda out: dmcvb_gen.verify(out, everything=True), "no URL"),
+        (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
+        (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
+    ],
+)
+def test_errors_are_those_of_the_commands(call, message, tmp_path):
+    with pytest.raises(DmcvbError, match=message):
+        call(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
