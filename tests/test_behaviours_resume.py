@@ -7,6 +7,8 @@ import csv
 import fcntl
 import io
 import json
+import multiprocessing
+import os
 import resource
 import signal
 import subprocess
@@ -22,7 +24,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.policy_file import load_policy, read_header
 from dmcvb_gen.training import runs
 from dmcvb_gen.training.run_log import COLUMNS, read_rows
-from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.runs import RunConfig, Stopped
 from dmcvb_gen.training.sac import ReplayBuffer
 from dmcvb_gen.training.state_file import STATE, pack_state, read_state
 from dmcvb_gen.training.training import open_run
@@ -118,10 +120,10 @@ def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):
 
 SCRIPT = """
 import json, sys, torch
-from dmcvb_gen.training import runs, sb3, training
+from dmcvb_gen.training import runs, training
 torch.set_num_threads(1)
 runs.EVALUATION_EPISODES = 2
-sb3.SAVE_SECONDS = training.SAVE_SECONDS = 0  # save at each evaluation
+runs.SAVE_SECONDS = 0  # save at every moment at which a run may be stopped
 training.open_run(sys.argv[1], runs.RunConfig(**json.loads(sys.argv[2])), True).train()
 """
 
@@ -149,6 +151,73 @@ def test_a_killed_run_resumes_to_the_same_bits(tmp_path, algorithm):
         with (killed.folder / "resume" / path.name).open("r+b") as file:
             file.truncate(path.stat().st_size)
     assert_same_run(whole, killed, buffer=False)  # place and size differ, as the killed run was meant to be longer
+
+
+def _train_in_a_process(folder, fields, signals=()):
+    """Train in a forked process, saving whenever it may, and send it signals: (seconds to wait, number)."""
+    process = multiprocessing.get_context("fork").Process(target=_train_saving_often, args=(folder, fields))
+    process.start()
+    for wait, number in signals:
+        process.join(wait)
+        if process.is_alive():
+            os.kill(process.pid, number)
+    process.join(120)
+    assert not process.is_alive()
+    return process.exitcode
+
+
+def _train_saving_often(folder, fields):
+    runs.SAVE_SECONDS = 0
+    train(folder, True, **fields)
+    os._exit(0)
+
+
+LONG = {
+    "sac": dict(steps=1200, every=400),
+    "guided": dict(steps=200, every=200),
+    "sb3-sac": dict(steps=1000, every=500),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", LONG)
+def test_ten_kills_at_random_moments_change_nothing(tmp_path, algorithm):
+    fields = dict(algorithm=algorithm) | LONG[algorithm]
+    whole, chance, kills = train(tmp_path / "whole", **fields), np.random.default_rng(0), 0
+    for _ in range(10):
+        code = _train_in_a_process(tmp_path / "killed", fields, [(chance.uniform(0.05, 0.6), signal.SIGKILL)])
+        kills += code == -signal.SIGKILL
+    assert kills >= 2
+    killed = train(tmp_path / "killed", True, **fields)
+    assert killed.step == whole.step == fields["steps"]
+    assert_same_run(whole, killed)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "number"),
+    [("sac", signal.SIGINT), pytest.param("guided", signal.SIGTERM, marks=pytest.mark.slow)],
+)
+def test_a_signal_saves_the_run_and_a_second_one_does_not_hurt(tmp_path, algorithm, number, monkeypatch):
+    monkeypatch.setattr(runs, "SAVE_SECONDS", 3600)
+    fields = dict(algorithm=algorithm, steps=80, every=80)
+    whole, run = train(tmp_path / "whole", **fields), open_run(tmp_path / "run", config(**fields), False)
+    told, handler, pack = [], signal.getsignal(number), runs.pack_state
+
+    def tick(steps):
+        if run.step == 40:
+            os.kill(os.getpid(), number)
+
+    def pack_and_signal(state):
+        os.kill(os.getpid(), number)
+        return pack(state)
+
+    monkeypatch.setattr(runs, "pack_state", pack_and_signal)
+    with pytest.raises(Stopped, match="step 40, and saved; resume: dmcvb-gen train-behaviour .* --resume"):
+        run.train(tick=tick, stopping=lambda: told.append(1))
+    assert told == [1] and signal.getsignal(number) is handler
+    monkeypatch.setattr(runs, "pack_state", pack)
+    assert run.saved()["step"] == 40
+    assert_same_run(whole, train(tmp_path / "run", True, **fields))
 
 
 @contextlib.contextmanager

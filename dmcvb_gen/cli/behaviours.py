@@ -28,8 +28,13 @@ from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, 
 )
 @click.option("--resume", is_flag=True, help="Resume the run in --out with its own settings.")
 @json_option
-def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, precision, resume, as_json):
+@click.pass_context
+def train_behaviour(
+    context, task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, precision, resume, as_json
+):
     """Train a behaviour policy online on states.
+
+    Ctrl-C saves the run and prints the command that resumes it; a process that is killed loses less than a minute.
 
     \b
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
@@ -43,9 +48,11 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.paper import paper_returns
+    from dmcvb_gen.spec import task_folder
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.training.defaults import parse_settings, run_config
-    from dmcvb_gen.training.runs import read_config
+    from dmcvb_gen.training.runs import Stopped, read_config
+    from dmcvb_gen.training.selection import plot_curve
     from dmcvb_gen.training.training import open_run
 
     allow([task])  # a person typed its name, so its code may run
@@ -64,23 +71,38 @@ def train_behaviour(task, out, steps, seed, algo, pairs, config, init_from, eval
         name = "bfloat16" if chosen["bfloat16"] else "float32"
         click.echo(f"Computing in {name}, the faster one on this processor.", err=True)
     torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
-    done = (run.saved() or {"step": 0})["step"]
+    saved = run.saved()
+    if resume and not saved:
+        click.echo(f"Nothing is saved in {folder} yet, so the run begins at step 0.", err=True)
+    done = saved["step"] if saved else 0
     expert = paper_returns(task, "expert")
-    goal = f" of the paper's {expert['mean']:.0f}" if expert else ""
     with ProgressBar(
-        as_json, total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task
+        as_json, total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task_folder(task)
     ) as bar:
 
         def report(progress):
-            bar.set_postfix_str(f"return {progress.evaluation.mean:.1f}{goal}", refresh=False)
+            bar.set_postfix_str(_standing(progress, expert), refresh=False)
 
         try:
-            run.train(report, bar.update)
-        except KeyboardInterrupt:
-            raise DmcvbError(f"stopped; go on from the last saved state with --out {folder} --resume") from None
+            run.train(report, bar.update, lambda: click.echo("\nStopping: the run is being saved.", err=True))
+        except Stopped as stopped:
+            bar.close()
+            click.echo(stopped, err=True)
+            context.exit(1)
+    curve = plot_curve(folder, expert and expert["mean"])
     if as_json:
-        return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1)))
-    click.echo(f"{folder}: trained to {run.step:,} agent steps. Next: dmcvb-gen select-checkpoints {folder}")
+        return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1), curve=str(curve)))
+    click.echo(f"{folder}: trained to {run.step:,} agent steps; its curve is {curve}.")
+    click.echo(f"Next: dmcvb-gen select-checkpoints {folder}")
+
+
+def _standing(progress, expert):
+    """The last evaluation beside the paper's expert, and the pace."""
+    mean, pace = progress.evaluation.mean, f"{progress.updates_per_second:.0f} updates/s"
+    if not expert:
+        return f"return {mean:.1f}, {pace}"
+    share = f" ({100 * mean / expert['mean']:.0f} %)" if expert["mean"] > 0 else ""  # mazes' returns are costs
+    return f"return {mean:.1f} of the paper's {expert['mean']:.0f}{share}, {pace}"
 
 
 def _precision(asked, algorithm, settings, found):
@@ -122,7 +144,8 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     """
     from dmcvb_gen.training import selection as module
 
-    picked = module.select_checkpoints(run, episodes, seed, not sample, converged)
+    with ProgressBar(as_json, unit=" checkpoints") as bar:
+        picked = module.select_checkpoints(run, episodes, seed, not sample, converged, bar)
     if as_json:
         return print_json(module.selection_json(picked))
     end = picked.convergence

@@ -29,7 +29,7 @@ from dmcvb_gen.tasks.ant_maze.task import GOAL_NOISE
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 from dmcvb_gen.training.episodes import Episodes
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays, as_tensors
-from dmcvb_gen.training.runs import SAVE_SECONDS, ProgressCallback, Report, Run
+from dmcvb_gen.training.runs import ProgressCallback, Report, Run
 from dmcvb_gen.training.sac import RowBuffer
 from dmcvb_gen.training.settings import Count, Natural, NonNegative, Positive, Share
 
@@ -126,11 +126,10 @@ class GuidedRun(Run):
             observation = episodes.restore(saved["episodes"])
         else:
             observation = episodes.start(np.arange(settings.simulations))
-        last_saved = self._started
 
-        def save() -> None:
+        def state() -> dict[str, Any]:
             parts = {"learner": learner.state(), "episodes": episodes.saved(observation)}
-            self.save(parts | {"next_evaluation": next_evaluation})
+            return parts | {"next_evaluation": next_evaluation}
 
         while self.step < config.steps:
             result = episodes.batch.step(learner.act(observation))
@@ -142,10 +141,8 @@ class GuidedRun(Run):
                 metrics = {"squared_error": learner.loss}
                 progress = self.record(learner.weights(), learner.updates, metrics, report)
                 next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
-                if self._started - last_saved > SAVE_SECONDS:
-                    save()
-                    last_saved = self._started
-        save()
+            self.between_rounds(state)
+        self.save(state())
 
 
 class Student:

@@ -23,6 +23,8 @@ import dataclasses
 import json
 import os
 import shlex
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -58,8 +60,9 @@ DENSE_SHARE = 0.2
 are picked from there."""
 RISEN = 5
 """Evaluations whose median must be above that."""
-SAVE_SECONDS = 240
-"""Seconds after which the next evaluation also saves the state to resume from."""
+SAVE_SECONDS = 30
+"""Seconds after which the state to resume from is saved again: a process that is killed loses these, and at most the
+evaluation that it was at."""
 
 FREE = ("steps", "settings", "init_sha256")
 """Fields of a run's configuration in which one that goes on need not be written as it was."""
@@ -105,6 +108,11 @@ class Progress:
     evaluation: Evaluation
     seconds: float
     steps_per_second: float
+    updates_per_second: float = 0.0
+
+
+class Stopped(DmcvbError):
+    """A run that was asked to stop, and that saved all it had."""
 
 
 def command_of(config: RunConfig) -> str:
@@ -189,7 +197,8 @@ class Run(abc.ABC):
             **self.network(),
         )
         self.step, self.seconds = 0, 0.0
-        self._started = time.time()
+        self._started = self._last_saved = time.time()
+        self._asked_to_stop = False
 
     # -- what an algorithm must say ---------------------------------------------------------
 
@@ -239,10 +248,21 @@ class Run(abc.ABC):
 
     # -- what callers use -------------------------------------------------------------------
 
-    def train(self, report: Report = lambda progress: None, tick: ProgressCallback = lambda steps: None) -> None:
-        """Train until `config.steps` agent steps; told of every evaluation and of every few steps.
+    def train(
+        self,
+        report: Report = lambda progress: None,
+        tick: ProgressCallback = lambda steps: None,
+        stopping: Callable[[], Any] = lambda: None,
+    ) -> None:
+        """Train until `config.steps` agent steps, or until Ctrl-C or SIGTERM, which save the run.
+
+        Args:
+          report: called with every evaluation.
+          tick: called with the agent steps made since the last call.
+          stopping: called when a signal asks the run to stop; it saves after the step that it is at.
 
         Raises:
+          Stopped: a signal asked for it; everything is saved.
           DmcvbError: another process trains in the folder, or its disk is full (the last saved state is whole).
         """
         with self._writing():
@@ -253,9 +273,10 @@ class Run(abc.ABC):
                 self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
                 self._drop_later_checkpoints()
                 self._log = RunLog(self.folder, self.step)
-                self._started = time.time()
+                self._started = self._last_saved = time.time()
                 try:
-                    self._train(saved, report, tick)
+                    with self._stopping_on_signals(stopping):
+                        self._train(saved, report, tick)
                 finally:
                     self._log.close()
 
@@ -278,7 +299,8 @@ class Run(abc.ABC):
         save_policy(self._checkpoint(self.step), header, arrays)
         self._log.add(self.step, evaluation, self.seconds, updates, metrics)
         self._thin()
-        progress = Progress(self.step, evaluation, self.seconds, self.step / max(self.seconds, 1e-9))
+        seconds = max(self.seconds, 1e-9)
+        progress = Progress(self.step, evaluation, self.seconds, self.step / seconds, updates / seconds)
         report(progress)
         self._started = time.time()
         return progress
@@ -304,8 +326,48 @@ class Run(abc.ABC):
 
     def save(self, state: dict[str, Any]) -> None:
         """Put the state to resume from in place of the previous one, whole or not at all."""
-        data = pack_state(state | {"step": self.step, "seconds": self.seconds})
-        write_bytes(self.folder / "resume" / STATE, data)
+        seconds = self.seconds + time.time() - self._started
+        write_bytes(self.folder / "resume" / STATE, pack_state(state | {"step": self.step, "seconds": seconds}))
+        self._last_saved = time.time()
+
+    def between_rounds(self, state: Callable[[], dict[str, Any]]) -> None:
+        """Save the run if it is time to, or if it was asked to stop; called where a resumed run can begin.
+
+        Args:
+          state: gives what `save` takes.
+
+        Raises:
+          Stopped: it was asked to stop, and is saved.
+        """
+        if self._asked_to_stop or time.time() - self._last_saved > SAVE_SECONDS:
+            self.save(state())
+        if self._asked_to_stop:
+            raise Stopped(f"stopped at step {self.step:,}, and saved; resume: {self.resume_command()}")
+
+    def resume_command(self) -> str:
+        """The command line that resumes this run."""
+        return (
+            f"dmcvb-gen train-behaviour {shlex.quote(self.config.task)} --out {shlex.quote(str(self.folder))} --resume"
+        )
+
+    @contextlib.contextmanager
+    def _stopping_on_signals(self, stopping: Callable[[], Any]) -> Iterator[None]:
+        """Ctrl-C and SIGTERM ask the run to stop; more of them change nothing, so a save is never cut off."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def stop(*_: Any) -> None:
+            if not self._asked_to_stop:
+                stopping()
+            self._asked_to_stop = True
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     # -- the folder -------------------------------------------------------------------------
 

@@ -25,13 +25,15 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.training.networks import Actor, as_tensors
 from dmcvb_gen.training.row_files import map_rows, rows_in
-from dmcvb_gen.training.runs import SAVE_SECONDS, ProgressCallback, Report, Run, read_config
+from dmcvb_gen.training.runs import ProgressCallback, Report, Run, read_config
 from dmcvb_gen.training.settings import OffPolicySettings
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
 CLIP_OBSERVATION = 10.0
 UNCLIPPED = 1e30
 """Stands for "not clipped" in a policy file's header."""
+ROUND_STEPS = 500
+"""Agent steps between two moments at which a run may be saved or stopped."""
 BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _CLASSES = {"sb3-sac": SAC, "tqc": TQC, "td3": TD3, "ppo": PPO}
 _SAC_SETTINGS = ("ent_coef", "target_entropy")
@@ -89,19 +91,18 @@ class Sb3Run(Run):
             )
         model = self._model(normalize or env)
         buffer = self._map_buffer(model) if isinstance(settings, OffPolicySettings) else None
-        next_evaluation, last_saved = config.evaluate_every, self._started
+        next_evaluation = config.evaluate_every
         if saved:
             self._restore(saved, model, env, normalize, buffer)
             next_evaluation = saved["next_evaluation"]
         elif config.init_from:
             self._start_from(config.init_from, model, normalize)
 
-        def save() -> None:
-            state = self._state(model, env, normalize, buffer)
-            self.save(state | {"next_evaluation": next_evaluation})
+        def state() -> dict[str, Any]:
+            return self._state(model, env, normalize, buffer) | {"next_evaluation": next_evaluation}
 
         while self.step < config.steps:
-            steps = min(next_evaluation, config.steps) - self.step
+            steps = min(next_evaluation, config.steps, self.step + ROUND_STEPS) - self.step
             model.learn(steps, callback=_Ticker(tick), log_interval=None, reset_num_timesteps=False)
             self.step = model.num_timesteps
             if self.step >= min(next_evaluation, self.config.steps):
@@ -109,10 +110,8 @@ class Sb3Run(Run):
                     self._actor_weights(model, normalize), model._n_updates, self._metrics(model), report
                 )
                 next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
-                if self._started - last_saved > SAVE_SECONDS:
-                    save()
-                    last_saved = self._started
-        save()
+            self.between_rounds(state)
+        self.save(state())
 
     def _model(self, env: VecEnv) -> BaseAlgorithm:
         settings, name = self.settings, self.config.algorithm

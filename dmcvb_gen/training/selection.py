@@ -9,23 +9,30 @@ data of mazes.
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
-from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
+from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze, task_folder
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.run_log import read_rows
+from dmcvb_gen.training.runs import read_config
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
 MEDIUM_TOLERANCE = 0.1
@@ -252,6 +259,7 @@ def select_checkpoints(
     seed: int = 20_000,
     deterministic: bool = True,
     converged: float | None = None,
+    progress: ProgressCallback = ignore,
 ) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
 
@@ -259,7 +267,8 @@ def select_checkpoints(
     in `reasons`, and earlier picks of that level are left alone.
 
     Args:
-      converged: return at convergence, of a longer run, where this one ends before it; None: from the curve.
+      converged: return at convergence, of a longer run, if this one ends before it; None: from the curve.
+      progress: called with the name of each checkpoint that is evaluated on fresh episodes.
 
     Raises:
       DmcvbError: the folder holds no run.
@@ -276,6 +285,8 @@ def select_checkpoints(
 
     def measure(path: Path) -> Evaluation:
         if path not in measured:
+            expect(progress, max(len(measured) + 1, 1 + CANDIDATES // 2 + (0 if mazes else MIXED_COUNT)))
+            progress(f"step {int(path.stem):,}")
             policy = load_policy(path, task)
             measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic)[0]
         return measured[path][1]
@@ -297,6 +308,7 @@ def select_checkpoints(
             # The run may have thinned a checkpoint away since the curve was read; a damaged one is a real error.
             if attempt == 4 or set(before) <= set(files):
                 raise
+    expect(progress, len(measured))
     _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})
     return selection
 
@@ -329,30 +341,55 @@ def selection_json(selection: Selection) -> dict:
 
 def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> None:
     """The learning curve with the picks marked, a PNG."""
+    colors = {"expert": "tab:green", "medium": "tab:orange", "mixed": "tab:red"}
+    with _curve_figure(curve, selection.task, path) as axes:
+        axes.axhline(selection.convergence.value, color="tab:blue", linestyle=":", linewidth=1)
+        axes.text(
+            curve[0][0], selection.convergence.value, f" convergence {selection.convergence.value:.0f}", va="bottom"
+        )
+        for level, picks in selection.picks.items():
+            axes.errorbar(
+                [pick.step for pick in picks],
+                [pick.evaluation.mean for pick in picks],
+                [pick.evaluation.std for pick in picks],
+                fmt="o",
+                color=colors[level],
+                capsize=2,
+                label=f"{level} (fresh episodes)",
+            )
+
+
+def plot_curve(folder: str | Path, expert: float | None = None) -> Path:
+    """Draw a run's learning curve into its folder as curve.png.
+
+    Args:
+      expert: mean return of the paper's expert, drawn beside it.
+
+    Returns:
+      The picture's path.
+    """
+    path, curve = Path(folder) / "curve.png", read_curve(Path(folder))
+    config = read_config(folder)
+    with _curve_figure(curve, config.task if config else "", path) as axes:
+        if expert is not None:
+            axes.axhline(expert, color="0.3", linestyle="--", linewidth=1, label=f"the paper's expert, {expert:.0f}")
+    return path
+
+
+@contextlib.contextmanager
+def _curve_figure(curve: Sequence[Point], task: str, path: Path) -> Iterator[Axes]:
+    """Axes with a learning curve to draw more on; the picture is written at the end."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    steps = [step for step, _, _ in curve]
-    returns = [value for _, value, _ in curve]
+    steps, returns = [step for step, _, _ in curve], [value for _, value, _ in curve]
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
     axes.plot(steps, returns, color="0.75", linewidth=1, label="evaluations along the way")
     axes.plot(steps, smooth(returns), color="tab:blue", label="smoothed")
-    axes.axhline(selection.convergence.value, color="tab:blue", linestyle=":", linewidth=1)
-    axes.text(steps[0], selection.convergence.value, f" convergence {selection.convergence.value:.0f}", va="bottom")
-    colors = {"expert": "tab:green", "medium": "tab:orange", "mixed": "tab:red"}
-    for level, picks in selection.picks.items():
-        axes.errorbar(
-            [pick.step for pick in picks],
-            [pick.evaluation.mean for pick in picks],
-            [pick.evaluation.std for pick in picks],
-            fmt="o",
-            color=colors[level],
-            capsize=2,
-            label=f"{level} (fresh episodes)",
-        )
-    axes.set(xlabel="agent steps", ylabel="episode return", title=selection.task)
+    yield axes
+    axes.set(xlabel="agent steps", ylabel="episode return", title=task_folder(task) if task else "")
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

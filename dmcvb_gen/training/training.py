@@ -24,7 +24,6 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import Episodes, shaping_of
 from dmcvb_gen.training.networks import as_tensors
 from dmcvb_gen.training.runs import (
-    SAVE_SECONDS,
     Progress,
     ProgressCallback,
     Report,
@@ -64,7 +63,10 @@ class SacRun(Run):
         if saved:
             next_evaluation = (self.step // self.config.evaluate_every + 1) * self.config.evaluate_every
             next_evaluation = saved.get("next_evaluation", next_evaluation)
-        last_saved = self._started
+
+        def state() -> dict[str, Any]:
+            return loop.state() | {"next_evaluation": next_evaluation}
+
         while self.step < self.config.steps:
             loop.collect()
             loop.learn()
@@ -73,10 +75,8 @@ class SacRun(Run):
                 learner = loop.learner
                 progress = self.record(learner.actor.state_dict(), learner.updates, learner.metrics(), report)
                 next_evaluation = self.next_evaluation(progress.evaluation, next_evaluation)
-                if self._started - last_saved > SAVE_SECONDS:
-                    self.save(loop.state() | {"next_evaluation": next_evaluation})
-                    last_saved = self._started
-        self.save(loop.state() | {"next_evaluation": next_evaluation})
+            self.between_rounds(state)
+        self.save(state())
 
 
 class SacLoop:
