@@ -199,6 +199,20 @@ def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = T
             path.unlink(missing_ok=True)
 
 
+def others_at_work(folder: str | Path) -> list[str]:
+    """Other running processes that are making something in a folder: "process 12", or "a process of machine NAME"."""
+    found = set()
+    for path in _partial_files(Path(folder), below=False):
+        if (owner := _OWNED.fullmatch(path.name)) is None:
+            continue
+        machine, process = owner[1], int(owner[2])
+        if machine != _machine():
+            found.add(f"a process of machine {machine.rpartition('-')[0]}")
+        elif process != os.getpid() and _alive(process):
+            found.add(f"process {process}")
+    return sorted(found)
+
+
 def _partial_files(folder: Path, below: bool) -> list[Path]:
     """Files and folders in the making; what is inside such a folder belongs to its owner and is not listed."""
     if not below:

@@ -231,6 +231,7 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         release=facts["release"],
         profile=facts["profile"],
         verdict=_verdict(facts),
+        trained=bool(facts["cells_planned"]),
         checks=_checks(facts["structure"]["findings"]),
         incomplete=[(name, *counts) for name, counts in facts["incomplete"].items()],
         findings=_listed(facts["structure"]["findings"]),
@@ -284,7 +285,10 @@ def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
     if kind == "unsound" and not facts["complete"]:
         text += f" Incomplete: {there:,} of {asked:,} episodes."
     done = len(facts["results"])
-    text += f" {done} of {facts['cells_planned']} benchmark cells run [{facts['profile']['name']}]."
+    if facts["cells_planned"]:
+        text += f" {done} of {facts['cells_planned']} benchmark cells run [{facts['profile']['name']}]."
+    else:
+        text += " The data were checked; no agent was trained."
     text += f" {pluralize(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
     return {"kind": kind, "text": text}
 
@@ -487,6 +491,8 @@ def _times(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settings(facts: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    if not facts["cells_planned"]:
+        return list({**facts["settings"], **facts["versions"]}.items())
     profile = {key: value for key, value in facts["profile"].items() if key not in ("name", "note")}
     network = profile["network"]
     profile["network"] = "channels {}, strides {}".format(

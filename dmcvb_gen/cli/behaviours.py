@@ -10,11 +10,16 @@ from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, 
 
 
 @click.command("train-behaviour")
-@click.argument("task")
+@click.argument("task", required=False)
+@click.option(
+    "--layout",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Text file of a maze of your own, instead of TASK: learns to walk it (guided) and selects checkpoints.",
+)
 @click.option("--out", type=OutPath(path_type=Path), help="Folder of the run.  [default: runs/TASK]")
 @click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
 @click.option("--seed", type=click.IntRange(0), help="Random seed.  [default: 0]")
-@click.option("--algo", help="sac, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac]")
+@click.option("--algo", help="sac, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac; --layout: guided]")
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="Override a setting. Repeatable.")
 @click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
 @click.option("--init-from", metavar="RUN|FILE", help="Run or policy file to start from; guided: the guide.")
@@ -30,7 +35,7 @@ from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, 
 @json_option
 @click.pass_context
 def train_behaviour(
-    context, task, out, steps, seed, algo, pairs, config, init_from, evaluate_every, precision, resume, as_json
+    context, task, layout, out, steps, seed, algo, pairs, config, init_from, evaluate_every, precision, resume, as_json
 ):
     """Train a behaviour policy online on states.
 
@@ -41,6 +46,7 @@ def train_behaviour(
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
     dmcvb-gen train-behaviour cheetah-run --algo tqc --set gradient_steps=8 --out runs/cheetah-tqc
     dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant-maze-medium7x7a
+    dmcvb-gen train-behaviour --layout ring.txt --out runs/ring
     dmcvb-gen select-checkpoints runs/walker-walk
     """
     import torch
@@ -48,20 +54,24 @@ def train_behaviour(
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.paper import paper_returns
-    from dmcvb_gen.spec import task_folder
+    from dmcvb_gen.spec import MazeName, task_folder
     from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.ant_maze import layout_task_id
     from dmcvb_gen.training.defaults import parse_settings, run_config
     from dmcvb_gen.training.runs import Stopped, read_config
-    from dmcvb_gen.training.selection import plot_curve
+    from dmcvb_gen.training.selection import plot_curve, selection_json
     from dmcvb_gen.training.training import open_run
 
+    if (task is None) == (layout is None):
+        raise click.UsageError("Give a TASK, or the file of a maze with --layout.")
+    task = task or layout_task_id(layout)
     allow([task])  # a person typed its name, so its code may run
     get_task(task)
-    folder = out or Path("runs") / task
+    folder = out or Path("runs") / (MazeName.parse(task).layout if layout else task)
     found = read_config(folder) if resume else None
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
-    algorithm = algo or (found.algorithm if found else "sac")
+    algorithm = algo or (found.algorithm if found else "guided" if layout else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
     settings = parse_settings(pairs, config, algorithm)
     chosen = _precision(precision, algorithm, settings, found)
@@ -89,11 +99,28 @@ def train_behaviour(
             bar.close()
             click.echo(stopped, err=True)
             context.exit(1)
-    curve = plot_curve(folder, expert and expert["mean"])
+    curve, selecting = plot_curve(folder, expert and expert["mean"]), f"dmcvb-gen select-checkpoints {folder}"
+    try:
+        picked = _select(folder, as_json) if layout else None
+    except KeyboardInterrupt:
+        click.echo(f"Interrupted. The run is trained; select its checkpoints: {selecting}", err=True)
+        context.exit(1)
     if as_json:
-        return print_json(dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1), curve=str(curve)))
+        facts = dict(out=str(folder), steps=run.step, seconds=round(run.seconds, 1), curve=str(curve))
+        return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
     click.echo(f"{folder}: trained to {run.step:,} agent steps; its curve is {curve}.")
-    click.echo(f"Next: dmcvb-gen select-checkpoints {folder}")
+    if not picked:
+        return click.echo(f"Next: {selecting}")
+    _show_picks(picked, folder)
+    if "expert" in picked.picks:
+        click.echo(f"Next: dmcvb-gen rollout --layout {layout} --level expert --behaviour {folder} --goal visible")
+
+
+def _select(folder, as_json, episodes=100, seed=20_000, sample=False, converged=None):
+    from dmcvb_gen.training.selection import select_checkpoints
+
+    with ProgressBar(as_json, unit=" checkpoints", desc="selection") as bar:
+        return select_checkpoints(folder, episodes, seed, not sample, converged, bar)
 
 
 def _standing(progress, expert):
@@ -142,23 +169,29 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     dmcvb-gen select-checkpoints runs/walker-walk
     dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk --episodes 20
     """
-    from dmcvb_gen.training import selection as module
+    from dmcvb_gen.training.selection import selection_json
 
-    with ProgressBar(as_json, unit=" checkpoints") as bar:
-        picked = module.select_checkpoints(run, episodes, seed, not sample, converged, bar)
+    picked = _select(run, as_json, episodes, seed, sample, converged)
     if as_json:
-        return print_json(module.selection_json(picked))
+        return print_json(selection_json(picked))
+    _show_picks(picked, run)
+
+
+def _show_picks(picked, run):
+    from dmcvb_gen.spec import task_folder
+
     end = picked.convergence
     state = "converged" if end.converged else f"not converged ({end.reason})"
-    click.echo(f"{picked.task}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
+    click.echo(f"{task_folder(picked.task)}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
     picks = [pick for level in picked.picks.values() for pick in level]
-    print_table(
-        ("pick", "agent step", "<aimed at", "mean", "std"),
-        [
-            (pick.name, f"{pick.step:,}", pick.target, f"{pick.evaluation.mean:.1f}", f"{pick.evaluation.std:.1f}")
-            for pick in picks
-        ],
-    )
+    if picks:
+        print_table(
+            ("pick", "agent step", "<aimed at", "mean", "std"),
+            [
+                (pick.name, f"{pick.step:,}", pick.target, f"{pick.evaluation.mean:.1f}", f"{pick.evaluation.std:.1f}")
+                for pick in picks
+            ],
+        )
     for level, reason in picked.reasons.items():
         click.echo(f"{level} cannot be picked yet: {reason}")
     click.echo(f"wrote {run}/selected, {run}/selection.json, {run}/curve.png")

@@ -46,9 +46,21 @@ def fetch(context, url, only, episodes, painting, size, views, goal, out, option
         print_json(dataclasses.asdict(moved) | (painted_facts(done) if done else {}))
     else:
         click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
+        if episodes:
+            _tell_whole_shards(out, episodes)
         if done:
             show_painted(out, done)
     context.exit(1 if done and done.differing else 0)
+
+
+def _tell_whole_shards(out, episodes):
+    """Say so if shards brought more episodes than were asked for."""
+    from dmcvb_gen.dataset import open_release
+
+    here = {name: len(subset.episodes) for name, subset in open_release(out).subsets.items()}
+    name = max(here, key=here.get, default=None)
+    if name and here[name] > (asked := episodes[1] - episodes[0]):
+        click.echo(f"Shards come whole: {name} has {here[name]} episodes here, and {asked} were asked for.")
 
 
 def _fetch_painted(url, out, only, episodes, overrides, given, as_json):

@@ -174,13 +174,43 @@ def rollout(
     plan = make_plan(chosen, site, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
     if device != "cpu" and chosen and not options["recipe"] and "renderer" not in given:
         click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
+    if chosen:
+        _tell_own_videos(chosen.backgrounds, chosen.split)
     if dry_run:
         return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
     shared = init or bool(part)
+    _tell_what_is_there(plan, shared)
     plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
     if init:
         return _tell_begun(plan, as_json)
     _run(plan, executor, as_json, whole=not part)
+
+
+def _tell_what_is_there(plan, shared):
+    """Notes on a release that gains subsets or episodes, and on another rollout that works on it."""
+    from dmcvb_gen.generate.site import rollouts_at_work
+
+    if plan.growth:
+        added = ", ".join(plan.growth[:3]) + (f" and {len(plan.growth) - 3} more" if len(plan.growth) > 3 else "")
+        click.echo(f"{plan.site.place} is a release already; this adds {added}.", err=True)
+    if not shared and (others := rollouts_at_work(plan.site)):
+        click.echo(
+            f"Another rollout is writing to {plan.site.place} ({', '.join(others)}), and both make the same shards. To "
+            "share the work, stop one and give --part 1/2 and --part 2/2.",
+            err=True,
+        )
+
+
+def _tell_own_videos(source, split):
+    from dmcvb_gen.distractors.backgrounds import videos_by_split
+
+    if source != "builtin" and (counts := videos_by_split(source)):
+        other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
+        click.echo(
+            f"{counts[split]} of {sum(counts.values())} videos in {source} are used; the others are kept for {other}. "
+            "To choose them yourself, put them into folders named train and val.",
+            err=True,
+        )
 
 
 def _tell_begun(plan, as_json):
@@ -356,9 +386,10 @@ def info(path, options, as_json):
     rows = []
     for subset in facts["subsets"]:
         planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
+        mark = " *" if subset["paper"] and subset["shorter"] else ""
         rows.append(
             (
-                subset["name"],
+                subset["name"] + mark,
                 f"{subset['episodes']:,}{planned}",
                 f"{subset['steps']:,}",
                 format_bytes(subset["bytes"]),
@@ -376,6 +407,8 @@ def info(path, options, as_json):
         optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
     )
     click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
+    if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
+        click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
     if facts["digest"]:
         click.echo(f"digest {facts['digest']}")
 

@@ -140,6 +140,15 @@ def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:
     return videos[1::2] if split == "val" else videos[::2]
 
 
+def videos_by_split(source: str | Path) -> dict[str, int] | None:
+    """How many videos of a folder each split takes; None if its owner has split it, or it holds one video or none."""
+    root = Path(source)
+    if not root.is_dir() or any((root / name).is_dir() for names in _SPLITS.values() for name in names):
+        return None
+    count = len(_find_videos(root))
+    return {split: len(_find_split(root, split)) for split in _SPLITS} if count > 1 else None
+
+
 def _listed(folder: Path) -> list[Path]:
     """What is in a folder, hidden files apart, with numbers in names ordered by value."""
 

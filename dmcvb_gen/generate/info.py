@@ -9,8 +9,11 @@ import numpy as np
 
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds
+from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds, is_maze
 from dmcvb_gen.version import __version__
+
+PAPER_STEPS = {False: 500, True: 600}
+"""Agent steps at the time limit of the paper's data: locomotion, mazes."""
 
 
 def return_statistics(returns: np.ndarray) -> dict[str, float]:
@@ -44,6 +47,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 renderer=subset.record.renderer.get("name"),
                 digest=subset.record.digest,
                 returns=return_statistics(subset.returns),
+                shorter=subset.record.max_steps < PAPER_STEPS[is_maze(subset.task)],
                 paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
             )
         )

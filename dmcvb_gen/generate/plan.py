@@ -52,6 +52,7 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.text import pluralize
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class Plan:
       inputs: of each subset, by name; None where the release's own copies serve.
       jobs: what is still to do, settings that share trajectories together.
       done: committed shards that are there already.
+      growth: what the release that is there gains: "walker-walk/random/none" for a new subset, "walker-walk/random/none
+        (40 episodes more)" for one that grows.
     """
 
     site: Site
@@ -71,6 +74,7 @@ class Plan:
     inputs: Mapping[str, Inputs] | None
     jobs: tuple[Job, ...]
     done: int
+    growth: tuple[str, ...] = ()
 
     @property
     def episodes(self) -> int:
@@ -122,7 +126,15 @@ def make_plan(
     _refuse_half_painted(there, records, done, site.place)
     jobs = part_of(make_jobs(grown, shards, site, None if site.slow else inputs, device), part)
     left = left_to_do(jobs, done)
-    return Plan(site, manifest, inputs, left, _count(jobs) - _count(left))
+    growth = _growth(there, records) if there is not None else ()
+    return Plan(site, manifest, inputs, left, _count(jobs) - _count(left), growth)
+
+
+def _growth(there: Manifest, records: Iterable[SubsetRecord]) -> tuple[str, ...]:
+    old = {record.name: record.episodes for record in there.subsets}
+    more = {record.name: record.episodes - old.get(record.name, 0) for record in records}
+    told = {name: f" ({pluralize(count, 'episodes')} more)" if name in old else "" for name, count in more.items()}
+    return tuple(name + told[name] for name, count in more.items() if count)
 
 
 def _refuse_half_painted(

@@ -401,6 +401,11 @@ class StagingFolder:
 _stages: dict[Site, StagingFolder] = {}
 
 
+def rollouts_at_work(site: Site) -> list[str]:
+    """Other running processes that make shards of a release in a folder: "process 12", see `files.others_at_work`."""
+    return files.others_at_work(site.workshop) if isinstance(site, FolderSite) else []
+
+
 def staging_folder_of(site: Site) -> StagingFolder:
     """This process's stage for a site."""
     if site not in _stages:

@@ -34,6 +34,9 @@ REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "Si
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+BUCKET_PROTOCOLS = ("s3", "gs", "gcs", "az", "abfs", "hf")
+
+
 def is_url(path: str) -> bool:
     """Whether a path is a URL rather than a folder ("file:..." counts as a URL)."""
     return "://" in path or path.startswith("file:")
@@ -66,7 +69,7 @@ def file_system(url: str, options: dict[str, Any] | None = None) -> tuple[fsspec
       options: passed to fsspec, e.g. {"endpoint_url": ..., "key": ..., "secret": ...} for S3.
 
     Raises:
-      StoreError: its protocol is unknown or not installed (says which extra to install).
+      StoreError: its protocol is unknown or not installed (says which extra to install), or it names no bucket.
     """
     protocol = url.split(":", 1)[0]
     try:
@@ -79,7 +82,10 @@ def file_system(url: str, options: dict[str, Any] | None = None) -> tuple[fsspec
         raise StoreError(
             f"cannot use {public(url)} ({error}); give file:, s3://, gs://, hf:// or another fsspec URL"
         ) from None
-    return filesystem, base.rstrip("/")
+    base = base.rstrip("/")
+    if protocol in BUCKET_PROTOCOLS and not base:
+        raise StoreError(f"{public(url)} names no bucket; give {protocol}://BUCKET/NAME")
+    return filesystem, base
 
 
 _SECRETS = (

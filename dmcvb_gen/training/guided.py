@@ -36,6 +36,8 @@ from dmcvb_gen.training.settings import Count, Natural, NonNegative, Positive, S
 GUIDE = "ant-maze-empty7x7"
 """The task whose bundled expert walks where --init-from names none."""
 
+MOST_CELLS = 15
+"""Rows or columns of the largest maze that is learned: an ant runs about twenty cells in an episode (1.6 m/s, 30 s)."""
 
 EVALUATION_STEPS = 40.0
 """Agent steps simulated in evaluations for each one trained, at most.
@@ -107,6 +109,12 @@ class GuidedRun(Run):
         return 0
 
     def problem(self) -> str | None:
+        rows, columns = self.task.layout.shape
+        if max(rows, columns) > MOST_CELLS:
+            return (
+                f"maze {self.task.layout.name} is {rows} x {columns} cells; an episode of {self.task.max_steps} steps "
+                f"is too short to cross more than {MOST_CELLS} x {MOST_CELLS}, so give a smaller layout"
+            )
         return self.too_few_updates(0)
 
     def evaluation_steps(self) -> float:

@@ -42,7 +42,7 @@ from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import save_policy
-from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION
+from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, MazeName
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.networks import as_arrays
 from dmcvb_gen.training.pruning import prunable_checkpoints
@@ -346,9 +346,12 @@ class Run(abc.ABC):
 
     def resume_command(self) -> str:
         """The command line that resumes this run."""
-        return (
-            f"dmcvb-gen train-behaviour {shlex.quote(self.config.task)} --out {shlex.quote(str(self.folder))} --resume"
-        )
+        what = [self.config.task]
+        if (maze := MazeName.parse(self.config.task)) and maze.rows:  # its name is short, its rows are not
+            path = self.folder / f"{maze.layout}.txt"
+            path.write_text(maze.rows.replace("/", "\n").replace(".", " ") + "\n")
+            what = ["--layout", str(path)]
+        return shlex.join(["dmcvb-gen", "train-behaviour", *what, "--out", str(self.folder), "--resume"])
 
     @contextlib.contextmanager
     def _stopping_on_signals(self, stopping: Callable[[], Any]) -> Iterator[None]:
