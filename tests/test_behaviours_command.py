@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import train_behaviour
-from dmcvb_gen.policies.bundled import bundled_folder, bundled_levels
+from dmcvb_gen.policies.bundled import bundled_levels, bundled_policies
 from dmcvb_gen.policies.evaluation import maze_scores, running_speed
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task, task_ids
@@ -95,7 +95,7 @@ def test_one_command_sets_every_bundled_level_beside_the_paper():
 
 
 def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
-    file = bundled_folder() / "walker-walk" / "medium.safetensors"
+    (file,) = bundled_policies("walker-walk", "medium")
     (row,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--json"))
     assert (row["task"], row["level"], row["mode"]) == ("walker-walk", "medium", "mean")
     folder = json.loads(

@@ -16,7 +16,8 @@ from safetensors.torch import load_file, save_file
 from dmcvb_gen import arithmetic
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.policies.actor import Policy, random_policy
-from dmcvb_gen.policies.bundled import bundled_folder, bundled_policies, resolve_policies
+from dmcvb_gen.policies.archives import bundled_digests, bundled_file
+from dmcvb_gen.policies.bundled import bundled_policies, resolve_policies
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.policies.simulate import simulate
@@ -256,7 +257,7 @@ def test_a_placeless_header_has_the_last_names_of_paths_alone(path, name):
 
 
 def test_no_bundled_policy_names_a_place():
-    files = sorted(bundled_folder().rglob("*.safetensors"))
+    files = [bundled_file(name) for name in bundled_digests()]
     assert files and all(read_header(path).without_local_paths() == read_header(path) for path in files)
 
 

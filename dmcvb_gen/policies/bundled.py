@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from importlib import resources
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.own_code import is_own
+from dmcvb_gen.policies.archives import bundled_digests, bundled_file
 from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.spec import TRAINED_LEVELS
 
 CONVERTED = (".zip", ".pt", ".pth")
 """Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
-
-
-def bundled_folder() -> Path:
-    """Where the package keeps its policies: <task>/<level>.safetensors, mixed_0 .. mixed_7."""
-    return Path(str(resources.files("dmcvb_gen.policies"))) / "data"
 
 
 def level_files(folder: Path, level: str) -> list[Path]:
@@ -29,25 +24,31 @@ def level_files(folder: Path, level: str) -> list[Path]:
     return [path] if path.exists() else []
 
 
+def bundled_names(task_id: str, level: str) -> list[str]:
+    """Names of the bundled policy files of a task and level, in order: <task>/expert.safetensors, for example."""
+    start = f"{task_id}/mixed_" if level == "mixed" else f"{task_id}/{level}.safetensors"
+    return sorted(name for name in bundled_digests() if name.startswith(start))
+
+
 def bundled_levels(task_id: str) -> list[str]:
     """Levels that the package has policies for."""
-    return [level for level in TRAINED_LEVELS if level_files(bundled_folder() / task_id, level)]
+    return [level for level in TRAINED_LEVELS if bundled_names(task_id, level)]
 
 
 def bundled_policies(task_id: str, level: str) -> list[Path]:
     """Bundled policy files of a task and level (eight for mixed).
 
     Raises:
-      DmcvbError: the package has none; says how to get one.
+      DmcvbError: the package has none (says how to get one), or no folder to unpack them into can be written.
     """
-    files = level_files(bundled_folder() / task_id, level)
-    if not files:
+    names = bundled_names(task_id, level)
+    if not names:
         have = ", ".join([*bundled_levels(task_id), "random"])
         raise DmcvbError(
             f"no {level} policy of {task_id} is bundled (there is: {have}); train one with `dmcvb-gen train-behaviour "
             f"{task_id}` and `dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
         )
-    return files
+    return [bundled_file(name) for name in names]
 
 
 def levels_of(behaviour: str | Path) -> list[str]:
