@@ -11,6 +11,8 @@ import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import pytest
+
 import dmcvb_gen
 
 ROOT = Path(dmcvb_gen.__file__).parent
@@ -181,3 +183,24 @@ def test_the_architecture_names_every_package_and_no_other():
     table = text.split("```text")[1].split("```")[0]
     named = {line.split()[0] for line in table.splitlines() if line}
     assert named == {path.parent.name for path in ROOT.glob("*/__init__.py")}
+
+
+@pytest.mark.parametrize(
+    ("command", "heavy"),
+    [
+        (["list"], ("numba", "scipy", "torch", "zarr", "xarray", "matplotlib")),
+        (["info", "RELEASE"], ("numba", "scipy", "torch", "mujoco", "dm_control", "xarray", "matplotlib")),
+        (["--help"], ("numpy", "rich", "pydantic", "zarr", "mujoco")),
+    ],
+    ids=lambda value: value[0],
+)
+def test_a_command_that_shows_loads_no_simulator(command, heavy, small_release):
+    words = [str(small_release) if word == "RELEASE" else word for word in command]
+    code = f"""import sys
+import pytest
+
+from dmcvb_gen.cli import main
+main({words!r}, standalone_mode=False)
+print("loaded:", [name for name in {heavy!r} if name in sys.modules])"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "loaded: []", done.stdout + done.stderr

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset import open_release
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds, is_maze
 from dmcvb_gen.version import __version__
@@ -31,6 +31,8 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     Raises:
       StoreError: there is no release at `path`.
     """
+    from dmcvb_gen.dataset import open_release  # loads zarr, which `list` needs not
+
     release = open_release(path, storage_options)
     subsets = []
     for name, subset in release.subsets.items():
@@ -71,6 +73,8 @@ def describe_package() -> dict[str, Any]:
     from dmcvb_gen.rendering import available_renderers
     from dmcvb_gen.tasks import get_task, suite_ids, task_ids
 
+    looking = ThreadPoolExecutor(1)
+    renderers = looking.submit(available_renderers)  # OpenGL is tried in a process of its own
     tasks = []
     for task_id in task_ids():
         task = get_task(task_id)
@@ -94,5 +98,5 @@ def describe_package() -> dict[str, Any]:
         maze_settings=list(GOAL_MODES),
         recipes=list(shipped_recipes()),
         manifests=list(shipped_manifests()),
-        renderers=available_renderers(),
+        renderers=renderers.result(),
     )

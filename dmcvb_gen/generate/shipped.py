@@ -13,9 +13,7 @@ from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
-from dmcvb_gen.dataset.index import INDEX, trusted_index
 from dmcvb_gen.dataset.manifest import MANIFEST
-from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.errors import StoreError, UnknownNameError
 
 _FOLDER = resources.files("dmcvb_gen.generate") / "data" / "manifests"
@@ -61,6 +59,9 @@ def write_archive(release: str | Path, out: str | Path) -> int:
     Raises:
       StoreError: the release is not complete.
     """
+    from dmcvb_gen.dataset.index import INDEX, trusted_index  # loads zarr, which names need not
+    from dmcvb_gen.dataset.reader import load_manifest
+
     root, manifest = load_manifest(release)
     if not manifest.complete or trusted_index(root, manifest) is None:
         raise StoreError(f"{root} is not complete; finish it with the command that began it")

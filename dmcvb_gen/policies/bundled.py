@@ -9,7 +9,6 @@ from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file
-from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.spec import TRAINED_LEVELS
 
 CONVERTED = (".zip", ".pt", ".pth")
@@ -59,6 +58,8 @@ def levels_of(behaviour: str | Path) -> list[str]:
     """
     path = Path(behaviour)
     if path.is_file():
+        from dmcvb_gen.policies.policy_file import read_header  # loads numba, which listing needs not
+
         return [read_header(path).level or path.stem]
     for folder in (path / "selected", path):
         levels = [level for level in TRAINED_LEVELS if level_files(folder, level)]

@@ -74,7 +74,8 @@ def make_renderer(
 
 def available_renderers() -> dict[str, str | None]:
     """Renderer -> None if it can start here, else why not and what to do."""
-    return {name: renderer_class(name).unavailable() for name in RENDERERS}
+    # The native one needs nothing but the package, and half a second to load.
+    return {name: None if name == "native" else renderer_class(name).unavailable() for name in RENDERERS}
 
 
 def default_renderer(task: Task) -> str:

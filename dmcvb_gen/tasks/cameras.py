@@ -10,7 +10,6 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
-from scipy.spatial.transform import Rotation
 
 from dmcvb_gen.tasks.base import Task, physics_columns
 
@@ -96,12 +95,18 @@ def seen_materials(model: mujoco.MjModel) -> np.ndarray:
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) as quaternions (..., 4), w x y z with w >= 0."""
+    from scipy.spatial.transform import (
+        Rotation,  # scipy takes a fifth of a second, which commands that list or show need not wait for
+    )
+
     rotation = Rotation.from_matrix(matrices.reshape(-1, 3, 3))
     return rotation.as_quat(canonical=True, scalar_first=True).reshape(*matrices.shape[:-2], 4)
 
 
 def matrices(quaternion: np.ndarray) -> np.ndarray:
     """Quaternions (..., 4), w x y z, normalized here, as rotation matrices (..., 3, 3) float64."""
+    from scipy.spatial.transform import Rotation
+
     rotation = Rotation.from_quat(np.asarray(quaternion, np.float64).reshape(-1, 4), scalar_first=True)
     return rotation.as_matrix().reshape(*quaternion.shape[:-1], 3, 3)
 

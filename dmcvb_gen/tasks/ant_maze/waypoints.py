@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from scipy import ndimage
 
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, floor_pixels, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
@@ -51,6 +50,8 @@ def _downhill(layout: Layout, goal_cell: tuple[int, int]) -> np.ndarray:
 def _clearance(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """(row, column) distance of every pixel to the nearest wall, meters; (row, column, 2) unit x and y away from it."""
     floor, _ = floor_pixels(layout)
+    from scipy import ndimage  # scipy takes a fifth of a second, which commands that list or show need not wait for
+
     clear = ndimage.distance_transform_edt(floor) * CELL / PIXELS
     down, right = np.gradient(ndimage.gaussian_filter(np.where(floor, clear, -CELL / PIXELS), 1.0))
     away = np.stack([right, -down], axis=-1)
