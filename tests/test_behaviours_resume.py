@@ -38,6 +38,7 @@ TINY = {
     "td3": dict(learning_starts=24, batch_size=16, hidden=[16, 8], simulations=4),
     "ppo": dict(n_steps=10, batch_size=20, hidden=[16], simulations=4, n_epochs=2),
 }
+TINY["mpo"] = TINY["sac"] | dict(train_episode_steps=20, target_period=7)
 TINY["sac"] |= dict(train_episode_steps=20, bfloat16=False)
 
 

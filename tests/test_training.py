@@ -208,7 +208,7 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
     "arguments, words",
     [
         (["walker-fly"], "walker-walk"),
-        (["walker-walk", "--algo", "dreamer"], "Known: guided, ppo, sac, sb3-sac, td3, tqc."),
+        (["walker-walk", "--algo", "dreamer"], "Known: guided, mpo, ppo, sac, sb3-sac, td3, tqc."),
         (["walker-walk", "--set", "speed=3"], "learning_rate"),
         (["walker-walk", "--algo", "ppo", "--set", "buffer_size=3"], "clip_range"),
         (["walker-walk", "--set", "speed"], "key=value"),

@@ -19,7 +19,9 @@ from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, 
 @click.option("--out", type=OutPath(path_type=Path), help="Folder of the run.  [default: runs/TASK]")
 @click.option("--steps", type=click.IntRange(1), help="Agent steps (at action repeat 2).  [default: the task's]")
 @click.option("--seed", type=click.IntRange(0), help="Random seed.  [default: 0]")
-@click.option("--algo", help="sac, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac; --layout: guided]")
+@click.option(
+    "--algo", help="sac, mpo, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo.  [default: sac; --layout: guided]"
+)
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="Override a setting. Repeatable.")
 @click.option("--config", type=click.Path(path_type=Path), help="A YAML file of settings.")
 @click.option("--init-from", metavar="RUN|FILE", help="Run or policy file to start from; guided: the guide.")

@@ -26,6 +26,7 @@ OWN_CODE = "own-code"
 """Algorithm of a behaviour that is a function of the user's."""
 ORIGINS = {
     "sac": "by soft actor-critic (SAC)",
+    "mpo": "by maximum a posteriori policy optimization (MPO)",
     "guided": "on a policy of the open maze, by imitation of a guide that knows the way (DAgger)",
     "sb3-sac": "by Stable-Baselines3's SAC",
     "td3": "by Stable-Baselines3's TD3",

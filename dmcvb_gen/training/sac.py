@@ -7,10 +7,12 @@ processor has them, compiled updates. scripts/bench_training.py sets it beside S
 
 from __future__ import annotations
 
+import abc
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -207,14 +209,86 @@ class RunningNorm:
         return np.sqrt(self.m2 / self.count).clip(1e-2)
 
 
-class Sac:
+class ReplayLearner(abc.ABC):
+    """What learns from a replay buffer: an actor, running statistics of observations, and whatever else `update` needs.
+
+    Attributes of subclasses:
+      _parts, _optimizers: names of the networks and optimizers that `state` holds.
+    """
+
+    _parts: tuple[str, ...]
+    _optimizers: tuple[str, ...]
+
+    def __init__(self, header: PolicyHeader, settings: Any, seed: int):
+        torch.manual_seed(seed)
+        self.settings, self.actor = settings, Actor(header)
+        self.norm = RunningNorm(header.observation_size)
+        self.updates = 0
+
+    @abc.abstractmethod
+    def update(self, batch: dict[str, torch.Tensor]) -> None:
+        """One gradient step on rows of the buffer."""
+
+    @abc.abstractmethod
+    def metrics(self) -> dict[str, float]:
+        """Numbers of the last update, for the log."""
+
+    def begin_round(self, step: int) -> None:
+        """Called at every agent step of the simulations, before its updates."""
+        self.sync_norm()
+
+    def sync_norm(self) -> None:
+        """Put the running statistics into the actor, where every network reads them."""
+        self.actor.observation_mean.copy_(torch.from_numpy(self.norm.mean))
+        self.actor.observation_std.copy_(torch.from_numpy(self.norm.std))
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Actions for collecting, (n, observation) -> (n, action) float32: means in the first rows, samples below."""
+        with torch.no_grad():
+            mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
+            noise = torch.randn_like(mean)
+            noise[: round(self.settings.mean_share * len(noise))] = 0
+            return torch.tanh(mean + std * noise).numpy()
+
+    def state(self) -> dict[str, Any]:
+        """Everything that learning continues from (tensors and plain numbers)."""
+        norm = {
+            "count": self.norm.count,
+            "mean": torch.from_numpy(self.norm.mean),
+            "m2": torch.from_numpy(self.norm.m2),
+        }
+        states = {name: getattr(self, name).state_dict() for name in (*self._parts, *self._optimizers)}
+        return states | {"norm": norm, "updates": self.updates, "torch_rng": torch.get_rng_state()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`."""
+        self.load_networks(state)
+        for name in self._optimizers:
+            getattr(self, name).load_state_dict(state[name])
+        self.updates = int(state["updates"])
+        torch.set_rng_state(state["torch_rng"])
+
+    def load_networks(self, state: dict[str, Any]) -> None:
+        """Take networks, temperature and normalization of `state()`, but no optimizer or random state.
+
+        Raises:
+          RuntimeError: they have other shapes.
+        """
+        for name in self._parts:
+            getattr(self, name).load_state_dict(state[name])
+        self.norm.count = float(state["norm"]["count"])
+        self.norm.mean, self.norm.m2 = state["norm"]["mean"].numpy().copy(), state["norm"]["m2"].numpy().copy()
+
+
+class Sac(ReplayLearner):
     """The learner: networks, optimizers, temperature; `update` does one step of all of them."""
 
+    _parts = ("actor", "critic", "target")
+    _optimizers = ("actor_optimizer", "critic_optimizer", "alpha_optimizer")
+
     def __init__(self, header: PolicyHeader, settings: SacSettings, seed: int):
-        torch.manual_seed(seed)
-        self.settings = settings
+        super().__init__(header, settings, seed)
         observation, action = header.observation_size, header.action_size
-        self.actor = Actor(header)
         sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics)
         self.critic, self.target = CriticEnsemble(*sizes), CriticEnsemble(*sizes)
         self.target.load_state_dict(self.critic.state_dict())
@@ -227,13 +301,15 @@ class Sac:
         self.actor_optimizer = torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay)
         self.critic_optimizer = torch.optim.AdamW(self.critic.parameters(), lr=rate, **decay)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
-        self.norm = RunningNorm(observation)
-        self.updates = 0
         self._losses: dict[str, torch.Tensor] = {}
         self._critic_loss, self._actor_loss = self.critic_loss, self.actor_loss
         if settings.compile:
             self._critic_loss = torch.compile(self.critic_loss)
             self._actor_loss = torch.compile(self.actor_loss)
+
+    def begin_round(self, step: int) -> None:
+        super().begin_round(step)
+        self.sharpen(step)
 
     def sharpen(self, step: int) -> None:
         """Aim at the lower entropy, by smaller steps, from the agent step on that the settings name."""
@@ -244,11 +320,6 @@ class Sac:
         for optimizer in (self.actor_optimizer, self.critic_optimizer, self.alpha_optimizer):
             for group in optimizer.param_groups:
                 group["lr"] = settings.sharp_learning_rate or group["lr"]
-
-    def sync_norm(self) -> None:
-        """Put the running statistics into the actor, where every network reads them."""
-        self.actor.observation_mean.copy_(torch.from_numpy(self.norm.mean))
-        self.actor.observation_std.copy_(torch.from_numpy(self.norm.std))
 
     def sample_action(self, normalized: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Reparametrized action and its log probability, (n, action), (n,)."""
@@ -316,56 +387,16 @@ class Sac:
             self.alpha_optimizer.step()
         torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Actions for collecting, (n, observation) -> (n, action) float32: means in the first rows, samples below."""
-        with torch.no_grad():
-            mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
-            noise = torch.randn_like(mean)
-            noise[: round(self.settings.mean_share * len(noise))] = 0
-            return torch.tanh(mean + std * noise).numpy()
-
     def metrics(self) -> dict[str, float]:
         """Losses, policy entropy (nats) and temperature of the last update."""
         return {name: float(value) for name, value in self._losses.items()} | {
             "temperature": float(self.log_alpha.detach().exp())
         }
 
-    def state(self) -> dict:
-        """Everything that learning continues from (tensors and plain numbers)."""
-        return {
-            "actor": self.actor.state_dict(),
-            "critic": self.critic.state_dict(),
-            "target": self.target.state_dict(),
-            "log_alpha": self.log_alpha.detach(),
-            "actor_optimizer": self.actor_optimizer.state_dict(),
-            "critic_optimizer": self.critic_optimizer.state_dict(),
-            "alpha_optimizer": self.alpha_optimizer.state_dict(),
-            "norm": {
-                "count": self.norm.count,
-                "mean": torch.from_numpy(self.norm.mean),
-                "m2": torch.from_numpy(self.norm.m2),
-            },
-            "updates": self.updates,
-            "torch_rng": torch.get_rng_state(),
-        }
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"log_alpha": self.log_alpha.detach()}
 
-    def load_state(self, state: dict) -> None:
-        """Continue from `state()`."""
-        self.load_networks(state)
-        for name in ("actor_optimizer", "critic_optimizer", "alpha_optimizer"):
-            getattr(self, name).load_state_dict(state[name])
-        self.updates = int(state["updates"])
-        torch.set_rng_state(state["torch_rng"])
-
-    def load_networks(self, state: dict) -> None:
-        """Take networks, temperature and normalization of `state()`, but no optimizer or random state.
-
-        Raises:
-          RuntimeError: they have other shapes.
-        """
-        for name in ("actor", "critic", "target"):
-            getattr(self, name).load_state_dict(state[name])
+    def load_networks(self, state: dict[str, Any]) -> None:
+        super().load_networks(state)
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
-        self.norm.count = float(state["norm"]["count"])
-        self.norm.mean, self.norm.m2 = state["norm"]["mean"].numpy().copy(), state["norm"]["m2"].numpy().copy()

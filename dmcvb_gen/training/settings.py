@@ -21,13 +21,14 @@ Decay = Annotated[float, Field(ge=0, lt=1)]
 
 ALGORITHMS = {
     "sac": "dmcvb_gen.training.sac:SacSettings",
+    "mpo": "dmcvb_gen.training.mpo:MpoSettings",
     "guided": "dmcvb_gen.training.guided:GuidedSettings",
     "sb3-sac": "dmcvb_gen.training.settings:Sb3SacSettings",
     "td3": "dmcvb_gen.training.settings:Td3Settings",
     "tqc": "dmcvb_gen.training.settings:TqcSettings",
     "ppo": "dmcvb_gen.training.settings:PpoSettings",
 }
-"""What `train-behaviour --algo` takes -> its settings. `sac` and `guided` are the package's own, the rest SB3's."""
+"""What `train-behaviour --algo` takes -> its settings. `sac`, `mpo`, `guided` are the package's own, the rest SB3's."""
 
 
 @dataclasses.dataclass(frozen=True)

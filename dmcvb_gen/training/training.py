@@ -1,11 +1,12 @@
 """Training a behaviour policy online on states: task and settings in, a run folder of checkpoints out.
 
-The package's own SAC is trained here, Stable-Baselines3's algorithms in `sb3`; `open_run` gives the one that is
-asked for. What a run folder holds is said in `runs`.
+The package's own SAC and MPO are trained here, Stable-Baselines3's algorithms in `sb3`; `open_run` gives the one that
+is asked for. What a run folder holds is said in `runs`.
 """
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import json
 import shutil
@@ -33,15 +34,19 @@ from dmcvb_gen.training.runs import (
     command_of,
     read_config,
 )
-from dmcvb_gen.training.sac import ReplayBuffer, Sac
+from dmcvb_gen.training.sac import ReplayBuffer, ReplayLearner, Sac
 from dmcvb_gen.training.settings import check_settings
 from dmcvb_gen.training.state_file import read_state
 
 __all__ = ["Progress", "Run", "RunConfig", "SacRun", "command_of", "open_run", "read_config"]
 
 
-class SacRun(Run):
-    """A run of the package's own SAC."""
+class ReplayRun(Run):
+    """A run of one of the package's learners that learn from a replay buffer."""
+
+    @abc.abstractmethod
+    def learner(self) -> ReplayLearner:
+        """A new learner."""
 
     def network(self) -> dict[str, Any]:
         return {"hidden": tuple(self.settings.actor_hidden)}
@@ -56,10 +61,10 @@ class SacRun(Run):
                 f"buffer_size {settings.buffer_size} holds fewer steps than warmup_steps {settings.warmup_steps}, so "
                 "nothing would ever be learned; give --set buffer_size of at least that"
             )
-        return self.too_few_updates(settings.warmup_steps, settings.actor_every)
+        return self.too_few_updates(settings.warmup_steps, getattr(settings, "actor_every", 1))
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
-        loop, next_evaluation = SacLoop(self, saved), self.config.evaluate_every
+        loop, next_evaluation = ReplayLoop(self, saved), self.config.evaluate_every
         if saved:
             next_evaluation = (self.step // self.config.evaluate_every + 1) * self.config.evaluate_every
             next_evaluation = saved.get("next_evaluation", next_evaluation)
@@ -79,16 +84,32 @@ class SacRun(Run):
         self.save(state())
 
 
-class SacLoop:
-    """What a run of SAC goes round: episodes fill the buffer, the learner learns from it; its state can be saved.
+class SacRun(ReplayRun):
+    """A run of the package's own SAC."""
+
+    def learner(self) -> Sac:
+        return Sac(self.header, self.settings, self.config.seed)
+
+
+class MpoRun(ReplayRun):
+    """A run of the package's own MPO."""
+
+    def learner(self) -> ReplayLearner:
+        from dmcvb_gen.training.mpo import Mpo
+
+        return Mpo(self.header, self.settings, self.config.seed)
+
+
+class ReplayLoop:
+    """What a run goes round: episodes fill the buffer, the learner learns from it; its state can be saved.
 
     Args:
       saved: `state()` to go on from; None at the start.
     """
 
-    def __init__(self, run: SacRun, saved: dict[str, Any] | None):
+    def __init__(self, run: ReplayRun, saved: dict[str, Any] | None):
         settings, task, config = run.settings, run.task, run.config
-        self.run, self.learner = run, Sac(run.header, settings, config.seed)
+        self.run, self.learner = run, run.learner()
         rows = max(min(settings.buffer_size, config.steps), settings.simulations)
         self.buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, run.folder / "resume")
         self.rng = np.random.default_rng([config.seed, 0xB0FF])
@@ -100,7 +121,7 @@ class SacLoop:
             self.rng.bit_generator.state = json.loads(saved["rng"])
             self._owed = saved.get("owed", 0.0)
         elif config.init_from:
-            _start_from(self.learner, config.init_from)
+            _start_from(self.learner, config.algorithm, config.init_from)
         self.episodes, self._shaping = Episodes(run, self.rng), shaping_of(task)
         if saved and "episodes" in saved:
             self.observation = self.episodes.restore(saved["episodes"])
@@ -151,8 +172,7 @@ class SacLoop:
     def learn(self) -> None:
         """The updates that the steps so far are owed."""
         settings = self.run.settings
-        self.learner.sync_norm()
-        self.learner.sharpen(self.run.step)
+        self.learner.begin_round(self.run.step)
         if len(self.buffer) < settings.warmup_steps:
             return
         self._owed += settings.updates_per_step * settings.simulations
@@ -170,14 +190,16 @@ def _fit(what: str, load: Callable[[Any], None], state: Any) -> None:
         raise DmcvbError(f"{what}: its networks do not fit these settings and task ({reason})") from None
 
 
-def _start_from(learner: Sac, source: str) -> None:
+def _start_from(learner: ReplayLearner, algorithm: str, source: str) -> None:
     """Take networks and normalization from another run, or the actor alone from a policy file."""
     path = Path(source)
     if path.is_dir():
         config = read_config(path)
-        saved = read_state(path) if config and config.algorithm == "sac" else None
+        saved = read_state(path) if config and config.algorithm == algorithm else None
         if not saved:
-            raise DmcvbError(f"--init-from {source}: no run of sac is saved there; give its folder or a policy file")
+            raise DmcvbError(
+                f"--init-from {source}: no run of {algorithm} is saved there; give its folder or a policy file"
+            )
         _fit(f"--init-from {source}", learner.load_networks, saved["learner"])
         return
     _fit(f"--init-from {source}", learner.actor.load_state_dict, as_tensors(load_policy(path).weights))
@@ -188,8 +210,8 @@ def _start_from(learner: Sac, source: str) -> None:
 
 def run_class(algorithm: str) -> type[Run]:
     """The kind of run that trains an algorithm."""
-    if algorithm == "sac":
-        return SacRun
+    if algorithm in ("sac", "mpo"):
+        return {"sac": SacRun, "mpo": MpoRun}[algorithm]
     if algorithm == "guided":
         from dmcvb_gen.training.guided import GuidedRun
 

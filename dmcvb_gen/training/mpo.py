@@ -1,0 +1,197 @@
+"""Maximum a posteriori policy optimization, by which DMC-VB's experts were trained (paper, section 3.1).
+
+MPO (Abdolmaleki et al. 2018a, "Maximum a Posteriori Policy Optimisation", and 2018b, "Relative Entropy Regularized
+Policy Iteration", equations cited as R): sampled actions are weighted by how good a critic finds them (E-step), and the
+policy is fitted to them within trust regions of its own for mean and standard deviation (M-step).
+
+What differs from the papers: the Gaussian lives before a tanh, as in this package's policy files. KL divergences do
+not change under tanh and its Jacobian does not depend on the policy, so every equation stays as it is. The critics
+learn from one-step targets instead of Retrace. The covariance is diagonal.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn.functional import softplus
+
+from dmcvb_gen.policies.header import PolicyHeader
+from dmcvb_gen.training.sac import CriticEnsemble, ReplayLearner
+from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, Share
+
+SMALLEST = 1e-8
+"""Added to temperature and multipliers, which must not be zero."""
+
+
+@dataclass(frozen=True)
+class MpoSettings:
+    """Settings of `Mpo`.
+
+    Attributes:
+      simulations: episodes stepped side by side.
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
+      warmup_steps: agent steps of uniform random actions before the first update.
+      action_samples: actions drawn from the target policy for each state.
+      epsilon: bound on the KL divergence of the weighted actions from the target policy (E-step).
+      epsilon_mean, epsilon_std: bounds on the M-step's KL divergences, through the mean and through the deviation.
+      dual_learning_rate: of temperature and multipliers.
+      target_period: updates after which the target networks become copies of policy and critics.
+      critics: how many critics; their mean is used.
+      reward_scale: multiplies rewards before learning.
+      shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
+      compile: compile the update (needs a C++ compiler on the CPU).
+    """
+
+    simulations: Count = 8
+    batch_size: Count = 256
+    actor_hidden: tuple[Count, ...] = (256, 256)
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    learning_rate: Positive = 3e-4
+    dual_learning_rate: Positive = 1e-2
+    discount: Decay = 0.99
+    updates_per_step: Positive = 0.5
+    warmup_steps: Natural = 5000
+    target_period: Count = 100
+    action_samples: Count = 20
+    epsilon: Positive = 0.1
+    epsilon_mean: Positive = 0.01
+    epsilon_std: Positive = 1e-4
+    initial_temperature: Positive = 1.0
+    initial_multiplier_mean: Positive = 1.0
+    initial_multiplier_std: Positive = 10.0
+    critics: Count = 2
+    reward_scale: Positive = 1.0
+    shaping: NonNegative = 0.0
+    progress: NonNegative = 0.0
+    standing_starts: Share = 0.0
+    sunken_starts: Share = 0.0
+    mean_share: Share = 0.0
+    train_episode_steps: Natural = 0
+    buffer_size: Count = 1_000_000
+    compile: bool = True
+
+
+def temperature_loss(values: torch.Tensor, temperature: torch.Tensor, epsilon: float) -> torch.Tensor:
+    """The dual of the E-step, (1): eta * epsilon + eta * E_s[log E_a exp(Q / eta)] (2018a, equation 9; R 4).
+
+    Args:
+      values: Q of the sampled actions, (sample, n).
+    """
+    mean_exp = torch.logsumexp(values / temperature, dim=0) - math.log(len(values))
+    return temperature * (epsilon + mean_exp.mean())
+
+
+def action_weights(values: torch.Tensor, temperature: torch.Tensor) -> torch.Tensor:
+    """Weights of the sampled actions, (sample, n), one in sum for each state: q ~ exp(Q / eta) (2018a, equation 8)."""
+    return torch.softmax(values / temperature, dim=0)
+
+
+def log_density(actions: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+    """Log densities of a diagonal Gaussian, summed over actions, (sample, n); without its constant."""
+    return (-0.5 * ((actions - mean) / std) ** 2 - std.log()).sum(-1)
+
+
+def kl_of_means(mean: torch.Tensor, new: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+    """KL(N(mean, std) || N(new, std)), its mean over states, (1) (R 6: the covariance is held fixed)."""
+    return (0.5 * ((new - mean) / std) ** 2).sum(-1).mean()
+
+
+def kl_of_stds(std: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
+    """KL(N(mean, std) || N(mean, new)), its mean over states, (1) (R 6: the mean is held fixed)."""
+    ratio = std / new
+    return (0.5 * (ratio**2 - 1) - ratio.log()).sum(-1).mean()
+
+
+class Mpo(ReplayLearner):
+    """The learner: policy, critics, their targets, temperature, multipliers; `update` does one step of all of them."""
+
+    def __init__(self, header: PolicyHeader, settings: MpoSettings, seed: int):
+        super().__init__(header, settings, seed)
+        sizes = (header.observation_size, header.action_size, settings.critic_hidden, False, settings.critics)
+        self.critic, self.target_actor = CriticEnsemble(*sizes), copy.deepcopy(self.actor)
+        self.target = copy.deepcopy(self.critic)
+        for network in (self.target, self.target_actor):
+            network.requires_grad_(False)
+        # Softplus of these: they stay positive whatever the optimizer does.
+        starts = (settings.initial_temperature, settings.initial_multiplier_mean, settings.initial_multiplier_std)
+        self.duals = nn.Parameter(torch.tensor([math.log(math.expm1(value)) for value in starts]))
+        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=settings.learning_rate, fused=True)
+        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.learning_rate, fused=True)
+        self.dual_optimizer = torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True)
+        self._loss = torch.compile(self.loss) if settings.compile else self.loss
+
+    def loss(self, observation, action, reward, terminated, next_observation):
+        """The sum of all losses, (1): critics', policy's, temperature's and multipliers'; and what is to be logged."""
+        settings = self.settings
+        with torch.no_grad():
+            values, sampled, mean, std = self._target_values(next_observation)
+            target = reward + (1 - terminated) * settings.discount * values.mean(dim=0)
+        critic_loss = ((self.critic(self.actor.normalize(observation), action) - target) ** 2).mean(dim=1).sum()
+
+        temperature, multiplier_mean, multiplier_std = softplus(self.duals) + SMALLEST
+        weights = action_weights(values, temperature).detach()
+
+        new_mean, new_std = self.actor(next_observation)
+        # Each part of the policy is fitted with the other one held at the target's (R 5 and 6).
+        fit = log_density(sampled, new_mean, std) + log_density(sampled, mean, new_std)
+        kl_mean, kl_std = kl_of_means(mean, new_mean, std), kl_of_stds(std, new_std)
+        policy_loss = multiplier_mean.detach() * kl_mean + multiplier_std.detach() * kl_std
+        policy_loss = policy_loss - (weights * fit).sum(dim=0).mean()
+        dual_loss = temperature_loss(values, temperature, settings.epsilon)
+        dual_loss = dual_loss + multiplier_mean * (settings.epsilon_mean - kl_mean.detach())
+        dual_loss = dual_loss + multiplier_std * (settings.epsilon_std - kl_std.detach())
+        logged = torch.stack([critic_loss, policy_loss, temperature, kl_mean, kl_std, std.mean()]).detach()
+        return critic_loss + policy_loss + dual_loss, logged
+
+    def _target_values(self, observation):
+        """Q of actions drawn from the target policy, (sample, n); these actions before tanh; its mean and std."""
+        mean, std = self.target_actor(observation)
+        sampled = mean + std * torch.randn(self.settings.action_samples, *mean.shape)
+        repeated = self.actor.normalize(observation).expand(len(sampled), -1, -1)
+        values = self.target(repeated.flatten(0, 1), torch.tanh(sampled).flatten(0, 1))
+        return values.mean(dim=0).view(len(sampled), -1), sampled, mean, std
+
+    def update(self, batch: dict[str, torch.Tensor]) -> None:
+        """One gradient step."""
+        names = ("observation", "action", "reward", "terminated", "next_observation")
+        batch = batch | {"reward": batch["reward"] * self.settings.reward_scale}
+        optimizers = (self.actor_optimizer, self.critic_optimizer, self.dual_optimizer)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        loss, logged = self._loss(*(batch[name] for name in names))
+        loss.backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        self.updates += 1
+        self._logged = logged
+        if self.updates % self.settings.target_period == 0:
+            self.target.load_state_dict(self.critic.state_dict())
+            self.target_actor.load_state_dict(self.actor.state_dict())
+
+    def sync_norm(self) -> None:
+        super().sync_norm()
+        for name in ("observation_mean", "observation_std"):  # else the target would see other numbers than the policy
+            getattr(self.target_actor, name).copy_(getattr(self.actor, name))
+
+    _logged: torch.Tensor | None = None
+
+    def metrics(self) -> dict[str, float]:
+        """Losses, temperature, KL divergences and mean deviation of the last update."""
+        names = ("critic_loss", "actor_loss", "temperature", "kl_mean", "kl_std", "std")
+        return {} if self._logged is None else dict(zip(names, self._logged.tolist(), strict=True))
+
+    _parts = ("actor", "critic", "target", "target_actor")
+    _optimizers = ("actor_optimizer", "critic_optimizer", "dual_optimizer")
+
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"duals": self.duals.detach()}
+
+    def load_networks(self, state: dict[str, Any]) -> None:
+        super().load_networks(state)
+        with torch.no_grad():
+            self.duals.copy_(state["duals"])

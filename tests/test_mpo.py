@@ -1,0 +1,129 @@
+"""MPO: each of its equations against what it should be, and whole runs of it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from torch.distributions import Independent, Normal, kl_divergence
+
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.policies.header import PolicyHeader
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training import mpo
+from dmcvb_gen.training.mpo import Mpo, MpoSettings
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.settings import check_settings
+from dmcvb_gen.training.training import open_run
+
+SMALL = dict(actor_hidden=[16], critic_hidden=[16], batch_size=32, warmup_steps=64, simulations=4, compile=False)
+
+
+def gaussian(mean, std):
+    return Independent(Normal(mean, std), 1)
+
+
+@pytest.fixture
+def two():
+    """Two Gaussians over three actions for five states, and samples of the first."""
+    torch.manual_seed(0)
+    mean, new = torch.randn(5, 3), torch.randn(5, 3)
+    std, other = torch.rand(5, 3) + 0.1, torch.rand(5, 3) + 0.1
+    return mean, std, new, other, gaussian(mean, std).sample((7,))
+
+
+def test_densities_are_a_gaussians(two):
+    mean, std, _, _, sampled = two
+    constant = 1.5 * math.log(2 * math.pi)
+    torch.testing.assert_close(mpo.log_density(sampled, mean, std) - constant, gaussian(mean, std).log_prob(sampled))
+
+
+def test_divergences_through_mean_and_deviation_are_those_of_torch(two):
+    mean, std, new, other, _ = two
+    one = gaussian(mean, std)
+    torch.testing.assert_close(mpo.kl_of_means(mean, new, std), kl_divergence(one, gaussian(new, std)).mean())
+    torch.testing.assert_close(mpo.kl_of_stds(std, other), kl_divergence(one, gaussian(mean, other)).mean())
+
+
+def test_the_dual_finds_the_temperature_whose_weights_keep_their_distance():
+    torch.manual_seed(1)
+    values, epsilon = torch.randn(200, 50) * 3, 0.1
+    grid = torch.linspace(0.3, 40, 4000)
+    losses = torch.stack([mpo.temperature_loss(values, eta, epsilon) for eta in grid])
+    best = grid[losses.argmin()]
+    weights = mpo.action_weights(values, best)
+    torch.testing.assert_close(weights.sum(0), torch.ones(50))
+    # The dual's minimum is where the weighted samples are epsilon away from the unweighted ones.
+    divergence = (weights * (weights * len(values)).log()).sum(0).mean()
+    assert divergence.item() == pytest.approx(epsilon, rel=0.02)
+    assert torch.equal(weights.argmax(0), values.argmax(0))
+
+
+def learner(**changes):
+    header = PolicyHeader(task="x", observation_size=3, action_size=2, algorithm="mpo", agent_step=0, hidden=(16,))
+    return Mpo(header, MpoSettings(**SMALL | changes), 0)
+
+
+def batch_of(count=64, seed=3):
+    torch.manual_seed(seed)
+    action = torch.rand(count, 2) * 2 - 1
+    rows = {"observation": torch.randn(count, 3), "action": action, "reward": 1 - (action[:, 0] - 0.5) ** 2}
+    return rows | {"terminated": torch.ones(count), "next_observation": torch.randn(count, 3)}
+
+
+def test_it_finds_the_action_that_pays():
+    mpo_learner = learner(learning_rate=3e-3, epsilon_mean=0.05, epsilon_std=0.01, target_period=20)
+    for seed in range(1500):
+        mpo_learner.update(batch_of(128, seed))
+    mean, std = mpo_learner.actor(torch.randn(100, 3))
+    assert (torch.tanh(mean)[:, 0] - 0.5).abs().mean() < 0.1 and std[:, 0].mean() < 0.2
+
+
+def test_the_policy_keeps_to_its_bounds_between_targets():
+    bounds = dict(epsilon_mean=1e-3, epsilon_std=1e-3, dual_learning_rate=0.1)
+    mpo_learner = learner(target_period=10_000, learning_rate=3e-3, **bounds)
+    for _ in range(600):
+        mpo_learner.update(batch_of())
+    metrics = mpo_learner.metrics()
+    assert metrics["kl_mean"] < 3e-3 and metrics["kl_std"] < 3e-3
+    with torch.no_grad():
+        mpo_learner.duals[1:] = -20.0  # without multipliers it runs away
+    for _ in range(100):
+        mpo_learner.dual_optimizer.param_groups[0]["lr"] = 0.0
+        mpo_learner.update(batch_of())
+    assert mpo_learner.metrics()["kl_mean"] > 1e-2
+
+
+def test_targets_are_copies_of_long_ago():
+    mpo_learner = learner(target_period=3)
+    before = mpo_learner.target.head.clone()
+    for count in range(1, 5):
+        mpo_learner.update(batch_of())
+        assert torch.equal(mpo_learner.target.head, before) == (count < 3)
+        assert torch.equal(mpo_learner.target.head, mpo_learner.critic.head) == (count == 3)
+    mpo_learner.norm.update(np.random.default_rng(0).normal(5, 2, (10, 3)))
+    mpo_learner.sync_norm()
+    assert torch.equal(mpo_learner.target_actor.observation_mean, mpo_learner.actor.observation_mean)
+
+
+def test_its_policies_roll_out(tmp_path):
+    config = RunConfig("walker-walk", "mpo", 128, 0, SMALL, evaluate_every=128, evaluate_sparse=128)
+    run = open_run(tmp_path / "run", config, False)
+    run.train()
+    path = tmp_path / "run" / "checkpoints" / f"{run.step:010d}.safetensors"
+    policy = load_policy(path, get_task("walker-walk"))
+    assert policy.header.algorithm == "mpo" and "--algo mpo" in policy.header.command
+    words = ["rollout", "walker-walk", "--level", "expert", "--behaviour", str(path), "--episodes", "1"]
+    done = CliRunner().invoke(main, [*words, "--max-steps", "3", "--size", "16", "--out", str(tmp_path / "r")])
+    assert done.exit_code == 0, done.output
+
+
+@pytest.mark.parametrize("given", [{"epsilon": 0.0}, {"action_samples": 0}, {"epsilon_meen": 0.1}])
+def test_settings_are_checked(given):
+    with pytest.raises(DmcvbError, match=next(iter(given))[:11]):
+        check_settings("mpo", given)
