@@ -78,8 +78,8 @@ def main() -> None:
             rates = []
             for half, compiled in [(False, False), (True, False)] + [(not agent.sees_state, True)] * options.compile:
                 torch.manual_seed(0)
-                encoder = make_encoder(agent, seen, architecture=network).to(options.device)
-                learner = make(agent, encoder, seen, network).to(options.device)
+                encoder = make_encoder(agent, seen.sizes, architecture=network).to(options.device)
+                learner = make(agent, encoder, seen.sizes, network).to(options.device)
                 rates.append(steps_per_second(learner, seen, options, half, compiled))
             shown = "".join(f" {rate:9.2f}" for rate in rates) + " " * 10 * (3 - len(rates))
             print(f"{f'{name}, {part}':34s}{shown}  {max(rates) / rates[0]:.2f} x", flush=True)

@@ -61,7 +61,7 @@ VARIANTS = {
 def make(variant: Variant, data, agent):
     """A policy with the same random start for the same sizes."""
     torch.manual_seed(0)
-    return make_policy(agent, make_encoder(agent, data, None, variant.network), data, variant.network)
+    return make_policy(agent, make_encoder(agent, data.sizes, None, variant.network), data.sizes, variant.network)
 
 
 def settings(variant: Variant, steps: int) -> TrainSettings:

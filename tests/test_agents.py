@@ -590,10 +590,10 @@ def test_every_agent_can_be_made_and_acts(name):
 
     agent, data = parse_agent(name), make_data()
     data = data.states_only() if agent.sees_state else data
-    encoder = make_encoder(agent, data)
+    encoder = make_encoder(agent, data.sizes)
     if agent.pretrain:
-        make_pretrainer(agent, encoder, data)
-    policy = make_policy(agent, encoder, data)
+        make_pretrainer(agent, encoder, data.sizes)
+    policy = make_policy(agent, encoder, data.sizes)
     action = policy.act(data.observe(data.train_rows[:3], *data._no_shift(3)))
     assert action.shape == (3, 2) and action.abs().max() <= 1
     assert policy.encoder.features == (64 if not agent.sees_state else policy.encoder.features)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from torch import nn
 
-from dmcvb_gen.agents.data import FRAMES, TrainingData
+from dmcvb_gen.agents.data import FRAMES, Sizes
 from dmcvb_gen.agents.dino import load_dino
 from dmcvb_gen.agents.learners import (
     TD3BC,
@@ -140,7 +140,7 @@ def _check_heard(agent: Agent, name: str) -> None:
 
 
 def make_encoder(
-    agent: Agent, data: TrainingData, dino_weights: str | Path | None = None, architecture: Architecture = PAPER
+    agent: Agent, sizes: Sizes, dino_weights: str | Path | None = None, architecture: Architecture = PAPER
 ) -> nn.Module:
     """phi of an agent, untrained (or DINO's).
 
@@ -148,34 +148,34 @@ def make_encoder(
       DmcvbError: DINO's weights are asked for and not at hand.
     """
     if agent.sees_state:
-        return state_encoder(data.state.shape[1])
+        return state_encoder(sizes.state)
     if agent.pretrain == "dino":
-        return load_dino(dino_weights, data.channels, data.frames.size)
-    return observation_encoder(data.channels, data.frames.size, architecture, data.stack)
+        return load_dino(dino_weights, sizes.channels, sizes.picture)
+    return observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
 
 
-def make_pretrainer(agent: Agent, encoder: Encoder, data: TrainingData, architecture: Architecture = PAPER) -> Learner:
+def make_pretrainer(agent: Agent, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER) -> Learner:
     """What pre-trains phi."""
-    actions, states = data.action.shape[1], data.state.shape[1]
+    actions, states = sizes.action, sizes.state
     makers = {
         "id": lambda: InverseDynamics(encoder, actions, agent.k, agent.sample_k),
         "lfd": lambda: LatentForwardDynamics(encoder, actions),
-        "ae": lambda: Autoencoder(encoder, data.channels, data.frames.size, architecture),
+        "ae": lambda: Autoencoder(encoder, sizes.channels, sizes.picture, architecture),
         "state": lambda: StatePrediction(encoder, states),
         "bc": lambda: BehaviorCloning(encoder, actions),
     }
     return makers[agent.pretrain]()
 
 
-def make_policy(agent: Agent, encoder: nn.Module, data: TrainingData, architecture: Architecture = PAPER) -> Policy:
+def make_policy(agent: Agent, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER) -> Policy:
     """What learns the policy, on the pre-trained encoder (frozen) or with one of its own."""
-    actions, frozen = data.action.shape[1], agent.pretrain is not None
+    actions, frozen = sizes.action, agent.pretrain is not None
     if agent.policy == "bc":
         return BehaviorCloning(encoder, actions, frozen=frozen)
     bounded = not agent.unbounded
     if frozen:
         return TD3BC(encoder, encoder.features, actions, frozen=True, bounded=bounded)
     if agent.sees_state:
-        return TD3BC(nn.Identity(), data.state.shape[1], actions, bounded=bounded)
-    body = Convolutions(data.channels, data.frames.size, architecture, data.stack)
+        return TD3BC(nn.Identity(), sizes.state, actions, bounded=bounded)
+    body = Convolutions(sizes.channels, sizes.picture, architecture, sizes.stack)
     return TD3BC(body, body.features, actions, bounded=bounded, latent=architecture.latent)

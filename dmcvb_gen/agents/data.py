@@ -183,6 +183,23 @@ def training_views(subset: Subset) -> tuple[str, ...]:
     return training_pictures(subset).arrays if subset.pixel_arrays else ()
 
 
+@dataclass(frozen=True)
+class Sizes:
+    """Numbers that networks are made for.
+
+    Attributes:
+      state, action: numbers of each.
+      channels: of an observation: 3 x views x frames of the stack. picture: pixels a side. stack: frames. All 0 for
+        agents that see states.
+    """
+
+    state: int
+    action: int
+    channels: int = 0
+    picture: int = 0
+    stack: int = 0
+
+
 class TrainingData(Dataset):
     """Episodes of one or several subsets, ready to be drawn from.
 
@@ -231,6 +248,12 @@ class TrainingData(Dataset):
     def channels(self) -> int:
         """Channels of an observation: 3 x views x frames of the stack."""
         return self.frames.channels * self.stack
+
+    @property
+    def sizes(self) -> Sizes:
+        """What networks for these data are made for."""
+        pictures = () if self.frames is None else (self.channels, self.frames.size, self.stack)
+        return Sizes(self.state.shape[1], self.action.shape[1], *pictures)
 
     @property
     def device(self) -> torch.device:

@@ -129,9 +129,16 @@ class Learner(nn.Module, abc.ABC):
 class Policy(Learner):
     """A learner that acts."""
 
+    only_learns: tuple[str, ...] = ()
+    """Beginnings of the weights' names that learning alone needs."""
+
     @abc.abstractmethod
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """(batch, action) in [-1, 1]."""
+
+    def acts_by(self, weight: str) -> bool:
+        """Whether actions depend on the weight of that name."""
+        return not weight.startswith(self.only_learns)
 
 
 # -- representation learning (paper, section 4.2) -------------------------------------------------
@@ -302,6 +309,7 @@ class TD3BC(Policy):
     needs_next = True
     needs_pictures = False
     compiled = ("critic_loss", "actor_loss")
+    only_learns = ("target.", "net.critic", "updates")
 
     def __init__(
         self,

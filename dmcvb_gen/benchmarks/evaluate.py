@@ -142,7 +142,7 @@ class EvaluationScene:
         Raises:
           DmcvbError: the text has another form, or there is no such task or setting.
         """
-        task, slash, setting = where.partition("/")
+        task, slash, setting = where.rpartition("/")
         if not slash or not setting:
             raise DmcvbError(f"{where!r} names no evaluation; give TASK/SETTING, e.g. walker-walk/dynamic")
         spec = SubsetSpec.parse(task, "random", setting)

@@ -22,13 +22,14 @@ from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pret
 from dmcvb_gen.agents.data import Normalization, Source, TrainingData, choose_episodes, load_data
 from dmcvb_gen.agents.learners import Batch, Learner, ObservationProbe, Policy, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
-from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, renderer_choice
+from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, protocol, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.own import AgentData, OwnAgent
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.setup import Pretraining, Setup, data_of_run, fingerprint, pretraining_of, read_result
 from dmcvb_gen.benchmarks.suites import Cell, Part
+from dmcvb_gen.benchmarks.trained import save_agent
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError
@@ -115,8 +116,8 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: ProgressCallback = ig
         return done
     data, network = _cache.get(setup, release, work.parts, True, work.agent.stack), setup.profile.network
     torch.manual_seed(setup.seed)
-    encoder = make_encoder(work.agent, data, architecture=network)
-    learner = make_pretrainer(work.agent, encoder, data, network).to(setup.device)
+    encoder = make_encoder(work.agent, data.sizes, architecture=network)
+    learner = make_pretrainer(work.agent, encoder, data.sizes, network).to(setup.device)
     folder = setup.encoders / f"{work.id}.{mark[:12]}.run"
     curve = train(
         learner,
@@ -182,6 +183,7 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     folder = setup.cells / f"{cell.id}.{mark[:12]}.run"
     subset = release[cell.policy[0].subset]
     curve, trained = _train_policy(setup, cell, subset, data, policy, folder, tick)
+    _save_trained(setup, cell, policy, data)
     inspected = time.perf_counter()
     looked_into = pixels and setup.profile.readout_steps
     inspection = inspect(setup, policy.encoder, data, cell, folder, tick) if looked_into else None
@@ -253,10 +255,10 @@ def _evaluator(setup: Setup, cell: Cell, subset: Subset, **options: Any) -> Eval
 
 def _make_policy(setup: Setup, cell: Cell, before: Pretraining | None, data: TrainingData) -> Policy:
     torch.manual_seed(setup.seed)
-    encoder = make_encoder(cell.agent, data, setup.dino_weights, setup.profile.network)
+    encoder = make_encoder(cell.agent, data.sizes, setup.dino_weights, setup.profile.network)
     if before:
         _load_encoder(setup, before, encoder)
-    return make_policy(cell.agent, encoder, data, setup.profile.network).to(setup.device)
+    return make_policy(cell.agent, encoder, data.sizes, setup.profile.network).to(setup.device)
 
 
 def _train_policy(
@@ -292,6 +294,13 @@ def _train_policy(
     return curve, time.perf_counter() - started
 
 
+def _save_trained(setup: Setup, cell: Cell, policy: Policy, data: TrainingData) -> None:
+    """Keep the policy beside its result, unless its score is noise or its encoder is DINO's, which is large."""
+    if setup.profile.scores and cell.agent.pretrain != "dino":
+        path = setup.cells / f"{cell.id}.safetensors"
+        save_agent(path, policy, cell.agent, data.sizes, setup.profile.network, data.normalization)
+
+
 def _facts(
     setup: Setup, cell: Cell, subset: Subset, data: TrainingData, curve: Curve, seconds: dict[str, float]
 ) -> dict[str, Any]:
@@ -312,6 +321,13 @@ def _facts(
         "paper": paper and {"mean": paper[0], "stderr": paper[1]},
         "data": dataclasses.asdict(data_score(subset, data)),
         "episodes": len(data.lengths),
+        "evaluation": protocol(
+            subset,
+            None if cell.policy[0].goal_pair is None else goal_cells(subset, cell.policy[0].goal_pair),
+            setup.backgrounds,
+            pictures=not agent.sees_state,
+            max_steps=profile.episode_steps,
+        ),
         "renderers": {"data": subset.record.renderer["name"], "evaluation": renderer_choice(subset)["name"]},
         "curve": [_thin(point) for point in curve],
         "seconds": seconds,

@@ -106,7 +106,12 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
         "format": "dmcvb-gen validation",
         "generator": f"dmcvb-gen {__version__}",
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
-        "release": {"name": release.manifest.name, "version": release.manifest.version, "path": release.root},
+        "release": {
+            "name": release.manifest.name,
+            "version": release.manifest.version,
+            "digest": release.manifest.digest,
+            "path": release.root,
+        },
         "sound": structure.sound and not failed,
         "complete": there == asked,
         "episodes": {"there": sum(there.values()), "asked": sum(asked.values())},

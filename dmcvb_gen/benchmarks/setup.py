@@ -2,6 +2,7 @@
 
     <out>/encoders/<id>.safetensors, .json   a pre-trained encoder and its learning curve, shared by cells
     <out>/cells/<id>.json                    a cell's scores, curve, settings, times
+    <out>/cells/<id>.safetensors             its trained policy (`trained.load_agent`)
     <out>/cells/<id>.rollout.png             frames of an evaluation episode
     <out>/cells/<id>.decoder.png             what decoders see through the encoder
     <out>/cells/<id>.log, encoders/<id>.log  the traceback of one that failed

@@ -1,0 +1,110 @@
+"""Trained agents in files: a cell's policy in, something that `dmcvb_gen.evaluate` takes out.
+
+    agent = load_agent("reports/mini/cells/b1_walker-walk_none_state-bc_expert.safetensors")
+    dmcvb_gen.evaluate(agent, "walker-walk/none", pixels=agent.pixels, stack=agent.stack)
+
+A file holds the weights that act, the normalization of states, and a header with all that the networks are made from.
+Nothing in it can run code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, parse_agent
+from dmcvb_gen.agents.data import Normalization, Sizes, normalize_pixels
+from dmcvb_gen.agents.learners import Policy
+from dmcvb_gen.agents.networks import Architecture
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import replacing
+
+FORMAT = "dmcvb-gen trained agent"
+
+
+def save_agent(
+    path: Path, policy: Policy, agent: Agent, sizes: Sizes, network: Architecture, normalization: Normalization
+) -> None:
+    """Write a trained policy.
+
+    Args:
+      sizes, network: that it was made for. normalization: of the states that it learned from.
+    """
+    facts = {
+        "format": FORMAT,
+        "agent": agent.name,
+        "sizes": dataclasses.asdict(sizes),
+        "network": dataclasses.asdict(network),
+        "half": policy.half,
+    }
+    tensors = {name: value for name, value in policy.state_dict().items() if policy.acts_by(name)}
+    tensors |= {"normalization.mean": normalization.mean, "normalization.std": normalization.std}
+    with replacing(path) as temporary:
+        whole = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
+        save_file(whole, str(temporary), metadata={"facts": json.dumps(facts)})
+
+
+@dataclass(frozen=True)
+class TrainedAgent:
+    """A trained policy, to call with a batch of observations as `dmcvb_gen.evaluate` gives them.
+
+    Attributes:
+      agent: by name, e.g. "id+bc". sizes: of its observations and actions.
+    """
+
+    agent: Agent
+    sizes: Sizes
+    policy: Policy
+    normalization: Normalization
+
+    @property
+    def pixels(self) -> bool:
+        """Whether it sees pictures."""
+        return not self.agent.sees_state
+
+    @property
+    def stack(self) -> int:
+        """Frames an observation."""
+        return self.agent.stack
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Observations of all episodes in, (episode, action) float32 in [-1, 1] out."""
+        if self.pixels:
+            seen = normalize_pixels(torch.from_numpy(observation["pixels"]))
+        else:
+            seen = self.normalization(torch.from_numpy(observation["state"]))
+        with torch.no_grad(), self.policy.precision():
+            return self.policy.act(seen).float().clamp(-1, 1).numpy()
+
+
+def load_agent(path: str | Path) -> TrainedAgent:
+    """The trained policy of a file that `validate` wrote beside a cell's result.
+
+    Raises:
+      DmcvbError: there is no such file, or it holds something else.
+    """
+    try:
+        with safe_open(str(path), "pt") as file:
+            facts = json.loads((file.metadata() or {}).get("facts", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        if facts.get("format") != FORMAT:
+            raise ValueError("another format")
+        normalization = Normalization(tensors.pop("normalization.mean"), tensors.pop("normalization.std"))
+        agent, sizes, network = parse_agent(facts["agent"]), Sizes(**facts["sizes"]), Architecture(**facts["network"])
+        policy = make_policy(agent, make_encoder(agent, sizes, architecture=network), sizes, network)
+        lacking = policy.load_state_dict(tensors, strict=False)
+        wrong = [*lacking.unexpected_keys, *(name for name in lacking.missing_keys if policy.acts_by(name))]
+        if wrong:
+            raise ValueError(f"{wrong[0]} does not fit")
+        policy.half = bool(facts["half"])
+    except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise DmcvbError(f"{path} is no agent that validate trained ({reason})") from None
+    return TrainedAgent(agent, sizes, policy.eval(), normalization)

@@ -1,0 +1,173 @@
+"""A leaderboard recomputes itself: rows out of reports of both families, their policies scored again, the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.agents.networks import PATCHES
+from dmcvb_gen.benchmarks.leaderboard import Row, add_rows, check_row, read_rows, render_page, rows_of_report
+from dmcvb_gen.benchmarks.profiles import get_profile
+from dmcvb_gen.benchmarks.trained import load_agent
+from dmcvb_gen.benchmarks.validate import make_setup, validate
+from dmcvb_gen.cli import main
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.spec import task_folder
+from tests.conftest import TINY_MAZE
+
+ROOT = Path(__file__).parent.parent
+COMMITTED = ROOT / "docs" / "leaderboard"
+
+
+def report_of(release, out, agents, only, benchmark="b1"):
+    """A report of a few steps whose scores count."""
+    profile = dataclasses.replace(get_profile("smoke"), scores=True, network=PATCHES, episodes=3, readout_steps=0)
+    setup = dataclasses.replace(make_setup(release, out=out), profile=profile)
+    validate(release, setup, benchmarks=(benchmark,), agents=agents, patterns=only)
+    return out
+
+
+@pytest.fixture(scope="module")
+def walkers(small_release, tmp_path_factory):
+    out = tmp_path_factory.mktemp("walkers")
+    return report_of(small_release, out, ["state-bc", "bc", "td3-bc"], ["*/*/none", "*/*/dynamic"])
+
+
+@pytest.fixture(scope="module")
+def mazes(small_mazes, tmp_path_factory):
+    return report_of(small_mazes, tmp_path_factory.mktemp("mazes"), ["state-td3-bc", "id+bc"], ["*/*/visible"])
+
+
+@pytest.mark.parametrize("report, count", [("walkers", 5), ("mazes", 2)])
+def test_every_row_of_a_report_holds_when_its_policy_is_scored_again(report, count, request, tmp_path):
+    folder = request.getfixturevalue(report)
+    rows = add_rows(tmp_path, rows_of_report(folder, "dmcvb-gen rollout ..."))
+    assert len(rows) == count and sorted(read_rows(tmp_path), key=lambda row: row.name) == sorted(
+        rows, key=lambda row: row.name
+    )
+    scores = {result["id"]: result["final"]["returns"] for result in facts_of(folder)["results"]}
+    assert sorted(list(row.returns) for row in rows) == sorted(scores.values())
+    for row in rows:
+        checked = check_row(tmp_path, row)
+        assert checked.holds and checked.returns == row.returns, (row.name, checked.why)
+
+
+def facts_of(report):
+    return json.loads((report / "report.json").read_text())
+
+
+def test_a_kept_policy_is_the_trained_one(walkers):
+    results = {result["id"]: result["final"] for result in facts_of(walkers)["results"]}
+    found = next(name for name in results if "td3-bc" in name and "dynamic" in name)
+    agent = load_agent(walkers / "cells" / f"{found}.safetensors")
+    assert agent.pixels and agent.stack == 3
+    options = dict(episodes=3, max_steps=10, size=agent.sizes.picture)
+    again = dmcvb_gen.evaluate(agent, "walker-walk/dynamic", **options)
+    assert list(again.returns) == results[found]["returns"]
+    other = dmcvb_gen.evaluate(agent, "walker-walk/dynamic", seed=1, **options)
+    assert other.returns != again.returns
+
+
+def test_another_policy_or_score_does_not_hold(walkers, tmp_path):
+    rows = add_rows(tmp_path, rows_of_report(walkers))
+    row = next(row for row in rows if row.agent == "state-bc")
+    better = row.model_copy(update={"returns": tuple(value + 100 for value in row.returns)})
+    checked = check_row(tmp_path, better)
+    assert checked.holds is False and "moved by -100.0" in checked.why
+    (tmp_path / f"{row.name}.json").write_text(better.model_dump_json())
+    done = CliRunner().invoke(main, ["leaderboard", str(tmp_path), "--check", "--row", row.name])
+    assert done.exit_code == 1 and f"DOES NOT HOLD {row.name}" in done.output
+    other = next(tmp_path / f"{r.name}.safetensors" for r in rows if r.agent == "bc")
+    (tmp_path / f"{row.name}.safetensors").write_bytes(other.read_bytes())
+    with pytest.raises(DmcvbError, match="is not the row's policy file"):
+        check_row(tmp_path, row)
+    without = row.model_copy(update={"policy": None})
+    checked = check_row(tmp_path, without)
+    assert checked.holds is None and row.command in checked.why
+
+
+def test_a_rows_command_names_its_cell(walkers, mazes):
+    for report in (walkers, mazes):
+        for name, (row, _) in rows_of_report(report).items():
+            words = shlex.split(row.command)
+            assert words[:2] == ["dmcvb-gen", "validate"] and row.release.digest and row.name == name
+            assert words[words.index("--agents") + 1] == row.agent
+            only = words[words.index("--only") + 1]
+            assert only == f"{task_folder(row.task)}/{row.data}/{row.setting}"
+
+
+def test_the_command_adds_shows_and_writes(mazes, tmp_path):
+    board, page = tmp_path / "board", tmp_path / "board.md"
+    run = CliRunner().invoke
+    done = run(main, ["leaderboard", str(board), "--add", str(mazes), "--cell", "*state-td3-bc*", "--write", str(page)])
+    assert done.exit_code == 0, done.output
+    (row,) = read_rows(board)
+    assert row.task == TINY_MAZE and f"{board}: added 1 row of {mazes}." in done.output
+    assert page.read_text() == render_page([row])
+    shown = run(main, ["leaderboard", str(board)])
+    assert shown.exit_code == 0 and "state-td3-bc" in shown.output
+    told = json.loads(run(main, ["leaderboard", str(board), "--check", "--json"]).output)
+    assert [one["holds"] for one in told] == [True] and told[0]["name"] == row.name
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["nowhere"], "there is no folder nowhere"),
+        ([".", "--row", "nobody"], "nobody"),
+        (["."], "is no row of a leaderboard"),
+        ([".", "--cell", "*"], "--cell has no effect without --add"),
+        ([".", "--write", "x.md", "--row", "y"], "--write writes all rows"),
+        ([".", "--add", "nowhere"], "nowhere holds no report of validate"),
+    ],
+)
+def test_wrong_uses_are_one_line(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if arguments == ["."]:
+        Path("row.json").write_text("{}")
+    done = CliRunner().invoke(main, ["leaderboard", *arguments])
+    assert done.exit_code == 2 and message in done.output and "Traceback" not in done.output
+
+
+def test_noise_and_unfinished_releases_make_no_rows(walkers, tmp_path):
+    facts = facts_of(walkers)
+    for change, message in (
+        ({"profile": facts["profile"] | {"scores": False}}, "are noise"),
+        ({"release": facts["release"] | {"digest": None}}, "no root digest"),
+        ({"results": []}, "no cell that can be evaluated again"),
+    ):
+        (tmp_path / "report.json").write_text(json.dumps(facts | change))
+        with pytest.raises(DmcvbError, match=message):
+            rows_of_report(tmp_path)
+
+
+def test_a_file_that_is_no_agent_is_refused(walkers, tmp_path):
+    with pytest.raises(DmcvbError, match="no agent that validate trained"):
+        load_agent(tmp_path / "nothing.safetensors")
+    (tmp_path / "x.safetensors").write_bytes(b"not one")
+    with pytest.raises(DmcvbError, match="no agent that validate trained"):
+        load_agent(tmp_path / "x.safetensors")
+
+
+# -- the rows of this repository ------------------------------------------------------------------
+
+
+def committed() -> list[Row]:
+    return read_rows(COMMITTED)
+
+
+def test_the_page_is_made_from_the_rows():
+    assert (ROOT / "docs" / "leaderboard.md").read_text() == render_page(committed())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", [row for row in committed() if row.evaluation.size is None], ids=lambda row: row.name)
+def test_a_row_of_agents_that_see_states_holds(row):
+    checked = check_row(COMMITTED, row)
+    assert checked.holds, checked.why
