@@ -1,4 +1,4 @@
-"""Every task of dm_control's suite through the commands: rollout, verify, regenerate, export, environment."""
+"""Every task of dm_control's suite through the commands: train, rollout, verify, regenerate, validate, export, env."""
 
 from __future__ import annotations
 
@@ -15,20 +15,35 @@ from tests.test_tasks import SUITE
 from tests.test_whole_way import run
 
 SIZE = 16
+TINY = {
+    "warmup_steps": 8,
+    "simulations": 4,
+    "batch_size": 8,
+    "actor_hidden": [8],
+    "critic_hidden": [8],
+    "compile": "false",
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task_id", SUITE)
 def test_a_suite_task_goes_the_whole_way(task_id, tmp_path):
     folder, task = tmp_path / "release", get_task(task_id)
-    short = ["--level", "random", "--episodes", 2, "--max-steps", 4, "--size", SIZE, "--distractor", "dynamic"]
-    run("rollout", task_id, *short, "--out", folder)
+    settings = [word for key, value in TINY.items() for word in ("--set", f"{key}={value}")]
+    run("train-behaviour", task_id, "--steps", 16, *settings, "--precision", "float32", "--out", tmp_path / "run")
+    newest = max((tmp_path / "run" / "checkpoints").glob("[0-9]*.safetensors"))
+    short = ["--level", "expert", "--behaviour", newest, "--episodes", 2, "--max-steps", 4, "--size", SIZE]
+    run("rollout", task_id, *short, "--distractor", "dynamic", "--out", folder)
     assert json.loads(run("verify", folder, "--json"))["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
     [subset] = open_release(folder).subsets.values()
     values = subset.episode(1)
     assert values["state"].shape[1] == task.state_size and np.isfinite(values["state"]).all()
     assert len(np.unique(values["pixels"].reshape(-1, 3), axis=0)) > 20  # there is something to see
+    few = ["--profile", "smoke", "--agents", "state-bc", "--workers", 1, "--out", tmp_path / "report"]
+    run("validate", folder, *few)
+    [result] = json.loads((tmp_path / "report" / "report.json").read_text())["results"]
+    assert np.isfinite(result["score"]["returns"]).all() and result["cell"]["task"] == task_id
     run("export", folder, "--to", "npz", "--out", tmp_path / "npz")
     assert list((tmp_path / "npz").rglob("*.npz"))
     env = DistractedEnv(task_id, "dynamic", size=SIZE, renderer=default_renderer(task))
