@@ -125,6 +125,39 @@ def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_p
     assert "own_agents:still" in page
 
 
+SEEING = """
+import numpy as np
+
+def seeing(data):
+    learned = data.source.gather(np.arange(2))["pixels"].shape[1:]
+    def policy(observation):
+        assert observation["pixels"].shape[1:] == learned, (observation["pixels"].shape, learned)
+        return np.zeros((len(observation["pixels"]), len(data.source[0]["action"])))
+    return policy
+"""
+
+
+@pytest.mark.parametrize("kind", ["small_release", "small_mazes"])
+def test_what_an_agent_learns_from_is_what_it_sees_when_it_is_scored(kind, request, tmp_path, monkeypatch):
+    (tmp_path / f"seeing_{kind}.py").write_text(SEEING)
+    monkeypatch.chdir(tmp_path)
+    command = ["validate", str(request.getfixturevalue(kind)), "--only", "*/random/*i*", "--agents", "state-bc"]
+    command += [
+        "--agent",
+        f"seeing_{kind}:seeing",
+        "--workers",
+        "1",
+        "--threads",
+        "1",
+        "--out",
+        str(tmp_path / "report"),
+    ]
+    result = CliRunner().invoke(main, command)
+    facts = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert not facts["failed"], facts["failed"]
+    assert any("seeing" in one["cell"]["agent_name"] for one in facts["results"]), result.output
+
+
 @pytest.mark.parametrize("name, told", [("own_agnts:still", "cannot load"), ("bc", "--agents")])
 def test_an_agent_that_cannot_be_loaded_is_one_line(small_release, tmp_path, name, told):
     command = ["validate", str(small_release), "--agent", name, "--only", "walker-walk/random/none", "--workers", "1"]

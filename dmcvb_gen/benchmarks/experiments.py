@@ -218,7 +218,8 @@ def _run_own(setup: Setup, cell: Cell, release: Release, mark: str) -> dict[str,
     sources = []
     for part in cell.policy:
         episodes, held = choose_episodes(_source(release, part), setup.seed)
-        sources.append(StepSource(release[part.subset], episodes[~held], None if own.pixels else (), own.stack))
+        views = "agents" if own.pixels else ()
+        sources.append(StepSource(release[part.subset], episodes[~held], views, own.stack))
     policy = own.policy(AgentData(tuple(sources), cell.task, cell.setting, setup.seed))
     trained = time.perf_counter() - started
     evaluator = _evaluator(setup, cell, subset, pixels=own.pixels, stack=own.stack)

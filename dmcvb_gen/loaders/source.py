@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.pictures import shown, training_pictures
 from dmcvb_gen.loaders.blocks import Block, check_count, choose, stack_channels
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
@@ -31,7 +31,8 @@ class StepSource:
 
     Args:
       episodes: indices of committed episodes, all by default.
-      pictures: views (or their arrays), in this order; by default all that the subset shows; () gives states alone.
+      pictures: views (or their arrays), in this order; by default all that the subset shows; "agents": those that
+        agents see and `dmcvb_gen.evaluate` gives, which are all but the overhead view of mazes; () gives states alone.
       stack: frames a stack; the first frame of an episode is repeated before it (paper, section 4).
       next_step: give what comes next, too.
       in_memory: hold all steps (they are read at the first use, and once again in each process that the source is
@@ -46,13 +47,13 @@ class StepSource:
         self,
         subset: Subset,
         episodes: Sequence[int] | None = None,
-        pictures: Sequence[str] | None = None,
+        pictures: Sequence[str] | Literal["agents"] | None = None,
         stack: int = 3,
         next_step: bool = False,
         in_memory: bool | None = None,
     ):
         self.subset, self.stack, self.next_step = subset, check_count("stack", stack), next_step
-        self.pictures = shown(subset, pictures).arrays
+        self.pictures = (training_pictures(subset) if pictures == "agents" else shown(subset, pictures)).arrays
         self.episodes = choose(subset, episodes)
         by_episode = dict(zip(subset.episodes.tolist(), subset.lengths.tolist(), strict=True))
         lengths = np.array([by_episode[int(episode)] for episode in self.episodes], int)

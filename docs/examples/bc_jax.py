@@ -10,7 +10,8 @@ import optax
 import dmcvb_gen
 
 STEPS = 100
-source = dmcvb_gen.open(sys.argv[1])[sys.argv[2]].source(stack=3)  # len(source), source[i]: numpy alone
+subset = dmcvb_gen.open(sys.argv[1])[sys.argv[2]]
+source = subset.source(stack=3, pictures="agents")  # len(source), source[i]: numpy alone
 channels, size, _ = source[0]["pixels"].shape
 shapes = {"first": (32, channels, 3, 3), "second": (32, 32, 3, 3)}  # out, in, height, width
 shapes |= {"dense": (256, 32 * (-(-size // 4)) ** 2), "last": (len(source[0]["action"]), 256)}
@@ -18,12 +19,16 @@ keys = dict(zip(shapes, jax.random.split(jax.random.key(0), len(shapes)), strict
 weights = {name: jax.nn.initializers.he_normal(1, 0)(keys[name], shape) for name, shape in shapes.items()}
 
 
-def loss(weights, pixels, actions):
+def act(weights, pixels):
     x = pixels / 255 - 0.5
     for name in ("first", "second"):
         x = jax.nn.relu(jax.lax.conv(x, weights[name], window_strides=(2, 2), padding="SAME"))
     x = jax.nn.relu(x.reshape(len(x), -1) @ weights["dense"].T)
-    return jnp.mean((jnp.tanh(x @ weights["last"].T) - actions) ** 2)
+    return jnp.tanh(x @ weights["last"].T)
+
+
+def loss(weights, pixels, actions):
+    return jnp.mean((act(weights, pixels) - actions) ** 2)
 
 
 optimizer = optax.adam(3e-4)
@@ -36,3 +41,9 @@ for _ in range(STEPS):
     weights = optax.apply_updates(weights, updates)
     losses.append(float(value))
 print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f} after {STEPS} steps of {len(source)} samples")
+task, _, setting = sys.argv[2].split("/")
+trained = jax.jit(lambda pixels: act(weights, pixels))
+score = dmcvb_gen.evaluate(
+    lambda observation: trained(observation["pixels"]), f"{task}/{setting}", episodes=4, max_steps=100, size=size
+)
+print(f"return {score.mean:.1f} +- {score.stderr:.1f} over 4 fresh episodes of 100 steps")

@@ -9,7 +9,8 @@ from torch.utils.data import DataLoader
 import dmcvb_gen
 
 STEPS = 100
-source = dmcvb_gen.open(sys.argv[1])[sys.argv[2]].source(stack=3)  # len(source), source[i]: numpy alone
+subset = dmcvb_gen.open(sys.argv[1])[sys.argv[2]]
+source = subset.source(stack=3, pictures="agents")  # len(source), source[i]: numpy alone
 first = source[0]
 channels, size, _ = first["pixels"].shape
 encoder = nn.Sequential(
@@ -32,3 +33,13 @@ while step < STEPS:
         losses.append(loss.item())
         step += 1
 print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f} after {step} steps of {len(source)} samples")
+
+
+@torch.no_grad()
+def act(observation):
+    return policy(torch.as_tensor(observation["pixels"]) / 255 - 0.5)
+
+
+task, _, setting = sys.argv[2].split("/")
+score = dmcvb_gen.evaluate(act, f"{task}/{setting}", episodes=4, max_steps=100, size=size)
+print(f"return {score.mean:.1f} +- {score.stderr:.1f} over 4 fresh episodes of 100 steps")

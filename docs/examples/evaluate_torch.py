@@ -49,7 +49,7 @@ if __name__ == "__main__":
 
     release, subset = sys.argv[1:3]
     episodes, steps = (int(value) for value in (*sys.argv[3:], 30, 500)[:2])  # fewer and shorter ones to try it
-    source = dmcvb_gen.open(release)[subset].source(stack=3)
+    source = dmcvb_gen.open(release)[subset].source(stack=3, pictures="agents")
     policy = train(SimpleNamespace(source=source, seed=0))
     task, _, setting = subset.split("/")
     size = source[0]["pixels"].shape[-1]
