@@ -35,6 +35,9 @@ def rollout(
     recipe: str | Path | None = None,
     only: Names = (),
     difficulty: str | None = None,
+    intensity: float | None = None,
+    vary: Names | None = None,
+    video_count: int | None = None,
     goals: Names | None = None,
     fixed_goals: int | None = None,
     episodes_per_goal: int | None = None,
@@ -68,6 +71,8 @@ def rollout(
       tasks, levels, distractors, goals, layouts, only: a name or several.
       out: folder or URL of the release, by default releases/<name>. Without tasks and recipe, that release resumes.
       recipe: a YAML file or the name of a shipped recipe; other arguments narrow or override it.
+      difficulty: easy, medium (the default) or hard; or intensity, the scale of the distractors, above 0 and up to 1.
+      vary: parts that vary, of camera, color and background; all by default. video_count: background videos in use.
       episodes: of each subset, 20 by default; or steps, in agent steps.
       size: width and height of the images, 64 pixels by default.
       behaviour: a policy file, a training run, an SB3 zip, a torch state dict or "module:function".
@@ -86,10 +91,12 @@ def rollout(
     from dmcvb_gen.generate.site import site_of
     from dmcvb_gen.loaders.release import open_for_reading
 
-    several = dict(levels=levels, distractors=distractors, goals=goals, layouts=layouts)
+    several = dict(levels=levels, distractors=distractors, goals=goals, layouts=layouts, vary=vary)
     given: dict[str, Any] = {name: _names(value) for name, value in several.items() if value is not None}
     single = dict(
         difficulty=difficulty,
+        intensity=intensity,
+        video_count=video_count,
         fixed_goals=fixed_goals,
         episodes_per_goal=episodes_per_goal,
         reward=reward,

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import enum
 import fnmatch
+import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
 LOCOMOTION, ANT_MAZE = "locomotion", "ant-maze"
 FAMILIES = (LOCOMOTION, ANT_MAZE)
@@ -70,6 +71,11 @@ DIFFICULTY_SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 DIFFICULTY_VIDEOS = {"easy": 4, "medium": 8, "hard": None}
 """Difficulty -> how many background videos are in play; None: all."""
 DIFFICULTIES = tuple(DIFFICULTY_SCALES)
+SCALED_PARTS = ("camera", "color")
+DISTRACTOR_PARTS = (*SCALED_PARTS, "background")
+"""The parts of DMC-VB's distractors, each of which can vary alone."""
+ALL = "all"
+"""Stands for all background videos where a difficulty gives their number."""
 
 VISIBLE, HIDDEN, FIXED = GOAL_MODES = tuple(mode.value for mode in GoalMode)
 """The stored names of the goal modes."""
@@ -135,7 +141,17 @@ def task_folder(task_id: str) -> str:
 
 @dataclass(frozen=True)
 class Distractor:
-    """A kind of distractor at a difficulty (paper, section 3.1); "medium" is left out of its `name`."""
+    """A kind of distractor at a difficulty (paper, section 3.1); "medium" is left out of its `name`.
+
+    Attributes:
+      kind: "none", "static", "dynamic", or one of a user's own.
+      difficulty: "easy", "medium" or "hard"; or a scale above 0 and up to 1 ("0.35"); or the parts that vary, each
+        with a number of its own if medium's is not meant: "camera0.1-color0.5-background4" (a background's number is
+        how many videos are in play). What amounts to a word is turned into it: "0.2" is "medium".
+
+    Raises:
+      UnknownNameError: there is no such kind or difficulty. DmcvbError: a number is out of range.
+    """
 
     kind: str = "none"
     difficulty: str = "medium"
@@ -143,33 +159,128 @@ class Distractor:
     def __post_init__(self) -> None:
         if self.kind not in DISTRACTOR_KINDS and self.kind not in distractor_kinds():
             raise UnknownNameError("distractor", self.kind, distractor_kinds())
-        if self.difficulty not in DIFFICULTIES:
-            raise UnknownNameError("difficulty", self.difficulty, DIFFICULTIES)
+        object.__setattr__(self, "difficulty", _canonical(self.difficulty))
+        if self.difficulty not in DIFFICULTIES and self.kind == "none":
+            raise DmcvbError(f"distractor none has no difficulty; {self.difficulty} is for static or dynamic")
+        if self.difficulty[0].isalpha() and self.difficulty not in DIFFICULTIES and self.kind not in DISTRACTOR_KINDS:
+            raise DmcvbError(f"distractor {self.kind} has no parts such as {self.difficulty}; give a scale, e.g. 0.35")
 
     @property
     def name(self) -> str:
-        """Its stored name: "none", "static", "dynamic_hard", ..."""
+        """Its stored name: "none", "static", "dynamic_hard", "dynamic_0.35", ..."""
         return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
+
+    def varies(self, part: str) -> bool:
+        """Whether a part ("camera", "color", "background") varies; none of DMC-VB's does under a user's own kind."""
+        return self.kind in DISTRACTOR_KINDS and self.kind != "none" and part in _strengths(self.difficulty)
+
+    def scale_of(self, part: str) -> float:
+        """The scale s of a part's ranges; 0 if it does not vary."""
+        return float(_strengths(self.difficulty)[part] or 0.0) if self.varies(part) else 0.0
 
     @property
     def scale(self) -> float:
-        """The scale s of every range; 0 without distractors."""
-        return 0.0 if self.kind == "none" else DIFFICULTY_SCALES[self.difficulty]
+        """The scale s of all ranges; the largest one if parts have their own, 0 without distractors."""
+        strengths = _strengths(self.difficulty)
+        return 0.0 if self.kind == "none" else max(float(strengths.get(part) or 0.0) for part in SCALED_PARTS)
 
     @property
     def videos(self) -> int | None:
         """Number of background videos in use; None for all."""
-        return DIFFICULTY_VIDEOS[self.difficulty]
+        found = _strengths(self.difficulty).get("background")
+        return None if found is None else int(found)
 
     @classmethod
     def parse(cls, name: str) -> Distractor:
-        """The distractor of a name such as "dynamic", "dynamic_medium" or "static_easy".
+        """The distractor of a name such as "dynamic", "dynamic_medium", "static_easy" or "dynamic_0.35".
 
         Raises:
-          UnknownNameError: there is no such kind or difficulty.
+          UnknownNameError: there is no such kind or difficulty. DmcvbError: a number is out of range.
         """
         kind, _, difficulty = name.partition("_")
         return cls(kind, difficulty or "medium")
+
+
+def difficulty_of(intensity: float | None, parts: Sequence[str] = (), videos: int | None = None) -> str:
+    """The difficulty of an intensity, of the parts that vary (all by default) and of a number of videos.
+
+    Raises:
+      UnknownNameError: there is no such part. DmcvbError: a number is out of range.
+    """
+    for part in parts:
+        if part not in DISTRACTOR_PARTS:
+            raise UnknownNameError("part of a distractor", part, DISTRACTOR_PARTS)
+    scale = DIFFICULTY_SCALES["medium"] if intensity is None else intensity
+    if not parts and videos is None:
+        return _canonical(_number(scale))
+    count = _videos_at(scale) if videos is None else videos
+    numbers = {"camera": _number(scale), "color": _number(scale), "background": ALL if count is None else str(count)}
+    return _canonical("-".join(f"{part}{numbers[part]}" for part in parts or DISTRACTOR_PARTS))
+
+
+def _number(value: float) -> str:
+    return f"{value:.3f}".rstrip("0").rstrip(".")
+
+
+def _videos_at(scale: float) -> int | None:
+    """How many videos are in play at a scale: as many as at the next word above it."""
+    return next((DIFFICULTY_VIDEOS[word] for word, top in DIFFICULTY_SCALES.items() if scale <= top), None)
+
+
+@functools.cache
+def _strengths(difficulty: str) -> dict[str, float | None]:
+    """Part -> its scale; of the background the number of videos, None for all."""
+    if difficulty in DIFFICULTIES:
+        scale = DIFFICULTY_SCALES[difficulty]
+        return {"camera": scale, "color": scale, "background": DIFFICULTY_VIDEOS[difficulty]}
+    if difficulty[:1].isdigit() or difficulty[:1] in ".-":
+        scale = _in_range(difficulty, difficulty)
+        return {"camera": scale, "color": scale, "background": _videos_at(scale)}
+    found: dict[str, float | None] = {}
+    for word in difficulty.split("-"):
+        part = next((part for part in DISTRACTOR_PARTS if word.startswith(part)), "")
+        number = word[len(part) :]
+        if not part or part in found:
+            raise UnknownNameError("difficulty", difficulty, DIFFICULTIES)
+        if part == "background":
+            if number not in ("", ALL) and not (number.isdigit() and int(number)):
+                raise DmcvbError(
+                    f"distractor part {word!r}: give a number of videos, e.g. background4, or background{ALL}"
+                )
+            found[part] = None if number == ALL else int(number or DIFFICULTY_VIDEOS["medium"] or 0)
+        else:
+            found[part] = _in_range(number, word) if number else DIFFICULTY_SCALES["medium"]
+    return found
+
+
+def _in_range(number: str, told: str) -> float:
+    try:
+        value = round(float(number), 3)
+    except ValueError:
+        raise UnknownNameError("difficulty", told, DIFFICULTIES) from None
+    if not 0 < value <= 1:
+        raise DmcvbError(
+            f"distractor scale {told!r} is not above 0 and up to 1; without distractors is the setting none"
+        )
+    return value
+
+
+@functools.cache
+def _canonical(difficulty: str) -> str:
+    """The one spelling of a difficulty: a word if there is one, else a scale, else its parts in their order."""
+    strengths = _strengths(difficulty)
+    scales = [strengths.get(part) for part in SCALED_PARTS]
+    if len(strengths) == len(DISTRACTOR_PARTS) and scales[0] == scales[1] and scales[0] is not None:
+        words = [word for word in DIFFICULTIES if _strengths(word) == strengths]
+        if words:
+            return words[0]
+        if strengths["background"] == _videos_at(scales[0]):
+            return _number(scales[0])
+    numbers = {part: _number(value) for part, value in strengths.items() if part in SCALED_PARTS and value}
+    if "background" in strengths:
+        count = strengths["background"]
+        numbers["background"] = ALL if count is None else str(int(count))
+    return "-".join(f"{part}{numbers[part]}" for part in DISTRACTOR_PARTS if part in numbers)
 
 
 def distractor_kinds() -> tuple[str, ...]:
@@ -241,7 +352,7 @@ class SubsetSpec:
     @property
     def camera_moves(self) -> bool:
         """Whether the camera moves: it follows the ant in mazes, and wanders in dynamic distractors."""
-        return self.goal is not None or self.distractor.kind == "dynamic"
+        return self.goal is not None or (self.distractor.kind == "dynamic" and self.distractor.varies("camera"))
 
 
 def subset_name(task_id: str, level: str, setting: str) -> str:

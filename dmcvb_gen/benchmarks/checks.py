@@ -25,7 +25,7 @@ from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_ord
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.spec import FIXED
+from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, Distractor
 from dmcvb_gen.tasks import get_task
 
 STANDARD_ERRORS = 4.0
@@ -110,35 +110,38 @@ def check_labels(subset: Subset) -> Iterator[Issue]:
     """The distractors' labels are what the setting's name says; imported data have none."""
     if subset.record.imported:
         return
-    task, kind = get_task(subset.task), subset.record.distractor.kind
+    task, setting = get_task(subset.task), subset.record.distractor
     looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]
     own = task.material_colors.astype(np.float32)
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
     for episode in map(int, subset.episodes):
         video, frame, color, style = subset.episode(episode, names).values()
         problems = [(~np.isin(style, looks) | (style != style[0]), "the maze's look is not one of its data's")]
-        problems += _label_problems(kind, own, video, frame, color)
+        problems += _label_problems(setting, own, video, frame, color)
         for bad, message in problems:
             if bad.any():
                 yield Issue("labels", subset.name, message, episode, int(bad.argmax()))
-    if (kind == "none") != (subset.record.backgrounds is None):
+    if (setting.kind == "none") != (subset.record.backgrounds is None):
         yield Issue("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
 
 
-def _label_problems(kind: str, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray):
-    """((step,) bool where it is wrong, what is) of one episode of a kind of distractor.
+def _label_problems(setting: Distractor, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray):
+    """((step,) bool where it is wrong, what is) of one episode of a setting.
 
     Args:
       own: (material, 3), the model's colors.
       video, frame: (step,). color: (step, material, 3).
     """
-    if kind == "none":
-        return [
-            ((video != -1) | (frame != -1), "a background is named, the setting has none"),
-            (np.abs(color - own).max(axis=(1, 2)) > 1e-6, "a material has another color, the setting has none"),
-        ]
-    problems = [((video < 0) | (video != video[0]), "the background is not one video throughout")]
-    if kind == "static":
+    if setting.kind not in DISTRACTOR_KINDS:
+        return []  # what a user's own kind draws is its author's to say
+    problems: list[tuple[np.ndarray, str]] = []
+    if not setting.varies("color"):
+        changed = np.abs(color - own).max(axis=(1, 2)) > 1e-6
+        problems += [(changed, "a material has another color, the setting has none")]
+    if not setting.varies("background"):
+        return [*problems, ((video != -1) | (frame != -1), "a background is named, the setting has none")]
+    problems += [((video < 0) | (video != video[0]), "the background is not one video throughout")]
+    if setting.kind == "static":
         return problems + [
             (frame != frame[0], "the background moves in a static setting"),
             ((color != color[0]).any(axis=(1, 2)), "colors change in a static setting"),

@@ -36,7 +36,8 @@ def _out_default(name: str) -> str:
 
 
 OPTION_GROUPS = {
-    "What": ("recipe", "only", "levels", "distractors", "difficulty", "behaviour", "sample", "independent", "seed"),
+    "What": ("recipe", "only", "levels", "behaviour", "sample", "independent", "seed"),
+    "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count"),
     "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
     "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "no_pixels"),
@@ -55,7 +56,7 @@ OPTION_GROUPS = {
     "--only", multiple=True, metavar="PATTERN", help="Roll out only these subsets, e.g. 'walker-walk/*/static'."
 )
 @click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
-@click.option("--distractor", "distractors", multiple=True, help="none, static, dynamic. Repeatable.  [default: none]")
+@click.option("--distractor", "distractors", multiple=True, help="none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. Repeatable.  [default: none]")
 @click.option(
     "--difficulty",
     type=click.Choice(DIFFICULTIES),
@@ -63,6 +64,15 @@ OPTION_GROUPS = {
     show_default=True,
     help="Strength of the distractors.",
 )
+@click.option(
+    "--intensity",
+    type=click.FloatRange(0, 1, min_open=True),
+    help="Scale of the distractors instead of a difficulty: easy is 0.1, medium 0.2, hard 0.3.",
+)
+@click.option(
+    "--vary", metavar="PART,...", help="Vary only these parts: camera, color, background.  [default: all three]"
+)
+@click.option("--video-count", type=click.IntRange(1), help="Background videos in use.  [default: by the difficulty]")
 @click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
 @click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
 @click.option(
@@ -160,6 +170,8 @@ def rollout(
     check_exclusive_options(context)
     executor = make_executor(workers, options["executor"], options["ray_address"])
     given = {name: context.params[name] for name in RECIPE_OPTIONS & given_options(context)}
+    if "vary" in given:
+        given["vary"] = [part.strip() for part in given["vary"].split(",")]
     resuming = bool(out) and not (options["tasks"] or options["layouts"] or options["recipe"] or given)
     chosen = None if resuming else make_request(options["tasks"], options["recipe"], device=device, **given)
     if options["slurm_script"]:

@@ -78,6 +78,6 @@ class DistractorPart(abc.ABC):
 def floor_alpha_for(task: Task, setting: Distractor) -> float:
     """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
 
-    Walker and cheetah 1.0, reacher 0.0, otherwise 0.3 (Distracting Control Suite); untouched without distractors.
+    Walker and cheetah 1.0, reacher 0.0, otherwise 0.3 (Distracting Control Suite); untouched if no background is shown.
     """
-    return 1.0 if setting.kind == "none" else task.floor_alpha
+    return task.floor_alpha if setting.varies("background") or setting.kind not in KINDS else 1.0

@@ -58,7 +58,8 @@ def camera_range(offset: np.ndarray, setting: Distractor) -> CameraRange:
       offset: (3,) nominal camera minus centre of mass, meters.
     """
     radius, polar, azimuth = spherical(offset)
-    scale, angle = setting.scale, ANGLE_RANGE * setting.scale
+    scale = setting.scale_of("camera")
+    angle = ANGLE_RANGE * scale
     low = np.array([radius * (1 - RADIUS_RANGE[0] * scale), max(polar - angle, 0.0), max(azimuth - angle, -np.pi)])
     high = np.array([radius * (1 + RADIUS_RANGE[1] * scale), min(polar + angle, np.pi / 2), min(azimuth + angle, 0.0)])
     return CameraRange(low, high, float(radius), angle)
@@ -85,7 +86,8 @@ def camera_walk(
     offsets[:], rolls[:] = cartesian(place)[:, None], roll[:, None]
     if setting.kind != "dynamic":
         return offsets, rolls
-    unit, limit = setting.scale * bounds.nominal_radius / 4, MAX_ROLL_SPEED * setting.scale
+    scale = setting.scale_of("camera")
+    unit, limit = scale * bounds.nominal_radius / 4, MAX_ROLL_SPEED * scale
     heading = np.stack([arithmetic.normal(rng, (3,)) for rng in generators])
     share = np.stack([rng.random(2) for rng in generators])  # of the top speeds
     velocity = heading / arithmetic.norm(heading, axis=1, keepdims=True) * share[:, :1] * MAX_SPEED * unit
@@ -99,7 +101,7 @@ def camera_walk(
         velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(speed, 1e-12))
         reached = cartesian(_clip(spherical(position + velocity), bounds))
         position, velocity = reached, reached - position  # a limit takes the speed towards it
-        roll_velocity = np.clip(roll_velocity + ROLL_VELOCITY_STD * setting.scale * noise[tick, :, 3], -limit, limit)
+        roll_velocity = np.clip(roll_velocity + ROLL_VELOCITY_STD * scale * noise[tick, :, 3], -limit, limit)
         rolled = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
         roll, roll_velocity = rolled, rolled - roll
         if (tick + 1) % ACTION_REPEAT == 0:

@@ -26,7 +26,8 @@ def color_walk(
     Returns:
       (episode, frame, material, 3) in [0, 1], never farther than s from the model's own.
     """
-    low, high = np.clip(own - setting.scale, 0, 1), np.clip(own + setting.scale, 0, 1)
+    scale = setting.scale_of("color")
+    low, high = np.clip(own - scale, 0, 1), np.clip(own + scale, 0, 1)
     start = np.stack([rng.random(own.shape) for rng in generators])
     color = low + start * (high - low)  # uniform in what is left of the range inside [0, 1]
     out = np.empty((len(generators), frames, *own.shape))
@@ -36,7 +37,7 @@ def color_walk(
     ticks = ACTION_REPEAT * (frames - 1)
     noise = np.stack([arithmetic.normal(rng, (ticks, *own.shape)) for rng in generators], axis=1)
     for tick in range(ticks):
-        color = np.clip(color + STEP_STD * setting.scale * noise[tick], low, high)
+        color = np.clip(color + STEP_STD * scale * noise[tick], low, high)
         if (tick + 1) % ACTION_REPEAT == 0:
             out[:, (tick + 1) // ACTION_REPEAT] = color
     return out

@@ -49,5 +49,7 @@ def distractors_of(setting: Distractor) -> tuple[type[DistractorPart], ...]:
             distractor = point.load()
             if setting.kind not in _registered:  # the class may have registered itself on import
                 register_distractor(distractor)
-    own = tuple(distractor for distractor in BUILT_IN if setting.kind in distractor.kinds or not distractor.kinds)
+    own = tuple(
+        part for part in BUILT_IN if not part.kinds or (setting.kind in part.kinds and setting.varies(part.stream))
+    )
     return own + _registered.get(setting.kind, ())

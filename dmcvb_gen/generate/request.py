@@ -13,7 +13,7 @@ from typing import Any
 from dmcvb_gen.errors import RecipeError
 from dmcvb_gen.generate.recipe import Recipe, check_heard, load_recipe, narrow, override, single_recipe
 from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
-from dmcvb_gen.spec import FIXED, Distractor, MazeName, is_maze, task_folder
+from dmcvb_gen.spec import DIFFICULTY_SCALES, FIXED, Distractor, MazeName, difficulty_of, is_maze, task_folder
 
 EPISODES = 20
 """Episodes of a subset if nobody says how many."""
@@ -23,7 +23,12 @@ _NOT_WITH_RECIPE = {
     "layouts": "--layout: name the maze by its TASK",
     "reward": "--reward: ask for 'ant-maze-...@geodesic' in the recipe",
     "difficulty": "--difficulty: ask for --distractor dynamic_hard",
+    "intensity": "--intensity: ask for --distractor dynamic_0.35",
+    "vary": "--vary: ask for --distractor dynamic_camera-color",
+    "video_count": "--video-count: ask for --distractor dynamic_camera-color-background4",
 }
+_STRENGTHS = ("difficulty", "intensity", "vary", "video_count")
+"""Options that say how strong distractors are, and which of their parts vary."""
 RECIPE_OPTIONS = _OVERRIDES | set(_NOT_WITH_RECIPE)
 RECIPE_OPTIONS |= {"levels", "distractors", "goals", "sample", "renderer", "samples", "backgrounds", "behaviour"}
 RECIPE_OPTIONS |= {"independent"}
@@ -128,8 +133,10 @@ def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Reci
     if is_maze(tasks[0]):
         settings = tuple(dict.fromkeys([*goals, *([FIXED] if given.get("fixed_goals") else [])]))
     else:
-        difficulty = given.get("difficulty", "medium")
-        settings = tuple(name if "_" in name else Distractor(name, difficulty).name for name in distractors)
+        difficulty = _difficulty(given)
+        settings = tuple(
+            name if "_" in name or name == "none" else Distractor(name, difficulty).name for name in distractors
+        )
     subset_fields = {name: given.get(name) for name in ("steps", "episodes_per_shard", "max_steps")}
     subset_fields["episodes"] = given.get("episodes") or (None if given.get("steps") else EPISODES)
     subset_fields["deterministic"] = not given.get("sample")
@@ -146,6 +153,17 @@ def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Reci
         **{name: given[name] for name in ("seed", "size", "split") if name in given},
         **_sources(given),
     )
+
+
+def _difficulty(given: Mapping[str, Any]) -> str:
+    """The difficulty that the options of `_STRENGTHS` come to."""
+    word, intensity = given.get("difficulty"), given.get("intensity")
+    if word and intensity is not None:
+        raise RecipeError("give --difficulty or --intensity, not both")
+    if "video_count" in given and given.get("vary") and "background" not in given["vary"]:
+        raise RecipeError("--video-count has no effect if --vary leaves the background out: remove it")
+    scale = DIFFICULTY_SCALES[word] if word else intensity
+    return difficulty_of(scale, given.get("vary") or (), given.get("video_count"))
 
 
 def _layout_task(layout: str | Path) -> str:
@@ -172,15 +190,19 @@ def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
     for name, flag in (("episodes_per_goal", "--episodes-per-goal"), ("reward", "--reward")):
         if name in given:
             raise RecipeError(f"{flag} has no effect outside mazes: remove it")
-    if "difficulty" in given and all("_" in name or name == "none" for name in given.get("distractors", ())):
-        raise RecipeError("--difficulty is for --distractor static or dynamic without one of their own; give one")
+    for name in _STRENGTHS:
+        if name in given and all("_" in kind or kind == "none" for kind in given.get("distractors", ())):
+            flag = f"--{name.replace('_', '-')}"
+            raise RecipeError(f"{flag} is for --distractor static or dynamic without one of their own; give one")
 
 
 def _check_given_to_mazes(given: Mapping[str, Any]) -> None:
     if given.get("distractors"):
         raise RecipeError("--distractor has no effect in mazes, which vary in style: use --goal visible|hidden")
-    if "difficulty" in given:
-        raise RecipeError("--difficulty has no effect in mazes, which have no distractors: remove it")
+    for name in _STRENGTHS:
+        if name in given:
+            flag = f"--{name.replace('_', '-')}"
+            raise RecipeError(f"{flag} has no effect in mazes, which have no distractors: remove it")
     goals: Collection[str] = given.get("goals", ())
     fixed = bool(given.get("fixed_goals")) or FIXED in goals
     if "episodes_per_goal" in given and not fixed:

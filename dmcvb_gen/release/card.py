@@ -311,17 +311,20 @@ def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
             words = "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in distractors_of(setting) if d.kinds)
             rows.append((name, f"s = {setting.scale:g}; {words}", "", "", ""))
             continue
-        s, moving = setting.scale, setting.kind == "dynamic"
+        s, moving = setting.scale_of("camera"), setting.kind == "dynamic"
         low, high = 1 - camera.RADIUS_RANGE[0] * s, 1 + camera.RADIUS_RANGE[1] * s
         place = (
             f"angles and roll +-{np.degrees(camera.ANGLE_RANGE * s):.0f} degrees, distance x {low:.2f} to {high:.2f}"
         )
         if moving:
             place += f"; speed walk std {camera.VELOCITY_STD * s:.3g}, at most {camera.MAX_SPEED * s:.3g} a tick"
-        paint = f"+-{s:g} a channel" + (f"; walk std {color.STEP_STD * s:.3g} a tick" if moving else "")
+        tint = setting.scale_of("color")
+        paint = f"+-{tint:g} a channel" + (f"; walk std {color.STEP_STD * tint:.3g} a tick" if moving else "")
         videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
         sky = f"{videos}; " + (f"a frame every {background.TICKS_A_FRAME} ticks" if moving else "one frame an episode")
-        rows.append((name, f"s = {s:g}", place, paint, sky))
+        shown = {"camera": place, "color": paint, "background": sky}
+        cells = [text if setting.varies(part) else "the model's own" for part, text in shown.items()]
+        rows.append((name, f"s = {setting.scale:g}", *cells))
     return rows
 
 

@@ -1,0 +1,127 @@
+"""The dial of distractors: names, what varies at which strength, and whole releases of it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.loaders.envs import DistractedEnv
+from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, Distractor, difficulty_of
+from dmcvb_gen.tasks import get_task
+from tests.test_distractors import labels, physics_of
+from tests.test_whole_way import run
+
+SCALES = st.integers(1, 1000).map(lambda thousandths: thousandths / 1000)
+
+
+@given(SCALES, st.lists(st.sampled_from(DISTRACTOR_PARTS), unique=True), st.none() | st.integers(1, 40))
+def test_a_name_says_all_and_has_one_spelling(scale, parts, videos):
+    setting = Distractor("dynamic", difficulty_of(scale, parts, videos))
+    assert Distractor.parse(setting.name) == setting
+    for part in DISTRACTOR_PARTS:
+        assert setting.varies(part) == (part in parts or not parts)
+    for part in ("camera", "color"):
+        assert setting.scale_of(part) == (scale if setting.varies(part) else 0)
+    if setting.varies("background") and videos:
+        assert setting.videos == videos
+
+
+def test_words_are_points_on_the_dial():
+    for word, scale in (("easy", 0.1), ("medium", 0.2), ("hard", 0.3)):
+        assert difficulty_of(scale) == word and Distractor.parse(f"static_{scale}") == Distractor("static", word)
+        assert Distractor("static", word).scale_of("camera") == Distractor("static", word).scale == scale
+    assert Distractor.parse("dynamic_camera0.2-color0.2-background8").name == "dynamic"
+    assert [Distractor("dynamic", text).videos for text in ("0.05", "0.15", "0.25", "0.9")] == [4, 8, None, None]
+
+
+@pytest.mark.parametrize(
+    "difficulty", ["0", "1.01", "nan", "-0.1", "camera2", "camera0", "background0", "background1.5", "0.0001"]
+)
+def test_numbers_out_of_range_are_refused(difficulty):
+    with pytest.raises(DmcvbError):
+        Distractor("dynamic", difficulty)
+
+
+@pytest.mark.parametrize("difficulty", ["harsh", "camera-camera", "sky0.1", "camera-", "0.1-color", ""])
+def test_other_words_are_refused_with_those_there_are(difficulty):
+    with pytest.raises(UnknownNameError, match="easy"):
+        Distractor("dynamic", difficulty)
+
+
+@pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "cartpole-swingup"])
+def test_only_the_parts_that_are_named_vary_and_by_their_own_scale(task_id):
+    task = get_task(task_id)
+    physics = physics_of(task)
+    plain, whole = labels(task, "none", physics), labels(task, "dynamic_0.5", physics)
+    half = labels(task, "dynamic_camera0.5-color0.05", physics)
+    np.testing.assert_array_equal(half.camera_position, whole.camera_position)  # of the same streams
+    np.testing.assert_array_equal(half.background_video, plain.background_video)
+    own = task.material_colors
+    assert np.abs(half.material_rgb - own).max() <= 0.05 + 1e-6 < np.abs(whole.material_rgb - own).max()
+    sky = labels(task, "dynamic_background", physics)
+    np.testing.assert_array_equal(sky.camera_quaternion, plain.camera_quaternion)
+    np.testing.assert_array_equal(sky.material_rgb, plain.material_rgb)
+    assert (sky.background_video >= 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "cartpole-swingup"])
+def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
+    folder = tmp_path / "release"
+    short = ["--level", "random", "--episodes", 2, "--max-steps", 4, "--size", 16, "--out", folder]
+    run("rollout", task_id, *short, "--distractor", "static", "--intensity", 0.35)
+    dial = ["--intensity", 0.5, "--vary", "camera,background", "--video-count", 3]
+    run("rollout", task_id, *short, "--distractor", "dynamic", *dial)
+    names = [f"{task_id}/random/static_0.35", f"{task_id}/random/dynamic_camera0.5-background3"]
+    assert list(open_release(folder).subsets) == names
+    assert json.loads(run("verify", folder, "--json"))["sound"]
+    assert "same digest" in run("regenerate", folder, "--check")
+    few = ["--profile", "smoke", "--agents", "state-bc,bc", "--workers", 1, "--out", tmp_path / "report"]
+    run("validate", folder, *few)
+    assert json.loads((tmp_path / "report" / "report.json").read_text())["structure"]["sound"]
+    run("card", folder)
+    card = (folder / "README.md").read_text()
+    assert "the model's own" in card and "up to 3 videos" in card and "s = 0.35" in card
+    run("repaint", folder, "--only", names[0], "--distractor", "dynamic_color0.9", "--out", tmp_path / "repainted")
+    [again] = open_release(tmp_path / "repainted").subsets.values()
+    assert again.setting == "dynamic_color0.9" and (again.episode(0)["exogenous/background_video"] == -1).all()
+    env = DistractedEnv(task_id, "dynamic_background2", size=16)
+    env.reset(seed=0)
+    env.close()
+    size = get_task(task_id).action_size
+    score = dmcvb_gen.evaluate(
+        lambda seen: np.zeros((2, size)), f"{task_id}/static_0.35", episodes=2, max_steps=2, size=16
+    )
+    assert len(score.returns) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["walker-walk", "--distractor", "dynamic", "--intensity", "0.5", "--difficulty", "hard"], "not both"),
+        (["walker-walk", "--intensity", "0.5"], "--intensity is for --distractor static or dynamic"),
+        (["walker-walk", "--distractor", "dynamic_0.2", "--vary", "camera"], "--vary is for"),
+        (["walker-walk", "--distractor", "dynamic", "--vary", "sky"], "part of a distractor 'sky'"),
+        (["walker-walk", "--distractor", "dynamic", "--vary", "color", "--video-count", "2"], "--video-count has no"),
+        (["ant-maze-empty7x7", "--video-count", "2"], "--video-count has no effect in mazes"),
+        (["--recipe", "quickstart", "--intensity", "0.5"], "ask for --distractor dynamic_0.35 instead"),
+        (["walker-walk", "--distractor", "dynamic_2"], "is not above 0 and up to 1"),
+    ],
+)
+def test_what_has_no_effect_or_sense_is_one_line(options, message, tmp_path):
+    done = CliRunner().invoke(main, ["rollout", *options, "--out", str(tmp_path / "r")])
+    assert done.exit_code == 2 and message in done.output and "Traceback" not in done.output
+    assert not (tmp_path / "r").exists()
+
+
+def test_all_words_are_known_to_the_dial():
+    assert set(DIFFICULTIES) == {difficulty_of(scale) for scale in (0.1, 0.2, 0.3)}
