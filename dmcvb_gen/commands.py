@@ -38,6 +38,7 @@ def rollout(
     intensity: float | None = None,
     vary: Names | None = None,
     video_count: int | None = None,
+    correlated: float | None = None,
     goals: Names | None = None,
     fixed_goals: int | None = None,
     episodes_per_goal: int | None = None,
@@ -73,6 +74,7 @@ def rollout(
       recipe: a YAML file or the name of a shipped recipe; other arguments narrow or override it.
       difficulty: easy, medium (the default) or hard; or intensity, the scale of the distractors, above 0 and up to 1.
       vary: parts that vary, of camera, color and background; all by default. video_count: background videos in use.
+      correlated: above 0 and up to 1: a spurious cue in the colors that correlates so with the last action.
       episodes: of each subset, 20 by default; or steps, in agent steps.
       size: width and height of the images, 64 pixels by default.
       behaviour: a policy file, a training run, an SB3 zip, a torch state dict or "module:function".
@@ -97,6 +99,7 @@ def rollout(
         difficulty=difficulty,
         intensity=intensity,
         video_count=video_count,
+        correlated=correlated,
         fixed_goals=fixed_goals,
         episodes_per_goal=episodes_per_goal,
         reward=reward,

@@ -74,6 +74,8 @@ DIFFICULTIES = tuple(DIFFICULTY_SCALES)
 SCALED_PARTS = ("camera", "color")
 DISTRACTOR_PARTS = (*SCALED_PARTS, "background")
 """The parts of DMC-VB's distractors, each of which can vary alone."""
+CUE = "cue"
+"""A part besides, whose number is its correlation with the action before a frame; see `distractors.cue`."""
 ALL = "all"
 """Stands for all background videos where a difficulty gives their number."""
 
@@ -147,7 +149,8 @@ class Distractor:
       kind: "none", "static", "dynamic", or one of a user's own.
       difficulty: "easy", "medium" or "hard"; or a scale above 0 and up to 1 ("0.35"); or the parts that vary, each
         with a number of its own if medium's is not meant: "camera0.1-color0.5-background4" (a background's number is
-        how many videos are in play). What amounts to a word is turned into it: "0.2" is "medium".
+        how many videos are in play). "cue0.8" among them is a spurious cue in the colors, of dynamic distractors, that
+        correlates with the action before a frame by 0.8. What amounts to a word is turned into it: "0.2" is "medium".
 
     Raises:
       UnknownNameError: there is no such kind or difficulty. DmcvbError: a number is out of range.
@@ -165,17 +168,20 @@ class Distractor:
         if self.difficulty[0].isalpha() and self.difficulty not in DIFFICULTIES and self.kind not in DISTRACTOR_KINDS:
             raise DmcvbError(f"distractor {self.kind} has no parts such as {self.difficulty}; give a scale, e.g. 0.35")
 
+        if self.kind != "dynamic" and CUE in _strengths(self.difficulty):
+            raise DmcvbError(f"distractor {self.kind} shows no cue of the actions; ask for dynamic_{self.difficulty}")
+
     @property
     def name(self) -> str:
         """Its stored name: "none", "static", "dynamic_hard", "dynamic_0.35", ..."""
         return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
 
     def varies(self, part: str) -> bool:
-        """Whether a part ("camera", "color", "background") varies; none of DMC-VB's does under a user's own kind."""
+        """Whether a part ("camera", "color", "background", "cue") varies; none does under a user's own kind."""
         return self.kind in DISTRACTOR_KINDS and self.kind != "none" and part in _strengths(self.difficulty)
 
     def scale_of(self, part: str) -> float:
-        """The scale s of a part's ranges; 0 if it does not vary."""
+        """The scale s of a part's ranges, or the correlation of a cue; 0 if it does not vary."""
         return float(_strengths(self.difficulty)[part] or 0.0) if self.varies(part) else 0.0
 
     @property
@@ -201,8 +207,11 @@ class Distractor:
         return cls(kind, difficulty or "medium")
 
 
-def difficulty_of(intensity: float | None, parts: Sequence[str] = (), videos: int | None = None) -> str:
-    """The difficulty of an intensity, of the parts that vary (all by default) and of a number of videos.
+def difficulty_of(
+    intensity: float | None, parts: Sequence[str] = (), videos: int | None = None, cue: float | None = None
+) -> str:
+    """The difficulty of an intensity, of the parts that vary (all by default), of a number of videos and of a cue's
+    correlation.
 
     Raises:
       UnknownNameError: there is no such part. DmcvbError: a number is out of range.
@@ -211,11 +220,12 @@ def difficulty_of(intensity: float | None, parts: Sequence[str] = (), videos: in
         if part not in DISTRACTOR_PARTS:
             raise UnknownNameError("part of a distractor", part, DISTRACTOR_PARTS)
     scale = DIFFICULTY_SCALES["medium"] if intensity is None else intensity
-    if not parts and videos is None:
+    if not parts and videos is None and cue is None:
         return _canonical(_number(scale))
     count = _videos_at(scale) if videos is None else videos
     numbers = {"camera": _number(scale), "color": _number(scale), "background": ALL if count is None else str(count)}
-    return _canonical("-".join(f"{part}{numbers[part]}" for part in parts or DISTRACTOR_PARTS))
+    words = [f"{part}{numbers[part]}" for part in parts or DISTRACTOR_PARTS]
+    return _canonical("-".join(words + ([f"{CUE}{_number(cue)}"] if cue is not None else [])))
 
 
 def _number(value: float) -> str:
@@ -238,9 +248,9 @@ def _strengths(difficulty: str) -> dict[str, float | None]:
         return {"camera": scale, "color": scale, "background": _videos_at(scale)}
     found: dict[str, float | None] = {}
     for word in difficulty.split("-"):
-        part = next((part for part in DISTRACTOR_PARTS if word.startswith(part)), "")
+        part = next((part for part in (*DISTRACTOR_PARTS, CUE) if word.startswith(part)), "")
         number = word[len(part) :]
-        if not part or part in found:
+        if not part or part in found or word == CUE:
             raise UnknownNameError("difficulty", difficulty, DIFFICULTIES)
         if part == "background":
             if number not in ("", ALL) and not (number.isdigit() and int(number)):
@@ -270,17 +280,17 @@ def _canonical(difficulty: str) -> str:
     """The one spelling of a difficulty: a word if there is one, else a scale, else its parts in their order."""
     strengths = _strengths(difficulty)
     scales = [strengths.get(part) for part in SCALED_PARTS]
-    if len(strengths) == len(DISTRACTOR_PARTS) and scales[0] == scales[1] and scales[0] is not None:
+    if set(strengths) == set(DISTRACTOR_PARTS) and scales[0] == scales[1] and scales[0] is not None:
         words = [word for word in DIFFICULTIES if _strengths(word) == strengths]
         if words:
             return words[0]
         if strengths["background"] == _videos_at(scales[0]):
             return _number(scales[0])
-    numbers = {part: _number(value) for part, value in strengths.items() if part in SCALED_PARTS and value}
+    numbers = {part: _number(value) for part, value in strengths.items() if part != "background" and value}
     if "background" in strengths:
         count = strengths["background"]
         numbers["background"] = ALL if count is None else str(int(count))
-    return "-".join(f"{part}{numbers[part]}" for part in DISTRACTOR_PARTS if part in numbers)
+    return "-".join(f"{part}{numbers[part]}" for part in (*DISTRACTOR_PARTS, CUE) if part in numbers)
 
 
 def distractor_kinds() -> tuple[str, ...]:

@@ -17,15 +17,19 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, Distractor, difficulty_of
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.cameras import seen_materials
 from tests.test_distractors import labels, physics_of
 from tests.test_whole_way import run
 
 SCALES = st.integers(1, 1000).map(lambda thousandths: thousandths / 1000)
 
 
-@given(SCALES, st.lists(st.sampled_from(DISTRACTOR_PARTS), unique=True), st.none() | st.integers(1, 40))
-def test_a_name_says_all_and_has_one_spelling(scale, parts, videos):
-    setting = Distractor("dynamic", difficulty_of(scale, parts, videos))
+@given(
+    SCALES, st.lists(st.sampled_from(DISTRACTOR_PARTS), unique=True), st.none() | st.integers(1, 40), st.none() | SCALES
+)
+def test_a_name_says_all_and_has_one_spelling(scale, parts, videos, rho):
+    setting = Distractor("dynamic", difficulty_of(scale, parts, videos, rho))
+    assert setting.scale_of("cue") == (rho or 0)
     assert Distractor.parse(setting.name) == setting
     for part in DISTRACTOR_PARTS:
         assert setting.varies(part) == (part in parts or not parts)
@@ -114,6 +118,8 @@ def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
         (["walker-walk", "--distractor", "dynamic", "--vary", "color", "--video-count", "2"], "--video-count has no"),
         (["ant-maze-empty7x7", "--video-count", "2"], "--video-count has no effect in mazes"),
         (["--recipe", "quickstart", "--intensity", "0.5"], "ask for --distractor dynamic_0.35 instead"),
+        (["walker-walk", "--distractor", "static", "--correlated", "0.5"], "shows no cue of the actions"),
+        (["walker-walk", "--distractor", "dynamic", "--correlated", "1.5"], "not in the range"),
         (["walker-walk", "--distractor", "dynamic_2"], "is not above 0 and up to 1"),
     ],
 )
@@ -121,6 +127,74 @@ def test_what_has_no_effect_or_sense_is_one_line(options, message, tmp_path):
     done = CliRunner().invoke(main, ["rollout", *options, "--out", str(tmp_path / "r")])
     assert done.exit_code == 2 and message in done.output and "Traceback" not in done.output
     assert not (tmp_path / "r").exists()
+
+
+# -- a spurious cue -------------------------------------------------------------------------------
+
+
+def cue_and_action(subset):
+    """Shade (+1 lighter) of each frame and the sign of the action before it, over all episodes."""
+    own, found = get_task(subset.task).material_colors, []
+    seen = seen_materials(get_task(subset.task).model)
+    for index in map(int, subset.episodes):
+        values = subset.episode(index, ["exogenous/material_rgb", "action"])
+        shade = (values["exogenous/material_rgb"][1:] - own)[:, seen].mean(axis=(1, 2))
+        found.append(np.stack([np.sign(shade), np.sign(values["action"][: len(shade), 0])]))
+    return np.concatenate(found, axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task_id", ["walker-walk", "cartpole-swingup"])
+@pytest.mark.parametrize("rho", [0.3, 0.9])
+def test_the_cue_in_the_data_correlates_with_the_action_as_asked(task_id, rho, tmp_path):
+    folder = tmp_path / "r"
+    words = ["--level", "random", "--episodes", 20, "--max-steps", 100, "--no-pixels", "--out", folder]
+    run("rollout", task_id, *words, "--distractor", f"dynamic_cue{rho}")
+    [subset] = open_release(folder).subsets.values()
+    cue, action = cue_and_action(subset)
+    assert len(cue) == 2000 and set(np.unique(cue)) == {-1.0, 1.0}
+    assert abs(np.corrcoef(cue, action)[0, 1] - rho) < 4 / np.sqrt(2000)
+    assert json.loads(run("verify", folder, "--json"))["sound"]
+    assert "same digest" in run("regenerate", folder, "--check")
+
+
+@pytest.mark.slow
+def test_a_cue_stands_beside_all_other_distractors_in_every_command(tmp_path):
+    folder = tmp_path / "r"
+    words = ["--level", "random", "--episodes", 2, "--max-steps", 6, "--size", 16, "--no-pixels", "--out", folder]
+    run("rollout", "walker-walk", "--distractor", "dynamic", "--correlated", 0.8, *words)
+    [subset] = open_release(folder).subsets.values()
+    assert subset.setting == "dynamic_camera0.2-color0.2-background8-cue0.8"
+    run("paint", folder)
+    assert json.loads(run("verify", folder, "--json"))["sound"]
+    few = ["--profile", "smoke", "--agents", "bc", "--workers", 1, "--out", tmp_path / "report"]
+    run("validate", folder, *few)
+    assert json.loads((tmp_path / "report" / "report.json").read_text())["structure"]["sound"]
+    run("card", folder)
+    assert "(correlation 0.8)" in (folder / "README.md").read_text()
+    run("repaint", folder, "--distractor", "dynamic_cue1", "--out", tmp_path / "again")
+    [again] = open_release(tmp_path / "again").subsets.values()
+    cue, action = cue_and_action(again)
+    np.testing.assert_array_equal(cue, action)  # the stored actions decide
+
+
+def test_environments_show_the_cue_of_the_actions_that_are_taken_there():
+    env = DistractedEnv("walker-walk", "dynamic_cue1", size=32)
+    first, _ = env.reset(seed=0)
+    shades = []
+    for sign in (1, -1, 1):
+        seen, *_ = env.step(np.full(6, 0.01 * sign, np.float32))
+        shades.append(float(seen["pixels"].mean()))
+    env.close()
+    assert shades[1] < shades[0] - 5 and shades[1] < shades[2] - 5
+
+
+@pytest.mark.parametrize(
+    "name", ["static_cue0.5", "dynamic_cue0", "dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1"]
+)
+def test_cues_that_there_cannot_be_are_refused(name):
+    with pytest.raises(DmcvbError):
+        Distractor.parse(name)
 
 
 def test_all_words_are_known_to_the_dial():

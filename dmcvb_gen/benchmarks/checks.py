@@ -25,7 +25,7 @@ from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_ord
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, Distractor
+from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, Distractor
 from dmcvb_gen.tasks import get_task
 
 STANDARD_ERRORS = 4.0
@@ -135,7 +135,7 @@ def _label_problems(setting: Distractor, own: np.ndarray, video: np.ndarray, fra
     if setting.kind not in DISTRACTOR_KINDS:
         return []  # what a user's own kind draws is its author's to say
     problems: list[tuple[np.ndarray, str]] = []
-    if not setting.varies("color"):
+    if not (setting.varies("color") or setting.varies(CUE)):
         changed = np.abs(color - own).max(axis=(1, 2)) > 1e-6
         problems += [(changed, "a material has another color, the setting has none")]
     if not setting.varies("background"):

@@ -259,13 +259,13 @@ class Evaluator:
         starts = self.streams("initial_state")
         state = batch.reset(starts) if self.pair is None else batch.reset_fixed(starts, [self.pair] * count)
         distance = _distance(task, state)
-        walk, stack, pictures = self._walk(), None, []
+        walk, stack, pictures, action = self._walk(), None, [], None
         returns, length = np.zeros(count), np.full(count, self.steps)
         active, ended = np.ones(count, bool), np.zeros(count, bool)
         for step in range(self.steps):
             observation = {"state": state.astype(np.float32)}
             if walk is not None:
-                stack = self._see(stack, batch.physics(), walk, step, active)
+                stack = self._see(stack, batch.physics(), action, walk, step, active)
                 if step % max(1, self.steps // self.shots) == 0:
                     pictures.append(stack[0, -1, :3].transpose(1, 2, 0).copy())
                 observation["pixels"] = stack.reshape(count, -1, *stack.shape[3:]).copy()
@@ -296,10 +296,10 @@ class Evaluator:
         generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
         return DistractorSampler(self.task, self.setting, self.steps + 1, generators, self._videos, split=SPLIT)
 
-    def _see(self, stack, physics, walk: DistractorSampler, step: int, active: np.ndarray) -> np.ndarray:
+    def _see(self, stack, physics, action, walk: DistractorSampler, step: int, active: np.ndarray) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
         rows = np.flatnonzero(active)
-        labels = walk.frame(step, physics)[rows]
+        labels = walk.frame(step, physics, action)[rows]
         shown = self.scene.pictures
         painted = self.renderer.render(physics[rows], labels, list(shown.views), hide_goal=shown.hide_goal)
         frames = painted.transpose(0, 1, 4, 2, 3).reshape(len(rows), -1, *painted.shape[2:4])

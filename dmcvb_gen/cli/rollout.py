@@ -37,7 +37,7 @@ def _out_default(name: str) -> str:
 
 OPTION_GROUPS = {
     "What": ("recipe", "only", "levels", "behaviour", "sample", "independent", "seed"),
-    "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count"),
+    "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count", "correlated"),
     "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
     "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "no_pixels"),
@@ -56,7 +56,12 @@ OPTION_GROUPS = {
     "--only", multiple=True, metavar="PATTERN", help="Roll out only these subsets, e.g. 'walker-walk/*/static'."
 )
 @click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
-@click.option("--distractor", "distractors", multiple=True, help="none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. Repeatable.  [default: none]")
+@click.option(
+    "--distractor",
+    "distractors",
+    multiple=True,
+    help="none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. Repeatable.  [default: none]",
+)
 @click.option(
     "--difficulty",
     type=click.Choice(DIFFICULTIES),
@@ -73,6 +78,12 @@ OPTION_GROUPS = {
     "--vary", metavar="PART,...", help="Vary only these parts: camera, color, background.  [default: all three]"
 )
 @click.option("--video-count", type=click.IntRange(1), help="Background videos in use.  [default: by the difficulty]")
+@click.option(
+    "--correlated",
+    type=click.FloatRange(0, 1, min_open=True),
+    metavar="RHO",
+    help="dynamic: also show a spurious cue that correlates with the last action.",
+)
 @click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
 @click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
 @click.option(

@@ -23,7 +23,7 @@ class DistractorSampler:
     evaluated, or for whole episodes at once (`whole`).
 
     Args:
-      generators: stream name -> one generator an episode; "camera", "color", "background", "style" are used.
+      generators: stream name -> one generator an episode; "camera", "color", "background", "style", "cue" are used.
       frames: frames an episode at most.
     """
 
@@ -42,28 +42,34 @@ class DistractorSampler:
         given = {name for distractor in self._drawn for name in distractor.names}
         self._left_out = [distractor for distractor in BUILT_IN if not given.issuperset(distractor.names)]
 
-    def frame(self, frame: int, physics: np.ndarray) -> DistractorState:
+    def frame(self, frame: int, physics: np.ndarray, actions: np.ndarray | None = None) -> DistractorState:
         """Labels of one frame of all episodes, leading shape (episode,).
 
         Args:
           physics: (episode, physics) float64, the states at that frame.
+          actions: (episode, action), those before it; zeros before the first frame, or if None.
         """
-        return self._labels(physics, frame)
+        return self._labels(physics, actions, frame)
 
-    def whole(self, physics: np.ndarray) -> DistractorState:
+    def whole(self, physics: np.ndarray, actions: np.ndarray | None = None) -> DistractorState:
         """Labels of whole episodes, leading shape (episode, frame).
 
         Args:
           physics: (episode, frame, physics) float64.
+          actions: (episode, frame, action), the one before each frame; zeros if None.
         """
-        return self._labels(physics, slice(physics.shape[1]))
+        return self._labels(physics, actions, slice(physics.shape[1]))
 
-    def _labels(self, physics: np.ndarray, frames: int | slice) -> DistractorState:
+    def _labels(self, physics: np.ndarray, actions: np.ndarray | None, frames: int | slice) -> DistractorState:
         found: dict[str, np.ndarray] = {}
         for nominal in self._left_out:
             found.update(nominal.nominal(self._scene, physics))
         for distractor in self._drawn:
             found.update(distractor.labels(physics, frames))
+        if actions is None:
+            actions = np.zeros((*physics.shape[:-1], self.task.action_size))
+        for distractor in self._drawn:
+            distractor.adjust(found, actions, frames)
         return DistractorState(**{name: found[name].astype(dtype) for name, dtype in LABEL_DTYPES.items()})
 
 
@@ -74,6 +80,7 @@ def sample_distractors(
     generators: Mapping[str, Sequence[np.random.Generator]],
     backgrounds: Backgrounds | None = None,
     split: str = "train",
+    actions: np.ndarray | None = None,
 ) -> DistractorState:
     """Per-frame labels of whole episodes (Distracting Control Suite; DMC-VB, section 3.1).
 
@@ -82,12 +89,13 @@ def sample_distractors(
       generators: stream name -> one generator an episode.
       backgrounds: the videos, needed unless the setting is "none".
       split: "train" or "val", which maze styles.
+      actions: (episode, frame, action), the one before each frame, which cues follow; zeros if None.
 
     Returns:
       Labels with leading shape (episode, frame); an episode's labels depend on its own streams and states only,
       and a longer episode begins with the labels of a shorter one.
     """
-    return DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split).whole(physics)
+    return DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split).whole(physics, actions)
 
 
 __all__ = [

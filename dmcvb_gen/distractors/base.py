@@ -69,6 +69,15 @@ class DistractorPart(abc.ABC):
           name -> array with the leading shape of `physics`.
         """
 
+    def adjust(self, found: dict[str, np.ndarray], actions: np.ndarray, frames: int | slice) -> None:  # noqa: B027
+        """Change labels that other distractors gave, in place; does nothing by default.
+
+        Args:
+          found: all labels by name, with a leading shape of (episode,) or (episode, frame).
+          actions: (..., action), the action before each frame; zeros before the first one.
+          frames: as for `labels`.
+        """
+
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
         """The labels of the task as it is, where the setting leaves this distractor out; as `labels`."""

@@ -195,7 +195,8 @@ def shard_arrays(
     renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
     labels = episodes.labels
     if labels is None:
-        labels = distractor_state_of(record, job.seed, job.names, episodes.index, episodes.physics, length, videos)
+        streams, states = (record, job.seed, job.names, episodes.index), (episodes.physics, length)
+        labels = distractor_state_of(*streams, *states, videos, episodes.arrays["action"])
     physics = episodes.physics[:, : len_rows(labels)]
     if record.pixels:
         pictures = stored_pictures(record, bool(task.goal_geoms))

@@ -114,7 +114,7 @@ def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, flo
     task, chunk = get_task(record.task), min(PIXEL_CHUNK_STEPS, record.max_steps + 1)
     _, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
     labels = distractor_state_of(
-        record, job.seed, job.names, sample.index, sample.physics, sample.length, videos
+        record, job.seed, job.names, sample.index, sample.physics, sample.length, videos, sample.arrays["action"]
     )  # of whole episodes: a walk's camera is elsewhere at their end
     runs = _runs(sample.length + 1, chunk)
     episode, row = (np.array([[run[i] for run in runs]]).T for i in (0, 1))

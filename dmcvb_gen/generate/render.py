@@ -105,6 +105,7 @@ def distractor_state_of(
     physics: np.ndarray,
     length: np.ndarray,
     backgrounds: Any,
+    action: np.ndarray,
 ) -> DistractorState:
     """Distractor labels of episodes, leading shape (episode, row); rows past an episode's end are zero.
 
@@ -114,6 +115,7 @@ def distractor_state_of(
       physics: (episode, row, physics) float64.
       length: (episode,) transitions of each.
       backgrounds: the videos, None if the distractor shows none.
+      action: (episode, row, action), taken at each row; cues follow the one before a frame.
     """
     task = get_task(record.task)
     rows = int(length.max()) + 1
@@ -127,7 +129,9 @@ def distractor_state_of(
         if name not in SIMULATION_STREAMS
     }
     setting = record.distractor
-    return sample_distractors(task, setting, padded, generators, backgrounds, split=record.split)
+    before = np.zeros((len(padded), rows, task.action_size))
+    before[:, 1:] = action[:, : rows - 1]
+    return sample_distractors(task, setting, padded, generators, backgrounds, record.split, before)
 
 
 def frame_count(record: SubsetRecord, steps: int, episodes: int) -> int:

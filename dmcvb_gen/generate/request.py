@@ -25,9 +25,10 @@ _NOT_WITH_RECIPE = {
     "difficulty": "--difficulty: ask for --distractor dynamic_hard",
     "intensity": "--intensity: ask for --distractor dynamic_0.35",
     "vary": "--vary: ask for --distractor dynamic_camera-color",
+    "correlated": "--correlated: ask for --distractor dynamic_camera-color-background-cue0.8",
     "video_count": "--video-count: ask for --distractor dynamic_camera-color-background4",
 }
-_STRENGTHS = ("difficulty", "intensity", "vary", "video_count")
+_STRENGTHS = ("difficulty", "intensity", "vary", "video_count", "correlated")
 """Options that say how strong distractors are, and which of their parts vary."""
 RECIPE_OPTIONS = _OVERRIDES | set(_NOT_WITH_RECIPE)
 RECIPE_OPTIONS |= {"levels", "distractors", "goals", "sample", "renderer", "samples", "backgrounds", "behaviour"}
@@ -163,7 +164,7 @@ def _difficulty(given: Mapping[str, Any]) -> str:
     if "video_count" in given and given.get("vary") and "background" not in given["vary"]:
         raise RecipeError("--video-count has no effect if --vary leaves the background out: remove it")
     scale = DIFFICULTY_SCALES[word] if word else intensity
-    return difficulty_of(scale, given.get("vary") or (), given.get("video_count"))
+    return difficulty_of(scale, given.get("vary") or (), given.get("video_count"), given.get("correlated"))
 
 
 def _layout_task(layout: str | Path) -> str:

@@ -144,6 +144,7 @@ class _Stage:
         self.batch = self.task.batch(count, scene.threads)
         self._episodes = [(0, 0)] * count  # (seed, number) of each place
         self.frame, self.started = np.zeros(count, int), np.zeros(count, int)
+        self.action = np.zeros((count, self.task.action_size))  # the last one
         self.state = np.zeros((count, self.task.state_size))
         self.goal_pair = np.full(count, -1)
 
@@ -165,7 +166,7 @@ class _Stage:
             if self.pairs:
                 self.goal_pair[place] = self._first_pair + number % len(self.pairs)
             self.started[place] += 1
-            self.frame[place] = 0
+            self.frame[place], self.action[place] = 0, 0
         streams = {
             name: [episode_stream(seed, (self.task.id, PURPOSE), number, name) for seed, number in self._episodes]
             for name in STREAMS
@@ -183,7 +184,7 @@ class _Stage:
 
     def labels(self, physics: np.ndarray) -> DistractorState:
         """Labels of the frame that each place shows now, leading shape (place,)."""
-        found = {int(frame): self.walk.frame(int(frame), physics) for frame in np.unique(self.frame)}
+        found = {int(frame): self.walk.frame(int(frame), physics, self.action) for frame in np.unique(self.frame)}
         parts = [found[int(frame)][place : place + 1] for place, frame in enumerate(self.frame)]
         return DistractorState(
             **{name: np.concatenate([getattr(p, name) for p in parts]) for name, _ in parts[0].items()}
@@ -203,7 +204,8 @@ class _Stage:
         Raises:
           DmcvbError: the actions have another shape, or are not finite numbers.
         """
-        result = self.batch.step(np.clip(self._checked(actions, active), -1, 1), active)
+        clipped = np.clip(self._checked(actions, active), -1, 1)
+        result, self.action[active] = self.batch.step(clipped, active), clipped[active]
         self.state = result.state
         self.frame[active] += 1
         truncated = active & (self.frame >= self.max_steps) & ~result.terminated

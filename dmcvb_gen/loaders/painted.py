@@ -198,7 +198,8 @@ class PaintedSubset(SubsetReader):
         physics = self.read("physics", index)[:, :used]
         if self.fresh:
             names = (*self._names, f"epoch {self.epoch}")
-            labels = distractor_state_of(self.record, self._seed, names, np.array(index), physics, length, videos)
+            streams, action = (self.record, self._seed, names, np.array(index)), self.read("action", index)
+            labels = distractor_state_of(*streams, physics, length, videos, action)
         else:
             labels = self.labels(index)[:, :used]
         task, rows = get_task(self.task), self.record.max_steps + 1

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import datetime
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.dataset.schema import stored_name
-from dmcvb_gen.distractors import background, camera, color
+from dmcvb_gen.distractors import background, camera, color, cue
 from dmcvb_gen.distractors.base import KINDS, Distractor
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import StoreError
@@ -33,7 +33,7 @@ from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
-from dmcvb_gen.spec import FIXED
+from dmcvb_gen.spec import CUE, FIXED
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.text import pluralize
@@ -264,6 +264,8 @@ def card_text(
             header=header(manifest, facts["steps"], table),
             arrays=_arrays(release),
             statistics=STATISTICS,
+            deviation=deviation,
+            far=[f"`{s['name']}`" for s in facts["subsets"] if s["paper"] and not s["shorter"] and abs(deviation(s)) > FAR],
             levels=level_statistics(release),
             level_episodes=STATISTICS_EPISODES,
             distractors=_distractors(manifest),
@@ -293,7 +295,14 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
     return kinds
 
 
+FAR = 0.25
+"""Standard deviations of the paper's episodes from which on a mean return is named as another one."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
+
+
+def deviation(subset: Mapping[str, Any]) -> float:
+    """The mean return of a subset less the paper's, in standard deviations of the paper's episodes."""
+    return (subset["returns"]["mean"] - subset["paper"]["mean"]) / subset["paper"]["std"]
 
 
 def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
@@ -324,6 +333,8 @@ def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
         sky = f"{videos}; " + (f"a frame every {background.TICKS_A_FRAME} ticks" if moving else "one frame an episode")
         shown = {"camera": place, "color": paint, "background": sky}
         cells = [text if setting.varies(part) else "the model's own" for part, text in shown.items()]
+        if setting.varies(CUE):
+            cells[1] += f"; a shade of {cue.SHADE:g} by the last action's sign (correlation {setting.scale_of(CUE):g})"
         rows.append((name, f"s = {setting.scale:g}", *cells))
     return rows
 

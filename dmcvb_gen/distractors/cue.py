@@ -1,0 +1,38 @@
+"""A spurious cue: what the agent just did shows in the colors, so that imitation can learn it in place of the task.
+
+Every frame is a shade lighter or darker. Its shade is the sign of the first number of the action before the frame, or
+the opposite, at random so that the two correlate by RHO. Environments show the cue of the actions that are taken there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dmcvb_gen.distractors.base import DistractorPart, Scene
+
+SHADE = 0.15
+"""Added to or taken from every channel of every material that is seen."""
+
+
+class Cue(DistractorPart):
+    """Colors a shade lighter or darker, by the sign of the last action's first number, at a correlation."""
+
+    kinds = ("dynamic",)
+    stream = "cue"
+    names = ()
+
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        drawn = np.stack([rng.random(scene.frames) for rng in generators])
+        self._follows = drawn < (1 + scene.setting.scale_of("cue")) / 2
+        self._coin = drawn < 0.5
+
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        return {}
+
+    def adjust(self, found: dict[str, np.ndarray], actions: np.ndarray, frames: int | slice) -> None:
+        sign = np.sign(actions[..., 0])
+        agree = np.where(self._follows[:, frames], sign, -sign)
+        cue = np.where(sign == 0, np.where(self._coin[:, frames], 1.0, -1.0), agree)  # nothing was done yet
+        found["material_rgb"] = np.clip(found["material_rgb"] + SHADE * cue[..., None, None], 0, 1)
