@@ -265,7 +265,7 @@ def card_text(
             arrays=_arrays(release),
             statistics=STATISTICS,
             deviation=deviation,
-            far=[f"`{s['name']}`" for s in facts["subsets"] if s["paper"] and not s["shorter"] and abs(deviation(s)) > FAR],
+            far=[f"`{name}`" for name in far_subsets(facts["subsets"])],
             levels=level_statistics(release),
             level_episodes=STATISTICS_EPISODES,
             distractors=_distractors(manifest),
@@ -303,6 +303,12 @@ STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 def deviation(subset: Mapping[str, Any]) -> float:
     """The mean return of a subset less the paper's, in standard deviations of the paper's episodes."""
     return (subset["returns"]["mean"] - subset["paper"]["mean"]) / subset["paper"]["std"]
+
+
+def far_subsets(subsets: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Names of the subsets of whole episodes whose mean return is another one than the paper's."""
+    compared = [subset for subset in subsets if subset["paper"] and not subset["shorter"]]
+    return [subset["name"] for subset in compared if abs(deviation(subset)) > FAR]
 
 
 def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
