@@ -265,7 +265,7 @@ class Evaluator:
         for step in range(self.steps):
             observation = {"state": state.astype(np.float32)}
             if walk is not None:
-                stack = self._see(stack, batch.physics(), action, walk, step, active)
+                stack = self._see(stack, batch.physics(), walk, step, active, action)
                 if step % max(1, self.steps // self.shots) == 0:
                     pictures.append(stack[0, -1, :3].transpose(1, 2, 0).copy())
                 observation["pixels"] = stack.reshape(count, -1, *stack.shape[3:]).copy()
@@ -296,7 +296,7 @@ class Evaluator:
         generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
         return DistractorSampler(self.task, self.setting, self.steps + 1, generators, self._videos, split=SPLIT)
 
-    def _see(self, stack, physics, action, walk: DistractorSampler, step: int, active: np.ndarray) -> np.ndarray:
+    def _see(self, stack, physics, walk: DistractorSampler, step: int, active, action=None) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
         rows = np.flatnonzero(active)
         labels = walk.frame(step, physics, action)[rows]
