@@ -110,6 +110,7 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
             "name": release.manifest.name,
             "version": release.manifest.version,
             "digest": release.manifest.digest,
+            "pixels": any(record.pixels for record in release.manifest.subsets),
             "path": release.root,
         },
         "sound": structure.sound and not failed,
