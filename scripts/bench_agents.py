@@ -19,6 +19,7 @@ from dmcvb_gen.agents.catalog import make_encoder, make_policy, make_pretrainer,
 from dmcvb_gen.agents.data import HeldFrames, TrainingData
 from dmcvb_gen.agents.networks import NETWORKS
 from dmcvb_gen.agents.trainer import TrainSettings, train
+from dmcvb_gen.precision import choose_precision, image_product
 
 AGENTS = "state-bc,state-td3-bc,bc,td3-bc,id+bc,lfd+bc,ae+bc,state+bc"
 
@@ -68,6 +69,10 @@ def main() -> None:
     data = random_data(options.device)
     how = f"{options.threads} threads, batch {options.batch_size}, {options.network} network"
     print(f"torch {torch.__version__}, {options.device}, {how}")
+    auto = choose_precision("auto", image_product(batch=options.batch_size), options.device)
+    print(
+        f"networks that see pictures: `--precision auto` takes {auto} here; agents that see states compute in float32"
+    )
     print(f"{'learner':34s} {'float32':>9s} {'bfloat16':>9s} {'compiled':>9s}  Adam steps/s (best against float32)")
     for name in options.agents.split(","):
         agent = parse_agent(name)

@@ -3,6 +3,7 @@
     python scripts/bench_training.py --limit 3600
     python scripts/bench_training.py --limit 3600 --peer-times 4          # stop the peer after four times ours
     python scripts/bench_training.py --recipes sac sb3-sac tqc --limit 900  # which --algo is soonest at 95 %?
+    python scripts/bench_training.py --precisions                           # updates a second in float32 and bfloat16
     python scripts/bench_training.py --limit 3 --every 400 --episodes 2     # does it run?
 
 The peer is Stable-Baselines3's SAC with its own settings on one dm_control environment at action repeat 2. One
@@ -17,6 +18,7 @@ import argparse
 import os
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -27,15 +29,20 @@ import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
+from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.precision import choose_precision, dense_product
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import runs
 from dmcvb_gen.training.defaults import default_run
 from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.sac import Sac, SacSettings
 from dmcvb_gen.training.training import open_run
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
 TASK = "walker-walk"
+UPDATES = 300
+"""Timed in each precision."""
 
 
 class SuiteEnv(gymnasium.Env):
@@ -121,6 +128,29 @@ def ours(
     return last[0], last[1], last[2]
 
 
+def precisions() -> None:
+    """Updates a second of SAC's critics and actor in both precisions, and which one `--precision auto` takes here."""
+    header = PolicyHeader(task=TASK, observation_size=24, action_size=6, algorithm="sac", agent_step=0, hidden=(256,))
+    settings, rates = SacSettings(**default_run(TASK, "sac")["settings"]), {}
+    batch = {
+        "observation": torch.randn(settings.batch_size, 24),
+        "next_observation": torch.randn(settings.batch_size, 24),
+    }
+    batch |= {"action": torch.rand(settings.batch_size, 6), "reward": torch.rand(settings.batch_size)}
+    batch |= {"terminated": torch.zeros(settings.batch_size)}
+    for half in (False, True):
+        sac = Sac(header, replace(settings, bfloat16=half), 0)
+        for _ in range(20):  # compiled, and warm
+            sac.update(batch)
+        started = time.perf_counter()
+        for _ in range(UPDATES):
+            sac.update(batch)
+        rates["bfloat16" if half else "float32"] = UPDATES / (time.perf_counter() - started)
+    auto = choose_precision("auto", dense_product(settings.critic_hidden[-1], settings.batch_size))
+    shown = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
+    print(f"updates a second: {shown}; auto takes {auto}, {rates[auto] / max(rates.values()):.2f} of the faster one")
+
+
 def compare(arguments: argparse.Namespace) -> None:
     """Seconds of each algorithm, with its default settings, until 95 % of the paper's expert return."""
     goal = 0.95 * paper_returns(TASK, "expert")["mean"]
@@ -139,8 +169,11 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=20, help="episodes of an evaluation")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--recipes", nargs="+", help="compare these of train-behaviour's algorithms, to 95 %%, instead")
+    parser.add_argument("--precisions", action="store_true", help="time updates in both precisions instead")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.precisions:
+        return precisions()
     if arguments.recipes:
         return compare(arguments)
     goal = 0.9 * paper_returns(TASK, "expert")["mean"]

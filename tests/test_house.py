@@ -29,6 +29,7 @@ FLOORS = (
         "distractor_state",
         "arithmetic",
         "precision",
+        "compilation",
         "own_code",
     ),  # the ground
     ("tasks",),

@@ -20,6 +20,7 @@ from safetensors.torch import save_file
 
 from dmcvb_gen.agents.data import TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
+from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
 
@@ -130,7 +131,7 @@ def train(
     learner.half = settings.half
     if settings.compile:
         for name in learner.compiled:
-            setattr(learner, name, torch.compile(getattr(learner, name)))
+            setattr(learner, name, compiled(getattr(learner, name)))
     log_every = max(1, settings.steps // settings.points)
     started = saved = time.perf_counter()
 

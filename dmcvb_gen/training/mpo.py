@@ -20,6 +20,7 @@ import torch
 from torch import nn
 from torch.nn.functional import softplus
 
+from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.training.sac import CriticEnsemble, ReplayLearner
 from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, Share
@@ -44,7 +45,7 @@ class MpoSettings:
       critics: how many critics; their mean is used.
       reward_scale: multiplies rewards before learning.
       shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
-      compile: compile the update (needs a C++ compiler on the CPU).
+      compile: compile the update; without a C++ compiler it runs as it is, and one line says so.
     """
 
     simulations: Count = 8
@@ -123,7 +124,7 @@ class Mpo(ReplayLearner):
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=settings.learning_rate, fused=True)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.learning_rate, fused=True)
         self.dual_optimizer = torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True)
-        self._loss = torch.compile(self.loss) if settings.compile else self.loss
+        self._loss = compiled(self.loss) if settings.compile else self.loss
 
     def loss(self, observation, action, reward, terminated, next_observation):
         """The sum of all losses, (1): critics', policy's, temperature's and multipliers'; and what is to be logged."""

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
 from dmcvb_gen.training.networks import Actor
 from dmcvb_gen.training.row_files import map_rows, rows_in
@@ -55,7 +56,7 @@ class SacSettings:
         tasks want).
       weight_decay: of AdamW, on actor and critics.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
-      compile: compile the updates (needs a C++ compiler on the CPU).
+      compile: compile the updates; without a C++ compiler they run as they are, and one line says so.
     """
 
     simulations: Count = 8
@@ -304,8 +305,8 @@ class Sac(ReplayLearner):
         self._losses: dict[str, torch.Tensor] = {}
         self._critic_loss, self._actor_loss = self.critic_loss, self.actor_loss
         if settings.compile:
-            self._critic_loss = torch.compile(self.critic_loss)
-            self._actor_loss = torch.compile(self.actor_loss)
+            self._critic_loss = compiled(self.critic_loss)
+            self._actor_loss = compiled(self.actor_loss)
 
     def begin_round(self, step: int) -> None:
         super().begin_round(step)

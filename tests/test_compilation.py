@@ -1,0 +1,91 @@
+"""Trainings where torch.compile cannot work: as they are, with one line."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch._dynamo.exc import BackendCompilerFailed
+
+from dmcvb_gen import compilation
+from dmcvb_gen.compilation import compiled, compiler
+
+LINE = "Training runs without torch.compile, which is slower"
+SMALL = {"warmup_steps": 8, "simulations": 4, "batch_size": 8, "actor_hidden": [8], "critic_hidden": [8]}
+
+
+@pytest.fixture(autouse=True)
+def told_anew():
+    compilation._tell.cache_clear()
+
+
+def test_functions_stay_as_they_are_without_a_compiler(monkeypatch, caplog):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert compiler() is None
+    with caplog.at_level(logging.WARNING):
+        assert compiled(abs) is abs and compiled(len) is len
+    assert [record.message for record in caplog.records] == [f"{LINE}: there is no C++ compiler."]
+
+
+def failing(error):
+    def make(function):
+        def call(*arguments):
+            raise error
+
+        return call
+
+    return make
+
+
+def test_what_cannot_be_compiled_is_called_as_it_is(monkeypatch, caplog):
+    def backend(): ...
+
+    monkeypatch.setattr(compilation, "compiler", lambda: "/usr/bin/g++")
+    monkeypatch.setattr(torch, "compile", failing(BackendCompilerFailed(backend, RuntimeError("no headers"), None)))
+    with caplog.at_level(logging.WARNING):
+        function = compiled(lambda x: x + 1)
+        assert function(1) == 2 and function(2) == 3
+    [record] = caplog.records
+    assert record.message.startswith(f"{LINE}: compiling failed: ") and "\n" not in record.message
+
+
+def test_a_functions_own_errors_are_not_hidden(monkeypatch):
+    monkeypatch.setattr(compilation, "compiler", lambda: "/usr/bin/g++")
+    monkeypatch.setattr(torch, "compile", failing(ValueError("its own")))
+    with pytest.raises(ValueError, match="its own"):
+        compiled(lambda x: x)(1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["sac", "mpo"])
+def test_a_training_without_a_compiler_says_so_in_one_line_and_trains(algorithm, tmp_path):
+    settings = [word for key, value in SMALL.items() for word in ("--set", f"{key}={value}")]
+    command = [
+        sys.executable,
+        "-m",
+        "dmcvb_gen",
+        "train-behaviour",
+        "walker-walk",
+        "--algo",
+        algorithm,
+        "--steps",
+        "32",
+    ]
+    environment = os.environ | {"CXX": "no-such-compiler"}
+    arguments = [*command, *settings, "--set", "compile=true", "--out", str(tmp_path / "run")]
+    done = subprocess.run(arguments, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count(LINE) == 1 and "Traceback" not in done.stderr
+    assert list((tmp_path / "run" / "checkpoints").glob("*.safetensors"))
+
+
+@pytest.mark.slow
+def test_a_validation_without_a_compiler_does_so_too(small_release, tmp_path):
+    command = [sys.executable, "-m", "dmcvb_gen", "validate", str(small_release), "--compile", "--agents", "state-bc"]
+    command += ["--only", "*/*/none", "--workers", "1", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"CXX": "no-such-compiler"})
+    assert done.returncode == 0 and done.stderr.count(LINE) == 1, done.stderr
