@@ -74,8 +74,10 @@ DIFFICULTIES = tuple(DIFFICULTY_SCALES)
 SCALED_PARTS = ("camera", "color")
 DISTRACTOR_PARTS = (*SCALED_PARTS, "background")
 """The parts of DMC-VB's distractors, each of which can vary alone."""
-CUE = "cue"
-"""A part besides, whose number is its correlation with the action before a frame; see `distractors.cue`."""
+CUE, SHAKE = "cue", "shake"
+"""Parts besides, of dynamic distractors alone. A cue's number is its correlation with the action before a frame."""
+ALL_PARTS = (*DISTRACTOR_PARTS, SHAKE, CUE)
+"""In the order of a difficulty's spelling."""
 ALL = "all"
 """Stands for all background videos where a difficulty gives their number."""
 
@@ -149,8 +151,9 @@ class Distractor:
       kind: "none", "static", "dynamic", or one of a user's own.
       difficulty: "easy", "medium" or "hard"; or a scale above 0 and up to 1 ("0.35"); or the parts that vary, each
         with a number of its own if medium's is not meant: "camera0.1-color0.5-background4" (a background's number is
-        how many videos are in play). "cue0.8" among them is a spurious cue in the colors, of dynamic distractors, that
-        correlates with the action before a frame by 0.8. What amounts to a word is turned into it: "0.2" is "medium".
+        how many videos are in play). Two parts of dynamic distractors come besides: "shake0.3" shifts the camera in
+        every frame, "cue0.8" is a spurious cue in the colors that correlates with the last action by 0.8. What amounts
+        to a word is turned into it: "0.2" is "medium".
 
     Raises:
       UnknownNameError: there is no such kind or difficulty. DmcvbError: a number is out of range.
@@ -168,8 +171,8 @@ class Distractor:
         if self.difficulty[0].isalpha() and self.difficulty not in DIFFICULTIES and self.kind not in DISTRACTOR_KINDS:
             raise DmcvbError(f"distractor {self.kind} has no parts such as {self.difficulty}; give a scale, e.g. 0.35")
 
-        if self.kind != "dynamic" and CUE in _strengths(self.difficulty):
-            raise DmcvbError(f"distractor {self.kind} shows no cue of the actions; ask for dynamic_{self.difficulty}")
+        if self.kind != "dynamic" and not set(_strengths(self.difficulty)) <= set(DISTRACTOR_PARTS):
+            raise DmcvbError(f"distractor {self.kind} has no cue and no shake; ask for dynamic_{self.difficulty}")
 
     @property
     def name(self) -> str:
@@ -177,7 +180,7 @@ class Distractor:
         return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
 
     def varies(self, part: str) -> bool:
-        """Whether a part ("camera", "color", "background", "cue") varies; none does under a user's own kind."""
+        """Whether a part (of `ALL_PARTS`) varies; none does under a user's own kind."""
         return self.kind in DISTRACTOR_KINDS and self.kind != "none" and part in _strengths(self.difficulty)
 
     def scale_of(self, part: str) -> float:
@@ -188,7 +191,7 @@ class Distractor:
     def scale(self) -> float:
         """The scale s of all ranges; the largest one if parts have their own, 0 without distractors."""
         strengths = _strengths(self.difficulty)
-        return 0.0 if self.kind == "none" else max(float(strengths.get(part) or 0.0) for part in SCALED_PARTS)
+        return 0.0 if self.kind == "none" else max(float(strengths.get(part) or 0.0) for part in (*SCALED_PARTS, SHAKE))
 
     @property
     def videos(self) -> int | None:
@@ -217,13 +220,14 @@ def difficulty_of(
       UnknownNameError: there is no such part. DmcvbError: a number is out of range.
     """
     for part in parts:
-        if part not in DISTRACTOR_PARTS:
-            raise UnknownNameError("part of a distractor", part, DISTRACTOR_PARTS)
+        if part not in (*DISTRACTOR_PARTS, SHAKE):
+            raise UnknownNameError("part of a distractor", part, (*DISTRACTOR_PARTS, SHAKE))
     scale = DIFFICULTY_SCALES["medium"] if intensity is None else intensity
     if not parts and videos is None and cue is None:
         return _canonical(_number(scale))
     count = _videos_at(scale) if videos is None else videos
     numbers = {"camera": _number(scale), "color": _number(scale), "background": ALL if count is None else str(count)}
+    numbers[SHAKE] = _number(scale)
     words = [f"{part}{numbers[part]}" for part in parts or DISTRACTOR_PARTS]
     return _canonical("-".join(words + ([f"{CUE}{_number(cue)}"] if cue is not None else [])))
 
@@ -248,7 +252,7 @@ def _strengths(difficulty: str) -> dict[str, float | None]:
         return {"camera": scale, "color": scale, "background": _videos_at(scale)}
     found: dict[str, float | None] = {}
     for word in difficulty.split("-"):
-        part = next((part for part in (*DISTRACTOR_PARTS, CUE) if word.startswith(part)), "")
+        part = next((part for part in ALL_PARTS if word.startswith(part)), "")
         number = word[len(part) :]
         if not part or part in found or word == CUE:
             raise UnknownNameError("difficulty", difficulty, DIFFICULTIES)
@@ -290,7 +294,7 @@ def _canonical(difficulty: str) -> str:
     if "background" in strengths:
         count = strengths["background"]
         numbers["background"] = ALL if count is None else str(int(count))
-    return "-".join(f"{part}{numbers[part]}" for part in (*DISTRACTOR_PARTS, CUE) if part in numbers)
+    return "-".join(f"{part}{numbers[part]}" for part in ALL_PARTS if part in numbers)
 
 
 def distractor_kinds() -> tuple[str, ...]:
@@ -362,7 +366,9 @@ class SubsetSpec:
     @property
     def camera_moves(self) -> bool:
         """Whether the camera moves: it follows the ant in mazes, and wanders in dynamic distractors."""
-        return self.goal is not None or (self.distractor.kind == "dynamic" and self.distractor.varies("camera"))
+        return self.goal is not None or (
+            self.distractor.kind == "dynamic" and (self.distractor.varies("camera") or self.distractor.varies(SHAKE))
+        )
 
 
 def subset_name(task_id: str, level: str, setting: str) -> str:

@@ -15,7 +15,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
-from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, Distractor, difficulty_of
+from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, SHAKE, Distractor, difficulty_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.cameras import seen_materials
 from tests.test_distractors import labels, physics_of
@@ -25,7 +25,10 @@ SCALES = st.integers(1, 1000).map(lambda thousandths: thousandths / 1000)
 
 
 @given(
-    SCALES, st.lists(st.sampled_from(DISTRACTOR_PARTS), unique=True), st.none() | st.integers(1, 40), st.none() | SCALES
+    SCALES,
+    st.lists(st.sampled_from([*DISTRACTOR_PARTS, SHAKE]), unique=True),
+    st.none() | st.integers(1, 40),
+    st.none() | SCALES,
 )
 def test_a_name_says_all_and_has_one_spelling(scale, parts, videos, rho):
     setting = Distractor("dynamic", difficulty_of(scale, parts, videos, rho))
@@ -33,7 +36,8 @@ def test_a_name_says_all_and_has_one_spelling(scale, parts, videos, rho):
     assert Distractor.parse(setting.name) == setting
     for part in DISTRACTOR_PARTS:
         assert setting.varies(part) == (part in parts or not parts)
-    for part in ("camera", "color"):
+    assert setting.varies(SHAKE) == (SHAKE in parts)
+    for part in ("camera", "color", SHAKE):
         assert setting.scale_of(part) == (scale if setting.varies(part) else 0)
     if setting.varies("background") and videos:
         assert setting.videos == videos
@@ -75,6 +79,11 @@ def test_only_the_parts_that_are_named_vary_and_by_their_own_scale(task_id):
     np.testing.assert_array_equal(sky.camera_quaternion, plain.camera_quaternion)
     np.testing.assert_array_equal(sky.material_rgb, plain.material_rgb)
     assert (sky.background_video >= 0).all()
+    shaken = labels(task, "dynamic_shake0.5", physics)
+    np.testing.assert_array_equal(shaken.camera_quaternion, plain.camera_quaternion)
+    np.testing.assert_array_equal(shaken.material_rgb, plain.material_rgb)
+    shift = (shaken.camera_position - plain.camera_position) / np.linalg.norm(task.model.cam_poscom0[0])
+    assert abs(shift.std() / 0.05 - 1) < 0.2 and abs(np.diff(shift, axis=1).std() / (0.05 * 2**0.5) - 1) < 0.2
 
 
 @pytest.mark.slow
@@ -118,7 +127,7 @@ def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
         (["walker-walk", "--distractor", "dynamic", "--vary", "color", "--video-count", "2"], "--video-count has no"),
         (["ant-maze-empty7x7", "--video-count", "2"], "--video-count has no effect in mazes"),
         (["--recipe", "quickstart", "--intensity", "0.5"], "ask for --distractor dynamic_0.35 instead"),
-        (["walker-walk", "--distractor", "static", "--correlated", "0.5"], "shows no cue of the actions"),
+        (["walker-walk", "--distractor", "static", "--correlated", "0.5"], "has no cue and no shake"),
         (["walker-walk", "--distractor", "dynamic", "--correlated", "1.5"], "not in the range"),
         (["walker-walk", "--distractor", "dynamic_2"], "is not above 0 and up to 1"),
     ],
@@ -174,6 +183,9 @@ def test_a_cue_stands_beside_all_other_distractors_in_every_command(tmp_path):
     assert "(correlation 0.8)" in (folder / "README.md").read_text()
     run("repaint", folder, "--distractor", "dynamic_cue1", "--out", tmp_path / "again")
     [again] = open_release(tmp_path / "again").subsets.values()
+    run("repaint", folder, "--distractor", "dynamic_shake0.5", "--out", tmp_path / "shaken")
+    assert json.loads(run("verify", tmp_path / "shaken", "--json"))["sound"]
+    assert "same digest" in run("regenerate", tmp_path / "shaken", "--check")
     cue, action = cue_and_action(again)
     np.testing.assert_array_equal(cue, action)  # the stored actions decide
 

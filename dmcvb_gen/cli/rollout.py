@@ -75,7 +75,9 @@ OPTION_GROUPS = {
     help="Scale of the distractors instead of a difficulty: easy is 0.1, medium 0.2, hard 0.3.",
 )
 @click.option(
-    "--vary", metavar="PART,...", help="Vary only these parts: camera, color, background.  [default: all three]"
+    "--vary",
+    metavar="PART,...",
+    help="Vary only these parts: camera, color, background, shake.  [default: the first three]",
 )
 @click.option("--video-count", type=click.IntRange(1), help="Background videos in use.  [default: by the difficulty]")
 @click.option(
@@ -500,7 +502,7 @@ def list_command(remote, options, as_json):
         ("tasks of dm_control's suite", facts["suite_tasks"]),
         ("levels", facts["levels"]),
         ("distractors", facts["distractors"]),
-        ("difficulties", facts["difficulties"]),
+        ("difficulties", [*facts["difficulties"], "or a scale up to 1 (dynamic_0.35)"]),
         ("maze goals", facts["maze_settings"]),
         ("recipes", facts["recipes"]),
         ("manifests", facts["manifests"]),
