@@ -69,7 +69,12 @@ def rollout(
     `dmcvb_gen.rollout("walker-walk", levels="expert", distractors="dynamic", episodes=4, out="releases/demo")`
 
     Args:
-      tasks, levels, distractors, goals, layouts, only: a name or several.
+      tasks: a name or several; so are levels, distractors, only, goals and layouts.
+      levels: expert, medium, mixed or random.
+      distractors: none, static, dynamic, or at a strength: dynamic_0.35.
+      only: patterns of subsets.
+      goals: of mazes: visible or hidden.
+      layouts: of mazes: names or text files.
       out: folder or URL of the release, by default releases/<name>. Without tasks and recipe, that release resumes.
       recipe: a YAML file or the name of a shipped recipe; other arguments narrow or override it.
       difficulty: easy, medium (the default) or hard; or intensity, the scale of the distractors, above 0 and up to 1.
@@ -147,7 +152,9 @@ def paint(
 
     Args:
       episodes: (first, last + 1): the shards that hold any of them.
-      size, views, goal: others than the manifest's; the release becomes another one.
+      size: width and height instead of the manifest's; the release becomes another one, as with views and goal.
+      views: to render, instead of the manifest's.
+      goal: of mazes: visible or hidden, instead of the manifest's.
 
     Raises:
       DmcvbError: nothing matches, a shard is damaged, or the videos are not those of the manifest.
@@ -355,7 +362,8 @@ def export(
     Args:
       release: a folder or URL.
       episodes: (first, last + 1); all by default.
-      merge, video: lerobot: all subsets as the tasks of one data set; images as mp4.
+      merge: lerobot: all subsets as the tasks of one data set.
+      video: lerobot: images as mp4.
 
     Raises:
       DmcvbError: no such format or subset, or a package is not installed.

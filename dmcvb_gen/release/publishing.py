@@ -12,9 +12,7 @@ from typing import Any
 from dmcvb_gen.dataset.index import CARD_FILES
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.release.card import README, write_card
 from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.release.publish import publish
@@ -55,6 +53,9 @@ def publish_folder(
 @contextlib.contextmanager
 def light_copy(path: str | Path) -> Iterator[str]:
     """A copy (of links) of a release without its pictures, beside it, with a card of its own if the release has one."""
+    from dmcvb_gen.generate.paint import without_pictures  # the simulator, which publishing as it is does not need
+    from dmcvb_gen.release.card import README, write_card
+
     folder = Path(path)
     with storage_errors(folder, "write beside"):
         made = tempfile.TemporaryDirectory(dir=folder.resolve().parent, prefix=f".{folder.name}-light-")
