@@ -1,4 +1,4 @@
-"""torch.compile where it can work: without a C++ compiler, functions stay as they are and one line says so."""
+"""torch.compile, if it can work here. Otherwise functions run uncompiled, and one line says so."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def compiler() -> str | None:
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function compiled at its first call, or as it is if it cannot be compiled here."""
+    """A function that is compiled at its first call; it runs uncompiled if compiling fails."""
     if compiler() is None:
         _tell("there is no C++ compiler")
         return function

@@ -79,7 +79,7 @@ CUE, SHAKE = "cue", "shake"
 ALL_PARTS = (*DISTRACTOR_PARTS, SHAKE, CUE)
 """In the order of a difficulty's spelling."""
 ALL = "all"
-"""Stands for all background videos where a difficulty gives their number."""
+"""In a difficulty, in place of a number of background videos: all of them."""
 
 VISIBLE, HIDDEN, FIXED = GOAL_MODES = tuple(mode.value for mode in GoalMode)
 """The stored names of the goal modes."""

@@ -1,4 +1,4 @@
-"""Trainings where torch.compile cannot work: as they are, with one line."""
+"""A training runs uncompiled, and says so in one line, if torch.compile cannot work."""
 
 from __future__ import annotations
 

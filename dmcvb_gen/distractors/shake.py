@@ -1,4 +1,4 @@
-"""Camera shake: the camera is a little elsewhere in every frame, whatever its walk."""
+"""Camera shake: every frame shifts the camera by a small random vector, on top of its walk."""
 
 from __future__ import annotations
 

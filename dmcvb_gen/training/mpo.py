@@ -45,7 +45,7 @@ class MpoSettings:
       critics: how many critics; their mean is used.
       reward_scale: multiplies rewards before learning.
       shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
-      compile: compile the update; without a C++ compiler it runs as it is, and one line says so.
+      compile: compile the update. Without a C++ compiler a warning says that it runs uncompiled.
     """
 
     simulations: Count = 8

@@ -56,7 +56,7 @@ class SacSettings:
         tasks want).
       weight_decay: of AdamW, on actor and critics.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
-      compile: compile the updates; without a C++ compiler they run as they are, and one line says so.
+      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
     simulations: Count = 8
