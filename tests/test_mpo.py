@@ -73,7 +73,7 @@ def batch_of(count=64, seed=3):
     torch.manual_seed(seed)
     action = torch.rand(count, 2) * 2 - 1
     rows = {"observation": torch.randn(count, 3), "action": action, "reward": 1 - (action[:, 0] - 0.5) ** 2}
-    return rows | {"terminated": torch.ones(count), "next_observation": torch.randn(count, 3)}
+    return rows | {"discount": torch.zeros(count), "next_observation": torch.randn(count, 3)}
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
@@ -18,7 +20,7 @@ from dmcvb_gen.training import runs
 from dmcvb_gen.training.defaults import default_run, parse_settings, run_config
 from dmcvb_gen.training.episodes import standing_states
 from dmcvb_gen.training.runs import RunConfig, check_same
-from dmcvb_gen.training.sac import CriticEnsemble, ReplayBuffer, RunningNorm, Sac, SacSettings
+from dmcvb_gen.training.sac import SUPPORT, CriticEnsemble, ReplayBuffer, ReturnScale, RunningNorm, Sac, SacSettings
 from dmcvb_gen.training.training import SacRun, open_run
 
 torch.set_num_threads(1)
@@ -44,7 +46,7 @@ def batch_of(count=64):
         next_observation=rng.normal(size=(count, 3)),
         action=rng.uniform(-1, 1, (count, 2)),
         reward=rng.random(count),
-        terminated=rng.random(count) < 0.2,
+        discount=0.99 * (rng.random(count) > 0.2),
     )
     return {name: torch.tensor(np.asarray(value), dtype=torch.float32) for name, value in values.items()}
 
@@ -95,22 +97,111 @@ def test_the_target_follows_by_its_decay():
     torch.testing.assert_close(sac.target.head, 0.9 * before + 0.1 * sac.critic.head)
 
 
-def test_a_terminal_transition_does_not_look_ahead():
-    sac, batch = learner(), batch_of()
-    batch["terminated"][:] = 1
-    first = sac.critic_loss(*[batch[k] for k in ("observation", "action", "reward", "terminated", "next_observation")])
+@pytest.mark.parametrize("bins", [0, 51])
+def test_a_terminal_transition_does_not_look_ahead(bins):
+    sac, batch = learner(bins=bins), batch_of()
+    batch["discount"][:] = 0
+    names = ("observation", "action", "reward", "discount", "next_observation")
+    first = sac.critic_loss(*[batch[name] for name in names])
     batch["next_observation"] += 100
-    second = sac.critic_loss(*[batch[k] for k in ("observation", "action", "reward", "terminated", "next_observation")])
+    second = sac.critic_loss(*[batch[name] for name in names])
     torch.testing.assert_close(first, second)
 
 
-def test_the_critics_fit_a_known_value():
-    sac, batch = learner(learning_rate=3e-3), batch_of()
-    batch["terminated"][:] = 1  # so the value of an action is its scaled reward
+@pytest.mark.parametrize("bins", [0, 51])
+def test_the_critics_fit_a_known_value(bins):
+    sac, batch = learner(learning_rate=3e-3, bins=bins), batch_of()
+    batch["discount"][:] = 0  # so the value of an action is its scaled reward
     for _ in range(600):
         sac.update(batch)
     values = sac.critic(sac.actor.normalize(batch["observation"]), batch["action"]).mean(0)
     assert (values - 0.5 * batch["reward"]).abs().mean() < 0.05
+
+
+@given(target=st.floats(-20, 20), bins=st.integers(11, 201))
+def test_a_distribution_over_bins_that_fits_a_target_has_its_mean(target, bins):
+    critic = CriticEnsemble(3, 2, (8,), False, bins=bins)
+    logits = torch.zeros(2, 1, bins, requires_grad=True)
+    critic.outputs = lambda observation, action: logits
+    wanted = torch.tensor([target])
+    (gradient,) = torch.autograd.grad(critic.loss(None, None, wanted), logits)
+    # The gradient of a cross-entropy is (softmax - wanted); softmax of zeros is uniform.
+    distribution = 1 / bins - gradient
+    width = 2 * SUPPORT / bins
+    within = float(np.clip(target, -SUPPORT + width, SUPPORT - width))
+    assert distribution.min() >= -1e-6 and distribution.sum(-1).numpy() == pytest.approx(1, abs=1e-4)
+    assert (distribution * critic.centers).sum(-1)[0].item() == pytest.approx(within, abs=0.5 * width)
+
+
+def test_learning_rates_fall_with_the_root_of_the_steps():
+    sac = learner(rate_half_life=1000, learning_rate=1e-3)
+    for step, rate in ((0, 1e-3), (1000, 1e-3 / 2**0.5), (8000, 1e-3 / 3)):
+        sac.begin_round(step)
+        groups = [optimizer.param_groups[0]["lr"] for optimizer in (sac.actor_optimizer, sac.critic_optimizer)]
+        assert groups == pytest.approx([rate, rate])
+
+
+def test_rewards_are_scaled_by_the_spread_of_discounted_returns():
+    rng, scale = np.random.default_rng(0), ReturnScale(2, 0.9)
+    seen, running = [], np.zeros(2)
+    for step in range(300):
+        reward, ended = rng.gamma(0.1, 3, 2), np.array([step % 50 == 49, step % 70 == 69])
+        running = 0.9 * running + reward
+        seen.append(running.copy())
+        running[ended] = 0
+        scale.update(reward, ended)
+    seen = np.concatenate(seen)
+    assert 1 / float(scale) == pytest.approx(max(seen.std(), seen.max() / 5), rel=1e-3)
+    again = ReturnScale(2, 0.9)
+    again.load_state(scale.state())
+    for each in (scale, again):
+        each.update(np.array([90.0, 0.0]), np.array([False, False]))
+    assert float(again) == float(scale) and 1 / float(scale) >= 18
+
+
+@given(st.data())
+def test_steps_that_follow_are_summed_as_far_as_an_episode_goes_on(data):
+    """Against a loop over what each simulation lived through, in a ring that may have wrapped."""
+    simulations, steps = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))
+    rounds, size = data.draw(st.integers(1, 12)), data.draw(st.integers(6, 20))
+    rng, buffer = np.random.default_rng(0), ReplayBuffer(size, 1, 1, simulations)
+    lived = [[] for _ in range(simulations)]
+    for moment in range(rounds):
+        number = (moment * simulations + np.arange(simulations, dtype=float))[:, None]
+        reward, terminated = rng.random(simulations), rng.random(simulations) < 0.2
+        ended = terminated | (rng.random(simulations) < 0.2)
+        rows = dict(observation=number, next_observation=number + 0.5, action=number)
+        buffer.add(**rows, reward=reward, terminated=terminated, ended=ended)
+        for k in range(simulations):
+            lived[k].append((reward[k], terminated[k], ended[k]))
+    batch = {name: value.numpy() for name, value in buffer.sample_steps(rng, 30, steps, 0.9).items()}
+    for i in range(30):
+        moment, k = divmod(int(batch["observation"][i, 0]), simulations)
+        total, factor = 0.0, 1.0
+        for at in range(moment, min(moment + steps, rounds)):
+            reward, terminated, ended = lived[k][at]
+            total, factor = total + factor * reward, factor * 0.9
+            if ended:
+                break
+        assert batch["reward"][i] == pytest.approx(total, rel=1e-5)
+        assert batch["discount"][i] == pytest.approx(factor * (1 - terminated), rel=1e-5)
+        assert batch["next_observation"][i, 0] == at * simulations + k + 0.5
+
+
+def test_a_buffer_that_grew_does_not_chain_what_did_not_follow(tmp_path):
+    tmp_path.joinpath("resume").mkdir()
+    small = ReplayBuffer(6, 1, 1, 2, tmp_path / "resume")
+    for start in range(0, 10, 2):  # rows 6 to 9 lie over 0 to 3
+        value = np.arange(start, start + 2, dtype=float)[:, None]
+        zero = np.zeros(2)
+        small.add(observation=value, next_observation=value, action=value, reward=zero + 1, terminated=zero, ended=zero)
+    small.flush()
+    large = ReplayBuffer(12, 1, 1, 2, tmp_path / "resume")
+    large.restore(small.position, small.full, small.size)
+    assert not large.full and len(large) == 6
+    batch = large.sample_steps(np.random.default_rng(0), 40, 3, 1.0)
+    led = dict(zip(batch["observation"][:, 0].tolist(), batch["next_observation"][:, 0].tolist(), strict=True))
+    assert led == {4: 4, 5: 5, 6: 8, 7: 9, 8: 8, 9: 9}  # 4 and 5 are followed by 6 and 7, which lie before them
 
 
 def test_a_sharpened_policy_is_paid_less_for_its_entropy():
@@ -150,7 +241,7 @@ def test_running_statistics_are_those_of_all_values():
 
 
 def test_the_buffer_keeps_the_latest():
-    buffer = ReplayBuffer(10, 1, 1)
+    buffer = ReplayBuffer(10, 1, 1, 4)
     for start in range(0, 16, 4):
         value = np.arange(start, start + 4, dtype=float)
         buffer.add(
@@ -159,6 +250,7 @@ def test_the_buffer_keeps_the_latest():
             action=value[:, None],
             reward=value,
             terminated=value,
+            ended=value,
         )
     assert len(buffer) == 10 and set(buffer.arrays["reward"]) == set(range(6, 16))
     sample = buffer.sample(np.random.default_rng(0), 50)

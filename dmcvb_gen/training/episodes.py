@@ -83,10 +83,14 @@ class Episodes:
             self.batch.sink(sunken, self._rng.uniform(-SPAWN_NOISE, -SPAWN_NOISE / 2, len(sunken)))
         return self.batch.behaviour_observation()
 
+    def ending(self, terminated: np.ndarray) -> np.ndarray:
+        """(size,) bool: which episodes the task, or the limit, ends with the step just made."""
+        return terminated | (self.elapsed + 1 >= self._limit)
+
     def restart_ended(self, observation: np.ndarray, terminated: np.ndarray) -> np.ndarray:
         """Count a step; begin anew where the task, or the limit, ended an episode."""
+        ended = np.flatnonzero(self.ending(terminated))
         self.elapsed += 1
-        ended = np.flatnonzero(terminated | (self.elapsed >= self._limit))
         if len(ended):
             observation = self.start(ended)
             self.elapsed[ended] = 0

@@ -44,7 +44,7 @@ class MpoSettings:
       target_period: updates after which the target networks become copies of policy and critics.
       critics: how many critics; their mean is used.
       reward_scale: multiplies rewards before learning.
-      shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
+      n_step, shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
       compile: compile the update. Without a C++ compiler a warning says that it runs uncompiled.
     """
 
@@ -55,6 +55,7 @@ class MpoSettings:
     learning_rate: Positive = 3e-4
     dual_learning_rate: Positive = 1e-2
     discount: Decay = 0.99
+    n_step: Count = 1
     updates_per_step: Positive = 0.5
     warmup_steps: Natural = 5000
     target_period: Count = 100
@@ -126,12 +127,12 @@ class Mpo(ReplayLearner):
         self.dual_optimizer = torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True)
         self._loss = compiled(self.loss) if settings.compile else self.loss
 
-    def loss(self, observation, action, reward, terminated, next_observation):
+    def loss(self, observation, action, reward, discount, next_observation):
         """The sum of all losses, (1): critics', policy's, temperature's and multipliers'; and what is to be logged."""
         settings = self.settings
         with torch.no_grad():
             values, sampled, mean, std = self._target_values(next_observation)
-            target = reward + (1 - terminated) * settings.discount * values.mean(dim=0)
+            target = reward + discount * values.mean(dim=0)
         critic_loss = ((self.critic(self.actor.normalize(observation), action) - target) ** 2).mean(dim=1).sum()
 
         temperature, multiplier_mean, multiplier_std = softplus(self.duals) + SMALLEST
@@ -159,7 +160,7 @@ class Mpo(ReplayLearner):
 
     def update(self, batch: dict[str, torch.Tensor]) -> None:
         """One gradient step."""
-        names = ("observation", "action", "reward", "terminated", "next_observation")
+        names = ("observation", "action", "reward", "discount", "next_observation")
         batch = batch | {"reward": batch["reward"] * self.settings.reward_scale}
         optimizers = (self.actor_optimizer, self.critic_optimizer, self.dual_optimizer)
         for optimizer in optimizers:

@@ -40,7 +40,16 @@ class SacSettings:
         swings from checkpoint to checkpoint; the end of a run can do without both.
       sharp_entropy_scale: see `sharpen_after`.
       sharp_learning_rate: see `sharpen_after`; 0: as before.
-      reward_scale: multiplies rewards before learning.
+      n_step: rewards summed before a target bootstraps, on the way that the episode really took.
+      n_step_half_life: the share of such targets is 1 / (1 + agent steps / this), others look one step ahead (0: all of
+        them always). They learn faster at first, and what old actions earned misleads them later.
+      bins: critics give a distribution over so many returns and learn it by cross-entropy (Farebrother et al. 2024,
+        "Stop Regressing"); 0: they give a number and learn by squared error.
+      reward_scale: multiplies rewards before learning; 0: the inverse of the spread of discounted returns, as it grows.
+      soft_values: targets hold the entropy bonus of later steps, as in SAC. Without it critics give returns alone, so
+        that their range does not depend on the action size, and entropy only regularizes the actor.
+      rate_half_life: agent steps after which learning rates have fallen to 1 / sqrt(2); they fall with the square root
+        of the steps (0: never).
       shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
       progress: mazes: weight of the meters of shortest path covered in a step, added to the training reward (never to
         an evaluation). DMC-VB's own reward is flat in the whole goal cell.
@@ -74,7 +83,12 @@ class SacSettings:
     sharp_entropy_scale: float = 1.5
     sharp_learning_rate: NonNegative = 0.0
     initial_temperature: Positive = 0.1
-    reward_scale: Positive = 0.5
+    n_step: Count = 1
+    n_step_half_life: Natural = 0
+    bins: Natural = 0
+    reward_scale: NonNegative = 0.5
+    soft_values: bool = True
+    rate_half_life: Natural = 0
     shaping: NonNegative = 0.0
     progress: NonNegative = 0.0
     standing_starts: Share = 0.0
@@ -89,14 +103,67 @@ class SacSettings:
     compile: bool = True
 
 
+RETURN_LIMIT = 5.0
+"""Scaled discounted returns stay within this: the largest seen is scaled to it if the spread alone does not."""
+SUPPORT = 1.2 * RETURN_LIMIT
+"""Largest absolute return of the bins; the entropy bonus needs some room."""
+SMOOTHING = 0.75
+"""Standard deviation of a target's smoothing over bins, in bins (Farebrother et al. 2024, section 3)."""
+
+
+class ReturnScale:
+    """The factor by which rewards are scaled: the inverse of the spread of the discounted returns that were seen.
+
+    Follows SimbaV2 (Lee et al. 2025): divides by the standard deviation, or by the largest return over `RETURN_LIMIT`
+    if that is more. Rewards of any task then need no scale of their own.
+    """
+
+    def __init__(self, simulations: int, discount: float):
+        self._discount, self._running = discount, np.zeros(simulations)
+        self._norm, self.largest = RunningNorm(1), 0.0
+
+    def update(self, reward: np.ndarray, ended: np.ndarray) -> None:
+        """Take in a step's rewards, (simulation,), and which episodes ended with it."""
+        self._running = self._discount * self._running + reward
+        self._norm.update(self._running[:, None])
+        self.largest = max(self.largest, float(np.abs(self._running).max()))
+        self._running[ended] = 0
+
+    def __float__(self) -> float:
+        spread = max(float(np.sqrt(self._norm.m2 / self._norm.count)[0]), self.largest / RETURN_LIMIT)
+        return 1 / max(spread, 1e-3)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """What it continues from."""
+        numbers = [self._norm.count, float(self._norm.mean[0]), float(self._norm.m2[0]), self.largest]
+        running = torch.from_numpy(self._running.copy())
+        return {"numbers": torch.tensor(numbers, dtype=torch.float64), "running": running}
+
+    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Continue from `state()`."""
+        count, mean, m2, self.largest = state["numbers"].tolist()
+        self._norm.count, self._norm.mean, self._norm.m2 = count, np.array([mean]), np.array([m2])
+        self._running = state["running"].numpy().copy()
+
+
 class CriticEnsemble(nn.Module):
-    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer."""
+    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer.
+
+    Args:
+      bins: outputs of a critic's head, see `SacSettings.bins`.
+    """
 
     def __init__(
-        self, observation_size: int, action_size: int, hidden: tuple[int, ...], bfloat16: bool, critics: int = 2
+        self,
+        observation_size: int,
+        action_size: int,
+        hidden: tuple[int, ...],
+        bfloat16: bool,
+        critics: int = 2,
+        bins: int = 0,
     ):
         super().__init__()
-        self.bfloat16 = bfloat16
+        self.bfloat16, self.bins = bfloat16, bins
         sizes = (observation_size + action_size, *hidden)
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
@@ -105,11 +172,34 @@ class CriticEnsemble(nn.Module):
             self.biases.append(nn.Parameter(torch.zeros(critics, 1, o)))
             self.scales.append(nn.Parameter(torch.ones(critics, 1, o)))
             self.shifts.append(nn.Parameter(torch.zeros(critics, 1, o)))
-        self.head = nn.Parameter(torch.stack([_init(sizes[-1], 1) for _ in range(critics)]) * 0.1)
-        self.head_bias = nn.Parameter(torch.zeros(critics, 1, 1))
+        outputs = max(bins, 1)
+        self.head = nn.Parameter(torch.stack([_init(sizes[-1], outputs) for _ in range(critics)]) * 0.1)
+        self.head_bias = nn.Parameter(torch.zeros(critics, 1, outputs))
+        if bins:
+            edges = torch.linspace(-SUPPORT, SUPPORT, bins + 1)
+            self.register_buffer("edges", edges, persistent=False)
+            self.register_buffer("centers", (edges[1:] + edges[:-1]) / 2, persistent=False)
 
     def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """(n, observation), (n, action) -> (critic, n)."""
+        """(n, observation), (n, action) -> (critic, n) values."""
+        outputs = self.outputs(observation, action)
+        if not self.bins:
+            return outputs.squeeze(-1)
+        return (outputs.softmax(dim=-1) * self.centers).sum(dim=-1)
+
+    def loss(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """(1): squared error, or cross-entropy, of targets (n,), its mean over rows and sum over critics."""
+        outputs = self.outputs(observation, action)
+        if not self.bins:
+            return ((outputs.squeeze(-1) - target) ** 2).mean(dim=1).sum()
+        width = 2 * SUPPORT / self.bins
+        target = target.clamp(-SUPPORT + width, SUPPORT - width)
+        below = torch.erf((self.edges - target[:, None]) / (math.sqrt(2) * SMOOTHING * width))
+        wanted = (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])  # (n, bin), one in sum
+        return -(wanted * outputs.log_softmax(dim=-1)).sum(dim=-1).mean(dim=1).sum()
+
+    def outputs(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(n, observation), (n, action) -> (critic, n, max(bins, 1))."""
         x = torch.cat([observation, action], dim=1).expand(len(self.head), -1, -1)
         for weight, bias, scale, shift in zip(self.weights, self.biases, self.scales, self.shifts, strict=True):
             if self.bfloat16:
@@ -118,7 +208,7 @@ class CriticEnsemble(nn.Module):
                 x = torch.baddbmm(bias, x, weight)
             x = nn.functional.layer_norm(x, x.shape[-1:]) * scale + shift
             x = nn.functional.relu(x)
-        return (torch.bmm(x, self.head) + self.head_bias).squeeze(-1)
+        return torch.baddbmm(self.head_bias, x, self.head)
 
 
 def _init(inputs: int, outputs: int) -> torch.Tensor:
@@ -179,17 +269,67 @@ class RowBuffer:
 
 
 class ReplayBuffer(RowBuffer):
-    """Transitions."""
+    """Transitions of simulations side by side; rows of one simulation lie `simulations` rows apart.
 
-    def __init__(self, size: int, observation_size: int, action_size: int, folder: Path | None = None):
+    Args:
+      simulations: rows of an `add`.
+    """
+
+    def __init__(
+        self, size: int, observation_size: int, action_size: int, simulations: int, folder: Path | None = None
+    ):
+        self._simulations = simulations
         shapes = {
             "observation": (observation_size,),
             "next_observation": (observation_size,),
             "action": (action_size,),
             "reward": (),
             "terminated": (),
+            "ended": (),
         }
         super().__init__(size, shapes, folder)
+
+    def restore(self, position: int, full: bool, rows: int | None = None) -> None:
+        super().restore(position, full, rows)
+        if full and not self.full:  # it has grown: where the ring was closed, rows do not follow each other any more
+            for end in (position, rows or self.found):
+                self.arrays["ended"][max(end - self._simulations, 0) : end] = 1
+
+    def sample_steps(
+        self, rng: np.random.Generator, count: int, steps: int, discount: float, share: float = 1.0
+    ) -> dict[str, torch.Tensor]:
+        """`count` rows drawn uniformly, each with the `steps` steps that followed, as far as its episode went on.
+
+        Args:
+          steps: steps of a row at most.
+          share: share of the rows that have them; others are single steps.
+
+        Returns:
+          float32 tensors: observation, action; reward, the discounted sum of the steps' rewards (n,); next_observation,
+          where they led; discount (n,) of the value there, 0 if the episode terminated.
+        """
+        first = rng.integers(0, len(self), count)
+        newer = (self.position - 1 - first) % self.size  # rows that were added after
+        last, factor = first.copy(), np.ones(count, np.float32)
+        reward = np.array(self.arrays["reward"][first])
+        goes_on = self.arrays["ended"][first] == 0
+        if share < 1:
+            goes_on &= rng.random(count) < share
+        for step in range(1, steps):
+            goes_on &= step * self._simulations <= newer
+            rows = (first + step * self._simulations) % self.size
+            last = np.where(goes_on, rows, last)
+            factor = np.where(goes_on, factor * np.float32(discount), factor)
+            reward += np.where(goes_on, factor * self.arrays["reward"][last], np.float32(0))
+            goes_on &= self.arrays["ended"][last] == 0
+        values = {
+            "observation": self.arrays["observation"][first],
+            "action": self.arrays["action"][first],
+            "reward": reward,
+            "next_observation": self.arrays["next_observation"][last],
+            "discount": (factor * np.float32(discount) * (1 - self.arrays["terminated"][last])).astype(np.float32),
+        }
+        return {name: torch.from_numpy(np.asarray(value)) for name, value in values.items()}
 
 
 class RunningNorm:
@@ -224,6 +364,7 @@ class ReplayLearner(abc.ABC):
         torch.manual_seed(seed)
         self.settings, self.actor = settings, Actor(header)
         self.norm = RunningNorm(header.observation_size)
+        self.returns = ReturnScale(settings.simulations, settings.discount)
         self.updates = 0
 
     @abc.abstractmethod
@@ -259,13 +400,15 @@ class ReplayLearner(abc.ABC):
             "m2": torch.from_numpy(self.norm.m2),
         }
         states = {name: getattr(self, name).state_dict() for name in (*self._parts, *self._optimizers)}
-        return states | {"norm": norm, "updates": self.updates, "torch_rng": torch.get_rng_state()}
+        numbers = {"norm": norm, "returns": self.returns.state(), "updates": self.updates}
+        return states | numbers | {"torch_rng": torch.get_rng_state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from `state()`."""
         self.load_networks(state)
         for name in self._optimizers:
             getattr(self, name).load_state_dict(state[name])
+        self.returns.load_state(state["returns"])
         self.updates = int(state["updates"])
         torch.set_rng_state(state["torch_rng"])
 
@@ -290,7 +433,7 @@ class Sac(ReplayLearner):
     def __init__(self, header: PolicyHeader, settings: SacSettings, seed: int):
         super().__init__(header, settings, seed)
         observation, action = header.observation_size, header.action_size
-        sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics)
+        sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics, settings.bins)
         self.critic, self.target = CriticEnsemble(*sizes), CriticEnsemble(*sizes)
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
@@ -311,6 +454,11 @@ class Sac(ReplayLearner):
     def begin_round(self, step: int) -> None:
         super().begin_round(step)
         self.sharpen(step)
+        if self.settings.rate_half_life:
+            rate = self.settings.learning_rate / math.sqrt(1 + step / self.settings.rate_half_life)
+            for optimizer in (self.actor_optimizer, self.critic_optimizer):
+                for group in optimizer.param_groups:
+                    group["lr"] = rate
 
     def sharpen(self, step: int) -> None:
         """Aim at the lower entropy, by smaller steps, from the agent step on that the settings name."""
@@ -342,16 +490,16 @@ class Sac(ReplayLearner):
         """(critic, n) -> (n,): the value that targets and the actor believe."""
         return values.min(dim=0).values if self.settings.clipped else values.mean(dim=0)
 
-    def critic_loss(self, observation, action, reward, terminated, next_observation):
-        """Mean squared Bellman error of the critics, (1)."""
+    def critic_loss(self, observation, action, reward, discount, next_observation):
+        """How far the critics are from their Bellman targets, (1)."""
         with torch.no_grad():
             next_observation = self.actor.normalize(next_observation)
             next_action, log_prob = self.sample_action(next_observation)
             next_value = self.reduce(self.target(next_observation, next_action))
-            next_value = next_value - self.log_alpha.exp() * log_prob
-            target = reward + (1 - terminated) * self.settings.discount * next_value
-        values = self.critic(self.actor.normalize(observation), action)
-        return ((values - target) ** 2).mean(dim=1).sum()
+            if self.settings.soft_values:
+                next_value = next_value - self.log_alpha.exp() * log_prob
+            target = reward + discount * next_value
+        return self.critic.loss(self.actor.normalize(observation), action, target)
 
     def actor_loss(self, observation):
         """E[alpha log pi - min Q] and the mean log probability."""
@@ -366,8 +514,8 @@ class Sac(ReplayLearner):
         loss = self._critic_loss(
             batch["observation"],
             batch["action"],
-            batch["reward"] * settings.reward_scale,
-            batch["terminated"],
+            batch["reward"] * (settings.reward_scale or float(self.returns)),
+            batch["discount"],
             batch["next_observation"],
         )
         self.critic_optimizer.zero_grad(set_to_none=True)

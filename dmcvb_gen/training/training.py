@@ -111,11 +111,14 @@ class ReplayLoop:
         settings, task, config = run.settings, run.task, run.config
         self.run, self.learner = run, run.learner()
         rows = max(min(settings.buffer_size, config.steps), settings.simulations)
-        self.buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, run.folder / "resume")
+        sizes = (task.behaviour_size, task.action_size, settings.simulations)
+        self.buffer = ReplayBuffer(rows, *sizes, run.folder / "resume")
         self.rng = np.random.default_rng([config.seed, 0xB0FF])
         self._owed = 0.0  # updates
         if saved:
             place = saved["buffer"]
+            if self.buffer.found < min(place["size"], rows):
+                raise DmcvbError(f"{run.folder} was trained by an earlier version; start again in another --out")
             _fit(f"{run.folder} cannot be resumed", self.learner.load_state, saved["learner"])
             self.buffer.restore(place["position"], place["full"], place.get("size"))
             self.rng.bit_generator.state = json.loads(saved["rng"])
@@ -158,13 +161,15 @@ class ReplayLoop:
             reward = reward + settings.progress * (before - batch.path_length())
         if settings.shaping:
             reward = reward + settings.shaping * self._shaping(result.state)
-        reached = batch.behaviour_observation()
+        reached, ended = batch.behaviour_observation(), self.episodes.ending(result.terminated)
+        self.learner.returns.update(reward, ended)
         self.buffer.add(
             observation=observation,
             next_observation=reached,
             action=action,
             reward=reward,
             terminated=result.terminated,
+            ended=ended,
         )
         self.run.step += settings.simulations
         self.observation = self.episodes.restart_ended(reached, result.terminated)
@@ -175,9 +180,13 @@ class ReplayLoop:
         self.learner.begin_round(self.run.step)
         if len(self.buffer) < settings.warmup_steps:
             return
+        half_life = getattr(settings, "n_step_half_life", 0)
+        share = 1 / (1 + self.run.step / half_life) if half_life else 1.0
         self._owed += settings.updates_per_step * settings.simulations
         while self._owed >= 1:
-            self.learner.update(self.buffer.sample(self.rng, settings.batch_size))
+            self.learner.update(
+                self.buffer.sample_steps(self.rng, settings.batch_size, settings.n_step, settings.discount, share)
+            )
             self._owed -= 1
 
 
