@@ -8,22 +8,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import shown
-from dmcvb_gen.loaders.blocks import choose, stack_channels, stream
+from dmcvb_gen.dataset.steps import Part, StepTable
 from dmcvb_gen.loaders.source import StepSource
+from dmcvb_gen.loaders.stream import Steps, stream
 
 
-def _tensor(value: np.ndarray) -> torch.Tensor:
-    return torch.as_tensor(np.ascontiguousarray(value)).reshape(np.shape(value))  # that call makes () to (1,)
-
-
-def _tensors(values: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    return {name: _tensor(value) for name, value in values.items()}
+def _tensors(values: Steps) -> dict[str, torch.Tensor]:
+    return {name: torch.as_tensor(value) for name, value in values.items()}
 
 
 class _Epochs:
@@ -69,7 +65,7 @@ class StepDataset(Dataset):
     def __init__(self, subset: Subset, **options: Any):
         self.source, self._epochs = StepSource(subset, **options), _Epochs(subset)
         if self.source.in_memory:
-            _ = self.source.block  # read now, so that workers that are forked share it
+            _ = self.source.table  # read now, so that workers that are forked share it
 
     def __len__(self) -> int:
         return len(self.source)
@@ -103,7 +99,7 @@ class EpisodeDataset(Dataset):
         pictures: Sequence[str] | None = None,
     ):
         self.subset, self.pictures = subset, shown(subset, pictures).arrays
-        self.episodes, self._epochs = choose(subset, episodes), _Epochs(subset)
+        self.episodes, self._epochs = subset.choose(episodes), _Epochs(subset)
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -114,12 +110,11 @@ class EpisodeDataset(Dataset):
 
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         self._epochs.take()
-        episode = int(self.episodes[index])
-        values = self.subset.episode(episode, ["state", "action", "reward", "discount", *self.pictures])
-        if self.pictures:
-            frames = np.stack([values.pop(name) for name in self.pictures], axis=1)  # (row, view, height, width, 3)
-            values["pixels"] = stack_channels(frames[:, None])
-        return _tensors(values | {"episode": np.asarray(episode)})
+        episode = self.episodes[index]
+        table = StepTable.read([Part(self.subset, self.episodes[[index]], self.pictures)])
+        values = {name: getattr(table, name)[: len(table)] for name in ("action", "reward", "discount")}
+        values |= {"state": table.state, "episode": episode}
+        return _tensors(values if table.frames is None else values | {"pixels": table.frames})
 
 
 class StreamDataset(IterableDataset):
@@ -129,7 +124,7 @@ class StreamDataset(IterableDataset):
     `set_epoch` before each epoch for another order.
 
     Args:
-      batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `blocks.stream`.
+      batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `stream.stream`.
       rank, world: this process's share; those of torch.distributed by default, where it runs.
     """
 
