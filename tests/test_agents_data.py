@@ -93,9 +93,9 @@ def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
     data = make_data()
     one = data.batch(32, np.random.default_rng(0), hold_out=True)
     rows = one.reward.long()
-    torch.testing.assert_close(one.observation, data.observe(rows, *data._no_shift(32)))
+    torch.testing.assert_close(one.observation, data.observe(rows))
     two = data.batch(32, np.random.default_rng(0))
-    plain = data.observe(two.reward.long(), *data._no_shift(32))
+    plain = data.observe(two.reward.long())
     same = (two.observation == plain).flatten(1).all(dim=1)
     assert same.sum() < 8
 
@@ -103,8 +103,8 @@ def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
 def test_shifts_can_be_left_out_and_the_same_transitions_are_drawn():
     data = make_data()
     shifted, plain = (data.batch(32, np.random.default_rng(0), next_observation=True, shift=s) for s in (True, False))
-    torch.testing.assert_close(plain.observation, data.observe(plain.reward.long(), *data._no_shift(32)))
-    torch.testing.assert_close(plain.next_observation, data.observe(plain.reward.long() + 1, *data._no_shift(32)))
+    torch.testing.assert_close(plain.observation, data.observe(plain.reward.long()))
+    torch.testing.assert_close(plain.next_observation, data.observe(plain.reward.long() + 1))
     assert (shifted.reward == plain.reward).all()
 
 
@@ -143,7 +143,7 @@ def test_a_subset_is_held_as_it_is_stored(small_release):
     assert not data.frames.mapped and data.channels == 9
     assert (data.held_out.sum(), len(data), len(data.hold_out_rows)) == (1, 1000, 500)
     episode = subset.episode(2)
-    last = data.observe(torch.tensor([2 * 501 + 400]), *data._no_shift(1))[0, -3:]
+    last = data.observe(torch.tensor([2 * 501 + 400]))[0, -3:]
     np.testing.assert_allclose(last, episode["pixels"][400].transpose(2, 0, 1) / 255 - 0.5, atol=1e-6)
     np.testing.assert_array_equal(data.action[2 * 501 : 2 * 501 + 500], episode["action"])
     raw = data.state * data.normalization.std + data.normalization.mean

@@ -246,7 +246,7 @@ def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_rele
         stack = evaluator._see(stack, physics[:, step], walk, step, np.ones(3, bool))
         shown = normalize_pixels(torch.from_numpy(stack).flatten(1, 2))
         rows = torch.arange(3) * 501 + step
-        assert torch.equal(shown, data.observe(rows, *data._no_shift(3)))
+        assert torch.equal(shown, data.observe(rows))
     evaluator.close()
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from torch import nn
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import training_pictures
-from dmcvb_gen.dataset.steps import FIELDS, Part, StepTable
+from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
@@ -192,21 +193,24 @@ class TrainingData:
     def __len__(self) -> int:
         return len(self.train_rows)
 
-    def _no_shift(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-        middle = torch.full((count,), PAD, device=self.device)
-        return middle, middle
-
     def observe(
         self,
         rows: torch.Tensor,
-        down: torch.Tensor,
-        right: torch.Tensor,
+        down: torch.Tensor | None = None,
+        right: torch.Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         out: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures."""
+        """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures.
+
+        Args:
+          down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
+          dtype: of pictures. out: written over, if given.
+        """
         if self.frames is None:
             return self.state[rows]
+        if down is None or right is None:
+            down = right = torch.full_like(rows, PAD)
         back = torch.arange(self.stack - 1, -1, -1, device=rows.device)
         stacks = torch.maximum(rows[:, None] - back, self.start[rows][:, None])
         return normalize_pixels(self.frames.shifted(stacks, down, right).to(self.device), dtype, out)
@@ -221,9 +225,7 @@ class TrainingData:
         sample_k: bool = False,
         hold_out: bool = False,
         shift: bool = True,
-        dtype: torch.dtype = torch.float32,
-        reuse: Batch | None = None,
-        pictures: bool = True,
+        **options: Any,
     ) -> Batch:
         """Transitions drawn uniformly, with replacement.
 
@@ -232,10 +234,7 @@ class TrainingData:
           k: steps between the two; with `sample_k` drawn from 1..k for each.
           hold_out: draw from the held-out episodes, without shifts.
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
-          dtype: of pictures. Half the bytes are half the time to write them.
-          reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
-            memory for a large batch costs several times the work that fills it.
-          pictures: give observations even if the data are encoded.
+          options: dtype, reuse and pictures of `transitions`.
         """
         rows = self.hold_out_rows if hold_out else self.train_rows
         if next_observation and k > 1:
@@ -246,14 +245,12 @@ class TrainingData:
                 "episodes"
             )
         chosen = rows[self._to_device(generator.integers(len(rows), size=size))]
-        if hold_out or not shift or self.frames is None or self.latent is not None:
-            down, right = self._no_shift(size)
-        else:
+        down = right = steps = None
+        if shift and not hold_out and self.frames is not None and self.latent is None:
             down, right = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
-        steps = None
         if next_observation:
             steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-        return self.transitions(chosen, steps, down, right, dtype, reuse, pictures)
+        return self.transitions(chosen, steps, down, right, **options)
 
     def transitions(
         self,
@@ -270,11 +267,11 @@ class TrainingData:
         Args:
           rows: (batch,) long.
           steps: (batch,) long, how far off the next observation is; None: no next observation.
-          down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
-          dtype, reuse, pictures: as for `batch`.
+          down, right, dtype: as for `observe`. Half the bytes are half the time to write them.
+          reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
+            memory for a large batch costs several times the work that fills it.
+          pictures: give observations even if the data are encoded.
         """
-        if down is None or right is None:
-            down, right = self._no_shift(len(rows))
         now = later = None
         if pictures or self.latent is None:
             now = self.observe(rows, down, right, dtype, reuse and reuse.observation)
@@ -311,7 +308,7 @@ class TrainingData:
         parts = []
         for few in rows.split(ENCODED_ROWS):
             with torch.autocast(self.device.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
-                parts.append(encoder(self.observe(few, *self._no_shift(len(few)), dtype)).float())
+                parts.append(encoder(self.observe(few, dtype=dtype)).float())
         return self._with(latent=torch.cat(parts))
 
     def _with(self, **changes) -> TrainingData:
@@ -408,7 +405,7 @@ def load_data(
     if pixels and not names[0]:
         raise DmcvbError(f"{subsets[0].name} has no pictures that agents are trained on")
     chosen, held_out = zip(*(choose_episodes(source, seed) for source in sources), strict=True)
-    parts = [Part(s, e, n if pixels else ()) for s, e, n in zip(subsets, chosen, names, strict=True)]
+    parts = [Selection(s, e, n if pixels else ()) for s, e, n in zip(subsets, chosen, names, strict=True)]
     size, lengths = subsets[0].record.size, [part.subset.read("length", part.episodes) for part in parts]
     needed = int((np.concatenate(lengths) + 1).sum()) * 3 * len(names[0]) * size * (size + 2 * PAD)
     if memory is None:  # an accelerator's pictures are read into main memory first

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -103,6 +103,10 @@ class Subset:
     def __init__(self, root: str, record: SubsetRecord, commits: Mapping[int, CommitRecord], storage_options: dict):
         self.root, self.record, self.commits = root, record, dict(commits)
         self._storage_options = storage_options
+
+    def read_as(self, kind: Callable[..., Any], *options: Any) -> Any:
+        """The same subset as another class of subset."""
+        return kind(self.root, self.record, self.commits, self._storage_options, *options)
 
     @property
     def name(self) -> str:

@@ -30,7 +30,7 @@ READ_BYTES = 2**26
 
 
 @dataclass(frozen=True)
-class Part:
+class Selection:
     """What a table holds of a subset.
 
     Attributes:
@@ -80,7 +80,7 @@ class StepTable:
         self.step, self.steps = row - self.start + first, row[row < self.end]
 
     @classmethod
-    def read(cls, parts: Sequence[Part], border: int = 0, folder: str | Path | None = None) -> StepTable:
+    def read(cls, parts: Sequence[Selection], border: int = 0, folder: str | Path | None = None) -> StepTable:
         """Read whole episodes, few at a time.
 
         Args:

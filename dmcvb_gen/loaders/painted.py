@@ -240,11 +240,9 @@ def painted_release(release: Release, painting: Painting, missing: bool = False)
     if all(record.imported for record in release.manifest.subsets) and not missing:
         raise StoreError(f"{release.root} was imported and has no physics states to paint from; open it without paint")
     subsets = {
-        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
+        name: subset.read_as(SubsetReader)
         if subset.record.imported or (missing and subset.record.pixels and not subset.unpainted.any())
-        else PaintedSubset(
-            subset.root, subset.record, subset.commits, subset._storage_options, release.manifest, painting
-        )
+        else subset.read_as(PaintedSubset, release.manifest, painting)
         for name, subset in release.subsets.items()
     }
     return ReleaseReader(release.root, release.manifest, subsets)

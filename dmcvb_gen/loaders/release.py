@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from dmcvb_gen.dataset import Release, Subset, open_release
@@ -12,8 +13,6 @@ from dmcvb_gen.loaders.stream import Steps, stream
 
 if TYPE_CHECKING:
     import xarray
-
-KINDS = ("steps", "transitions", "episodes", "stream")
 
 
 class SubsetReader(Subset):
@@ -53,15 +52,15 @@ class SubsetReader(Subset):
         """
         from dmcvb_gen.loaders import torch_data
 
-        if kind == "steps":
-            return torch_data.StepDataset(self, **options)
-        if kind == "transitions":
-            return torch_data.StepDataset(self, next_step=True, **options)
-        if kind == "episodes":
-            return torch_data.EpisodeDataset(self, **options)
-        if kind == "stream":
-            return torch_data.StreamDataset(self, **options)
-        raise UnknownNameError("kind of data set", kind, KINDS)
+        kinds: dict[str, Callable[..., Any]] = {
+            "steps": torch_data.StepDataset,
+            "transitions": functools.partial(torch_data.StepDataset, next_step=True),
+            "episodes": torch_data.EpisodeDataset,
+            "stream": torch_data.StreamDataset,
+        }
+        if kind not in kinds:
+            raise UnknownNameError("kind of data set", kind, kinds)
+        return kinds[kind](self, **options)
 
     def source(self, **options: Any) -> StepSource:
         """Any step at random, numpy alone: for Grain, tf.data or torch; `options` as for `StepSource`."""
@@ -69,7 +68,7 @@ class SubsetReader(Subset):
 
     def batches(self, batch_size: int, **options: Any) -> Iterator[Steps]:
         """One pass over the steps in shuffled numpy batches; `options` as for `StreamDataset`."""
-        yield from stream(self, batch_size=batch_size, **options)
+        return stream(self, batch_size=batch_size, **options)
 
 
 class ReleaseReader(Release):
@@ -84,8 +83,5 @@ class ReleaseReader(Release):
 def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseReader:
     """See `dmcvb_gen.open`."""
     release = open_release(path, storage_options)
-    subsets = {
-        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
-        for name, subset in release.subsets.items()
-    }
+    subsets = {name: subset.read_as(SubsetReader) for name, subset in release.subsets.items()}
     return ReleaseReader(release.root, release.manifest, subsets)

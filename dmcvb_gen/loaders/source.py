@@ -15,7 +15,7 @@ import numpy as np
 
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import shown, training_pictures
-from dmcvb_gen.dataset.steps import Part, StepTable
+from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.loaders.stream import Steps, check_count
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
@@ -98,7 +98,7 @@ class StepSource:
             epoch = getattr(self.subset, "shown_epoch", 0)
             if self._held is None or self._held[0] != epoch:
                 self._held = None  # free the old pictures before new ones are painted
-                self._held = epoch, StepTable.read([Part(self.subset, self.episodes, self.pictures)])
+                self._held = epoch, StepTable.read([Selection(self.subset, self.episodes, self.pictures)])
             return self._held[1]
 
     def __getstate__(self) -> dict[str, Any]:

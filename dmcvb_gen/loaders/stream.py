@@ -13,7 +13,7 @@ import numpy as np
 
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import shown
-from dmcvb_gen.dataset.steps import Part, StepTable
+from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
 
 Steps = dict[str, np.ndarray]
@@ -130,7 +130,7 @@ def _mixed(
     """Batches of the steps of episodes in their order, `buffer` episodes at a time, these mixed if there is a mixer."""
     parts: list[Steps] = []  # of a batch that the episodes in memory did not fill
     for first in range(0, len(order), buffer):
-        table = StepTable.read([Part(subset, order[first : first + buffer], names)])
+        table = StepTable.read([Selection(subset, order[first : first + buffer], names)])
         rows = table.steps if mixer is None else mixer.permutation(table.steps)
         held = sum(len(part["step"]) for part in parts)
         for taken in np.split(rows, range(size - held, len(rows), size)):
