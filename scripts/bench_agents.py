@@ -16,9 +16,10 @@ import numpy as np
 import torch
 
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, make_pretrainer, parse_agent
-from dmcvb_gen.agents.data import HeldFrames, TrainingData
+from dmcvb_gen.agents.data import PAD, TrainingData
 from dmcvb_gen.agents.networks import NETWORKS
 from dmcvb_gen.agents.trainer import TrainSettings, train
+from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.precision import choose_precision, image_product
 
 AGENTS = "state-bc,state-td3-bc,bc,td3-bc,id+bc,lfd+bc,ae+bc,state+bc"
@@ -26,18 +27,16 @@ AGENTS = "state-bc,state-td3-bc,bc,td3-bc,id+bc,lfd+bc,ae+bc,state+bc"
 
 def random_data(device: str, episodes: int = 4, steps: int = 500, size: int = 64) -> TrainingData:
     """Episodes of noise."""
-    rows, generator = episodes * (steps + 1), torch.Generator().manual_seed(0)
-    frames = HeldFrames(rows, 3, size, device)
-    frames.put(0, torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8))
-    return TrainingData(
-        state=torch.randn((rows, 24), generator=generator).to(device),
-        action=(torch.rand((rows, 6), generator=generator) * 2 - 1).to(device),
-        reward=torch.rand(rows, generator=generator).to(device),
-        discount=torch.ones(rows, device=device),
-        lengths=np.full(episodes, steps),
-        held_out=np.zeros(episodes, bool),
-        frames=frames,
-    )
+    rows, generator = episodes * (steps + 1), np.random.default_rng(0)
+    fields = {
+        "state": generator.standard_normal((rows, 24), np.float32),
+        "action": generator.random((rows, 6), np.float32) * 2 - 1,
+        "reward": generator.random(rows, np.float32),
+        "discount": np.ones(rows, np.float32),
+    }
+    frames = generator.integers(256, size=(rows, 3, size, size + 2 * PAD), dtype=np.uint8)
+    table = StepTable(fields, np.full(episodes, steps), frames)
+    return TrainingData(table, np.zeros(episodes, bool), device=device)
 
 
 def steps_per_second(learner, data: TrainingData, options, half: bool, compiled: bool) -> float:

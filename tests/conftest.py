@@ -7,6 +7,7 @@ import os
 
 os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linux-gnu/libEGL.so.1") else "disable")
 
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 import zarr  # noqa: E402
 
@@ -91,6 +92,11 @@ def small_mazes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mazes") / "mazes"
     roll_out(small_recipe(name="mazes", subsets=subsets), folder)
     return folder
+
+
+def stack_channels(frames):
+    """(stack, view, height, width, 3) -> (stack * view * 3, height, width), the oldest frame first."""
+    return np.concatenate([view.transpose(2, 0, 1) for frame in frames for view in frame])
 
 
 def rewrite(folder, name, change):

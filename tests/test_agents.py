@@ -310,7 +310,7 @@ def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
         seen = data.encoded(encoder) if encoded else data
         train(policy, seen, TrainSettings(steps=4, batch_size=8, evaluate_every=4, half=False, shift=False), seed=3)
         policies.append(policy)
-    observation = data.observe(data.train_rows, *data._no_shift(len(data)))
+    observation = data.observe(data.train_rows)
     torch.testing.assert_close(*(policy.act(observation) for policy in policies), atol=1e-5, rtol=1e-4)
 
 
@@ -594,6 +594,6 @@ def test_every_agent_can_be_made_and_acts(name):
     if agent.pretrain:
         make_pretrainer(agent, encoder, data.sizes)
     policy = make_policy(agent, encoder, data.sizes)
-    action = policy.act(data.observe(data.train_rows[:3], *data._no_shift(3)))
+    action = policy.act(data.observe(data.train_rows[:3]))
     assert action.shape == (3, 2) and action.abs().max() <= 1
     assert policy.encoder.features == (64 if not agent.sees_state else policy.encoder.features)

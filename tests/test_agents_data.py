@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
-from dmcvb_gen.agents import data as data_module
 from dmcvb_gen.agents import trainer
-from dmcvb_gen.agents.data import PAD, HeldFrames, Source, TrainingData, batches, load_data, normalize_pixels
+from dmcvb_gen.agents.data import PAD, Source, TrainingData, batches, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import BehaviorCloning
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
 from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import steps as steps_module
+from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError
 
 LENGTHS = np.array([4, 7, 2])
@@ -27,20 +27,12 @@ def make_data(stack=3, held=(False, True, False), size=SIZE):
     """Three short episodes of random pictures; action (row, row), reward row."""
     generator = torch.Generator().manual_seed(0)
     rows = int((LENGTHS + 1).sum())
-    count = torch.arange(rows, dtype=torch.float32)
-    frames = HeldFrames(rows, 3, size)
-    state = torch.rand((rows, 5), generator=generator)
-    frames.put(0, torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8))
-    return TrainingData(
-        state=state,
-        action=torch.stack([count, count], dim=1) / rows,
-        reward=count,
-        discount=torch.ones(rows),
-        lengths=LENGTHS,
-        held_out=np.array(held),
-        frames=frames,
-        stack=stack,
-    )
+    count = np.arange(rows, dtype=np.float32)
+    state = torch.rand((rows, 5), generator=generator).numpy()
+    pictures = torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8).numpy()
+    frames = np.pad(pictures, ((0, 0), (0, 0), (0, 0), (PAD, PAD)), mode="symmetric")
+    fields = {"state": state, "action": np.stack([count, count], 1) / rows, "reward": count, "discount": count * 0 + 1}
+    return TrainingData(StepTable(fields, LENGTHS, frames), np.array(held), stack)
 
 
 def by_hand(pictures, rows, down, right):
@@ -101,9 +93,9 @@ def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
     data = make_data()
     one = data.batch(32, np.random.default_rng(0), hold_out=True)
     rows = one.reward.long()
-    torch.testing.assert_close(one.observation, data.observe(rows, *data._no_shift(32)))
+    torch.testing.assert_close(one.observation, data.observe(rows))
     two = data.batch(32, np.random.default_rng(0))
-    plain = data.observe(two.reward.long(), *data._no_shift(32))
+    plain = data.observe(two.reward.long())
     same = (two.observation == plain).flatten(1).all(dim=1)
     assert same.sum() < 8
 
@@ -111,8 +103,8 @@ def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
 def test_shifts_can_be_left_out_and_the_same_transitions_are_drawn():
     data = make_data()
     shifted, plain = (data.batch(32, np.random.default_rng(0), next_observation=True, shift=s) for s in (True, False))
-    torch.testing.assert_close(plain.observation, data.observe(plain.reward.long(), *data._no_shift(32)))
-    torch.testing.assert_close(plain.next_observation, data.observe(plain.reward.long() + 1, *data._no_shift(32)))
+    torch.testing.assert_close(plain.observation, data.observe(plain.reward.long()))
+    torch.testing.assert_close(plain.next_observation, data.observe(plain.reward.long() + 1))
     assert (shifted.reward == plain.reward).all()
 
 
@@ -139,32 +131,19 @@ def test_states_are_normalized_by_the_training_episodes_with_a_floor():
     train_rows = np.r_[0:5, 13:16]
     expected = (raw - raw[train_rows].mean(0)) / raw[train_rows].std(0, correction=0)
     torch.testing.assert_close(data.state, expected, atol=1e-5, rtol=1e-5)
-    flat = TrainingData(
-        state=torch.full((4, 2), 7.0),
-        action=torch.zeros(4, 1),
-        reward=torch.zeros(4),
-        discount=torch.ones(4),
-        lengths=np.array([3]),
-        held_out=np.array([False]),
-    )
+    zeros = np.zeros(4, np.float32)
+    fields = {"state": np.full((4, 2), 7.0), "action": zeros[:, None], "reward": zeros, "discount": zeros}
+    flat = TrainingData(StepTable(fields, np.array([3])), np.array([False]))
     assert flat.normalization.std.tolist() == pytest.approx([1e-3, 1e-3]) and flat.state.abs().max() == 0
-
-
-def test_it_is_a_torch_data_set_that_a_loader_reads_batch_by_batch():
-    data = make_data()
-    observations, actions = next(iter(DataLoader(data, batch_size=6)))
-    assert observations.shape == (6, 9, SIZE, SIZE) and len(data) == 6
-    torch.testing.assert_close(observations[3], data[3][0])
-    torch.testing.assert_close(actions, data.action[data.train_rows])
 
 
 def test_a_subset_is_held_as_it_is_stored(small_release):
     subset = open_release(small_release)["walker-walk/random/dynamic"]
     data = load_data([Source(subset)])
-    assert isinstance(data.frames, HeldFrames) and data.channels == 9
+    assert not data.frames.mapped and data.channels == 9
     assert (data.held_out.sum(), len(data), len(data.hold_out_rows)) == (1, 1000, 500)
     episode = subset.episode(2)
-    last = data.observe(torch.tensor([2 * 501 + 400]), *data._no_shift(1))[0, -3:]
+    last = data.observe(torch.tensor([2 * 501 + 400]))[0, -3:]
     np.testing.assert_allclose(last, episode["pixels"][400].transpose(2, 0, 1) / 255 - 0.5, atol=1e-6)
     np.testing.assert_array_equal(data.action[2 * 501 : 2 * 501 + 500], episode["action"])
     raw = data.state * data.normalization.std + data.normalization.mean
@@ -192,7 +171,7 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
 
 
 def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch):
-    monkeypatch.setattr(data_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+    monkeypatch.setattr(steps_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(DmcvbError, match="fit neither into memory nor into .* another --out, or more --memory"):
         load_data([Source(open_release(small_release)["walker-walk/random/none"])], memory=0, scratch=tmp_path)
 

@@ -10,14 +10,7 @@ import torch
 from PIL import Image
 
 from dmcvb_gen.agents.catalog import parse_agent
-from dmcvb_gen.agents.data import (
-    Normalization,
-    Source,
-    default_memory,
-    load_data,
-    normalize_pixels,
-    training_views,
-)
+from dmcvb_gen.agents.data import Normalization, Source, default_memory, load_data, normalize_pixels
 from dmcvb_gen.benchmarks import report
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.experiments import _DataCache, run_cell, train_settings
@@ -29,6 +22,7 @@ from dmcvb_gen.benchmarks.setup import Setup, fingerprint, open_data, pretrainin
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
+from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.reader import Release, Subset
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -252,7 +246,7 @@ def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_rele
         stack = evaluator._see(stack, physics[:, step], walk, step, np.ones(3, bool))
         shown = normalize_pixels(torch.from_numpy(stack).flatten(1, 2))
         rows = torch.arange(3) * 501 + step
-        assert torch.equal(shown, data.observe(rows, *data._no_shift(3)))
+        assert torch.equal(shown, data.observe(rows))
     evaluator.close()
 
 
@@ -285,7 +279,7 @@ def test_agents_see_three_of_a_mazes_views_with_the_goal_hidden_where_the_settin
     monkeypatch.setattr(Subset, "pixel_arrays", property(lambda self: everything))
     for setting, root in (("visible", "pixels"), ("hidden", "pixels_hidden_goal"), ("fixed", "pixels_hidden_goal")):
         subset = release_of(f"ant-maze-empty7x7/expert/{setting}").subsets[f"ant-maze-empty7x7/expert/{setting}"]
-        assert training_views(subset) == tuple(f"{root}/{view}" for view in ("top", "egocentric", "follow"))
+        assert training_pictures(subset).arrays == tuple(f"{root}/{view}" for view in ("top", "egocentric", "follow"))
 
 
 def without_time(point):

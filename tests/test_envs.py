@@ -15,7 +15,6 @@ from gymnasium.utils.env_checker import check_env
 
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.loaders.blocks import stack_channels
 from dmcvb_gen.loaders.dm import DmEnv
 from dmcvb_gen.loaders.envs import FIXED_GOALS, DistractedEnv, DistractedVectorEnv
 from dmcvb_gen.loaders.layout import data_layout
@@ -23,7 +22,7 @@ from dmcvb_gen.loaders.register import MAZES, TASKS, environment_ids
 from dmcvb_gen.spec import DISTRACTOR_KINDS as SETTINGS
 from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from tests.conftest import TINY_MAZE
+from tests.conftest import TINY_MAZE, stack_channels
 
 SMALL = dict(size=16)
 

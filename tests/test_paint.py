@@ -235,7 +235,7 @@ def test_a_source_in_memory_shows_the_subsets_epoch(made):
     subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
     source = subset.source(episodes=[int(subset.episodes[0])])
     before = source[3]["pixels"]
-    assert source.in_memory and source.block is source.block
+    assert source.in_memory and source.table is source.table
     subset.set_epoch(1)
     assert (source[3]["pixels"] != before).any()
     subset.set_epoch(0)
@@ -280,15 +280,15 @@ def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
 @pytest.mark.parametrize("way", [{}, {"paint": True, "distractors": "resample"}])
 def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
     subset = next(reversed(dmcvb_gen.open(str(made / "painted"), **way).subsets.values()))
-    from dmcvb_gen.loaders import source as module
+    from dmcvb_gen.dataset.steps import StepTable
 
-    made_blocks, real = [], module.Block
-    monkeypatch.setattr(module, "Block", lambda *options: made_blocks.append(1) or real(*options))
+    tables, real = [], StepTable.read
+    monkeypatch.setattr(StepTable, "read", lambda *options: tables.append(1) or real(*options))
     source = pickle.loads(pickle.dumps(subset.source()))
     threads = [threading.Thread(target=lambda: source[0]) for _ in range(6)]
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
-    assert len(made_blocks) == 1
+    assert len(tables) == 1
 
 
 def test_painted_episodes_are_kept_while_there_is_room(made):

@@ -1,35 +1,29 @@
-"""Training data of the agents: subsets of a release in, batches of frame stacks, states and transitions out.
+"""Training data of the agents: a step table in, batches of frame stacks, states and transitions on a device out.
 
-Episodes lie one after the other in one table of rows, L + 1 rows an episode (row t: observation t, the action
-taken there, its reward); a batch is a gather from that table, never a loop over samples::
-
-    row        0    1   ...  L_0 | L_0 + 1 ...          start[e] + t
-    frames     o_0  o_1 ...  o_L | o_0 of episode 1 ...  (channel, height, width) uint8
-
-Pictures stay uint8 until they are in a batch. They are held in memory (or on the accelerator) where they fit, else
-decoded once into a file that is mapped into memory.
+The rows are those of `dataset.steps.StepTable`. Pictures stay uint8 until they are in a batch. They are held in memory
+(or on the accelerator) if they fit, else decoded once into a file that is mapped into memory.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
-from torch.utils.data import Dataset
 
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
 FRAMES = 3
 """Frames an observation; the first one of an episode is repeated (paper, appendix "Encoders")."""
@@ -40,8 +34,6 @@ HOLD_OUT = 0.05
 STD_FLOOR = 1e-3
 ENCODED_ROWS = 256
 """Observations that are encoded at a time."""
-READ_EPISODES = 10
-"""Episodes decoded at a time while a subset is loaded."""
 
 
 @dataclass(frozen=True)
@@ -78,74 +70,28 @@ class Normalization:
         return cls(values.mean(dim=0).float(), std.float())
 
 
-def mirror(size: int) -> torch.Tensor:
-    """(size + 2 PAD,) long: which pixel stands where after padding that repeats the border in reverse."""
-    index = torch.arange(size + 2 * PAD) - PAD
-    index = torch.where(index < 0, -index - 1, index)
-    return torch.where(index >= size, 2 * size - 1 - index, index)
-
-
-def _mapped_file(shape: tuple[int, ...], folder: Path) -> np.ndarray:
-    """A uint8 array of that shape in a nameless file."""
-    needed = math.prod(shape)
-    folder.mkdir(parents=True, exist_ok=True)
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise DmcvbError(
-            f"{needed / 1e9:.1f} GB of pictures fit neither into memory nor into {folder} ({free / 1e9:.1f} GB free); "
-            "give another --out, or more --memory"
-        )
-    with tempfile.TemporaryFile(dir=folder) as file:
-        file.truncate(needed)
-        return np.memmap(file, np.uint8, "r+", shape=shape)
-
-
 class HeldFrames:
-    """Pictures in memory, or in a file mapped into it, each line with its mirrored border at both ends.
+    """The frames of a table that was read with a border of `PAD`, as a tensor.
 
-    The borders take an eighth more bytes.
+    A shifted line of pixels is `size` bytes that stand together, so that picking frames, stacking them and moving them
+    is one gather of lines, for any number of stacks. The borders take an eighth more bytes.
 
-    A shifted line of pixels then is `size` bytes that stand together, so that picking frames, stacking them and moving
-    them is one gather of lines, for any number of stacks.
-
-    Args:
-      rows: pictures it has room for; `put` fills it.
-      scratch: a folder; the pictures then lie in a file there that is mapped into memory, so that the system keeps of
-        them what fits. The file has no name and is gone with the process.
-
-    Raises:
-      DmcvbError: the folder has no room for the file.
+    Attributes:
+      table: (row, channel, size, size + 2 PAD) uint8.
+      mapped: whether they lie in a file.
     """
 
-    def __init__(
-        self,
-        rows: int,
-        channels: int,
-        size: int,
-        device: str | torch.device = "cpu",
-        scratch: str | Path | None = None,
-    ):
-        self.channels, self.size, self.mapped = channels, size, scratch is not None
-        shape = (rows, channels, size, size + 2 * PAD)
-        if scratch is None:
-            self.table = torch.empty(shape, dtype=torch.uint8, device=device)
-        else:
-            self.table = torch.from_numpy(_mapped_file(shape, Path(scratch)))
-            device = "cpu"
-        self._mirror = mirror(size).to(device)
+    def __init__(self, frames: np.ndarray, device: str | torch.device = "cpu"):
+        self.mapped = isinstance(frames, np.memmap)
+        self.table = torch.from_numpy(frames).to("cpu" if self.mapped else device)
+        _, self.channels, self.size, _ = frames.shape
+        mirror = np.pad(np.arange(self.size), PAD, mode="symmetric")  # which pixel stands where, after padding
+        self._mirror = torch.from_numpy(mirror).to(self.table.device)
 
     @property
     def pictures(self) -> torch.Tensor:
         """(row, channel, size, size) uint8, a view."""
         return self.table[..., PAD:-PAD]
-
-    def put(self, first: int, pictures: torch.Tensor, channel: int = 0) -> None:
-        """Fill rows from `first` on, channels from `channel` on, with (n, c, size, size) uint8 pictures."""
-        rows, channels = slice(first, first + len(pictures)), slice(channel, channel + pictures.shape[1])
-        filled = self.table[rows, channels]
-        inner = filled[..., PAD:-PAD]
-        inner[:] = pictures.to(filled.device)
-        filled[..., :PAD], filled[..., -PAD:] = inner[..., :PAD].flip(-1), inner[..., -PAD:].flip(-1)
 
     def shifted(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         """(batch, frames) rows, (batch,) offsets in 0..2 PAD -> (batch, frames x channels, size, size) uint8."""
@@ -172,17 +118,6 @@ def normalize_pixels(
     return values.contiguous(memory_format=torch.channels_last) if out is None else out.copy_(values)
 
 
-def stack_rows(row: torch.Tensor, start: torch.Tensor, frames: int) -> torch.Tensor:
-    """(batch,) rows and the first rows of their episodes -> (batch, frames) rows, oldest first."""
-    back = torch.arange(frames - 1, -1, -1, device=row.device)
-    return torch.maximum(row[:, None] - back, start[:, None])
-
-
-def training_views(subset: Subset) -> tuple[str, ...]:
-    """The picture arrays that agents see (`store.pictures.training_pictures`); none where no pictures are stored."""
-    return training_pictures(subset).arrays if subset.pixel_arrays else ()
-
-
 @dataclass(frozen=True)
 class Sizes:
     """Numbers that networks are made for.
@@ -200,11 +135,15 @@ class Sizes:
     stack: int = 0
 
 
-class TrainingData(Dataset):
+class TrainingData:
     """Episodes of one or several subsets, ready to be drawn from.
 
-    As a torch data set it has an item a training transition: (observation, action); `__getitems__` gives many at
-    once, which a DataLoader uses. Training calls `batch`.
+    Args:
+      table: their rows, with frames that have a border of `PAD`, or none.
+      held_out: (episode,) bool, which episodes no agent learns from.
+      stack: frames an observation.
+      returns: (episode,) float64, of all episodes in it.
+      device: where everything is held.
 
     Attributes:
       state: (row, state) float32, normalized.
@@ -212,7 +151,6 @@ class TrainingData(Dataset):
       start, end: (row,) long, first and last row of the row's episode.
       normalization: of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.
-      returns: (episode,) float64, of all episodes in it.
       latent: (row, latent) float32 of a frozen encoder (`encoded`); None elsewhere.
     """
 
@@ -220,29 +158,22 @@ class TrainingData(Dataset):
 
     def __init__(
         self,
-        state: torch.Tensor,
-        action: torch.Tensor,
-        reward: torch.Tensor,
-        discount: torch.Tensor,
-        lengths: np.ndarray,
+        table: StepTable,
         held_out: np.ndarray,
-        frames: HeldFrames | None = None,
         stack: int = FRAMES,
         returns: np.ndarray | None = None,
+        device: str | torch.device = "cpu",
     ):
-        device = state.device
-        first = np.cumsum(lengths + 1) - (lengths + 1)
-        self.start = torch.as_tensor(np.repeat(first, lengths + 1), device=device)
-        self.end = torch.as_tensor(np.repeat(first + lengths, lengths + 1), device=device)
-        rows = torch.arange(len(state), device=device)
-        out = torch.as_tensor(np.repeat(held_out, lengths + 1), device=device)
-        self.train_rows = rows[(rows < self.end) & ~out]
-        self.hold_out_rows = rows[(rows < self.end) & out]
-        self.normalization = Normalization.of(state[~out])
-        self.state = self.normalization(state)
-        self.action, self.reward, self.discount = action, reward, discount
-        self.frames, self.stack = frames, stack
-        self.lengths, self.held_out, self.returns = lengths, held_out, returns
+        out = np.repeat(held_out, table.lengths + 1)
+        values = (getattr(table, name) for name in (*FIELDS, "start", "end", "steps"))
+        state, *values, self.start, self.end, rows = (torch.from_numpy(value).to(device) for value in values)
+        self.action, self.reward, self.discount = (value.float() for value in values)
+        held = torch.from_numpy(out).to(device)
+        self.train_rows, self.hold_out_rows = rows[~held[rows]], rows[held[rows]]
+        self.normalization = Normalization.of(state[~held])
+        self.state = self.normalization(state.float())
+        self.frames = None if table.frames is None else HeldFrames(table.frames, device)
+        self.lengths, self.held_out, self.returns, self.stack = table.lengths, held_out, returns, stack
 
     @property
     def channels(self) -> int:
@@ -262,30 +193,26 @@ class TrainingData(Dataset):
     def __len__(self) -> int:
         return len(self.train_rows)
 
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.__getitems__([index])[0]
-
-    def __getitems__(self, indices: Sequence[int]) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        rows = self.train_rows[torch.as_tensor(indices, device=self.device)]
-        observations = self.observe(rows, *self._no_shift(len(rows)))
-        return list(zip(observations, self.action[rows], strict=True))
-
-    def _no_shift(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-        middle = torch.full((count,), PAD, device=self.device)
-        return middle, middle
-
     def observe(
         self,
         rows: torch.Tensor,
-        down: torch.Tensor,
-        right: torch.Tensor,
+        down: torch.Tensor | None = None,
+        right: torch.Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         out: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures."""
+        """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures.
+
+        Args:
+          down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
+          dtype: of pictures. out: written over, if given.
+        """
         if self.frames is None:
             return self.state[rows]
-        stacks = stack_rows(rows, self.start[rows], self.stack)
+        if down is None or right is None:
+            down = right = torch.full_like(rows, PAD)
+        back = torch.arange(self.stack - 1, -1, -1, device=rows.device)
+        stacks = torch.maximum(rows[:, None] - back, self.start[rows][:, None])
         return normalize_pixels(self.frames.shifted(stacks, down, right).to(self.device), dtype, out)
 
     def batch(
@@ -298,9 +225,7 @@ class TrainingData(Dataset):
         sample_k: bool = False,
         hold_out: bool = False,
         shift: bool = True,
-        dtype: torch.dtype = torch.float32,
-        reuse: Batch | None = None,
-        pictures: bool = True,
+        **options: Any,
     ) -> Batch:
         """Transitions drawn uniformly, with replacement.
 
@@ -309,10 +234,7 @@ class TrainingData(Dataset):
           k: steps between the two; with `sample_k` drawn from 1..k for each.
           hold_out: draw from the held-out episodes, without shifts.
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
-          dtype: of pictures. Half the bytes are half the time to write them.
-          reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
-            memory for a large batch costs several times the work that fills it.
-          pictures: give observations even if the data are encoded.
+          options: dtype, reuse and pictures of `transitions`.
         """
         rows = self.hold_out_rows if hold_out else self.train_rows
         if next_observation and k > 1:
@@ -323,14 +245,12 @@ class TrainingData(Dataset):
                 "episodes"
             )
         chosen = rows[self._to_device(generator.integers(len(rows), size=size))]
-        if hold_out or not shift or self.frames is None or self.latent is not None:
-            down, right = self._no_shift(size)
-        else:
+        down = right = steps = None
+        if shift and not hold_out and self.frames is not None and self.latent is None:
             down, right = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
-        steps = None
         if next_observation:
             steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-        return self.transitions(chosen, steps, down, right, dtype, reuse, pictures)
+        return self.transitions(chosen, steps, down, right, **options)
 
     def transitions(
         self,
@@ -347,11 +267,11 @@ class TrainingData(Dataset):
         Args:
           rows: (batch,) long.
           steps: (batch,) long, how far off the next observation is; None: no next observation.
-          down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
-          dtype, reuse, pictures: as for `batch`.
+          down, right, dtype: as for `observe`. Half the bytes are half the time to write them.
+          reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
+            memory for a large batch costs several times the work that fills it.
+          pictures: give observations even if the data are encoded.
         """
-        if down is None or right is None:
-            down, right = self._no_shift(len(rows))
         now = later = None
         if pictures or self.latent is None:
             now = self.observe(rows, down, right, dtype, reuse and reuse.observation)
@@ -388,7 +308,7 @@ class TrainingData(Dataset):
         parts = []
         for few in rows.split(ENCODED_ROWS):
             with torch.autocast(self.device.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
-                parts.append(encoder(self.observe(few, *self._no_shift(len(few)), dtype)).float())
+                parts.append(encoder(self.observe(few, dtype=dtype)).float())
         return self._with(latent=torch.cat(parts))
 
     def _with(self, **changes) -> TrainingData:
@@ -453,8 +373,7 @@ def default_memory(device: str = "cpu") -> int:
     """Bytes of pictures that are held: half of what the machine (or its accelerator) has free."""
     if device.startswith("cuda"):
         return torch.cuda.mem_get_info(device)[0] // 2
-    pages = os.sysconf("SC_AVPHYS_PAGES") if "SC_AVPHYS_PAGES" in os.sysconf_names else 2**20
-    return pages * os.sysconf("SC_PAGE_SIZE") // 2
+    return (free_memory() or UNKNOWN_MEMORY) // 2
 
 
 def load_data(
@@ -480,74 +399,20 @@ def load_data(
       DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
     """
     subsets = [source.subset for source in sources]
-    names = _picture_arrays(subsets, pixels)
-    chosen = [choose_episodes(source, seed) for source in sources]
-    lengths = [
-        subset.lengths[np.searchsorted(subset.episodes, e)] for subset, (e, _) in zip(subsets, chosen, strict=True)
-    ]
-    returns = [
-        subset.returns[np.searchsorted(subset.episodes, e)] for subset, (e, _) in zip(subsets, chosen, strict=True)
-    ]
-    size, channels = subsets[0].record.size, 3 * len(names[0])
-    rows = int(sum((length + 1).sum() for length in lengths))
-    needed = rows * channels * size * (size + 2 * PAD)
-    hold = pixels and needed <= (default_memory(device) if memory is None else memory)
-    folder = None if hold else scratch or tempfile.gettempdir()
-    held = HeldFrames(rows, channels, size, device, folder) if pixels else None
-    tables = _read_rows(subsets, names, [episodes for episodes, _ in chosen], lengths, held)
-    return TrainingData(
-        **{name: torch.from_numpy(values).float().to(device) for name, values in tables.items()},
-        lengths=np.concatenate(lengths).astype(np.int64),
-        held_out=np.concatenate([out for _, out in chosen]),
-        frames=held,
-        stack=stack,
-        returns=np.concatenate(returns),
-    )
-
-
-def _picture_arrays(subsets: Sequence[Subset], pixels: bool) -> list[tuple[str, ...]]:
-    """The picture arrays of each subset that agents see.
-
-    Raises:
-      DmcvbError: the subsets are of different tasks or picture sizes, or (with `pixels`) hold no pictures.
-    """
-    names = [training_views(subset) for subset in subsets]
+    names = [training_pictures(subset).arrays if subset.pixel_arrays else () for subset in subsets]
     if len({(subset.task, subset.record.size, len(n)) for subset, n in zip(subsets, names, strict=True)}) != 1:
         raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or picture sizes differ")
     if pixels and not names[0]:
         raise DmcvbError(f"{subsets[0].name} has no pictures that agents are trained on")
-    return names
-
-
-def _read_rows(
-    subsets: Sequence[Subset],
-    names: Sequence[tuple[str, ...]],
-    chosen: Sequence[np.ndarray],
-    lengths: Sequence[np.ndarray],
-    held: HeldFrames | None,
-) -> dict[str, np.ndarray]:
-    """The rows of all chosen episodes, one after the other; pictures go into `held`.
-
-    Args:
-      chosen: (episode,) indices of each subset. lengths: (episode,) of those.
-
-    Returns:
-      Tables of (row, ...) values.
-    """
-    tables: dict[str, list[np.ndarray]] = {"state": [], "action": [], "reward": [], "discount": []}
-    first = 0
-    for index, (subset, episodes, length) in enumerate(zip(subsets, chosen, lengths, strict=True)):
-        step = np.arange(int(length.max()) + 1)
-        for part in range(0, len(episodes), READ_EPISODES):
-            few = episodes[part : part + READ_EPISODES]
-            e, t = np.nonzero(step[None] <= length[part : part + READ_EPISODES, None])
-            for name, table in tables.items():
-                table.append(subset.read(name, few)[e, t])
-            for view, name in enumerate(names[index] if held is not None else ()):
-                pictures = torch.from_numpy(subset.read(name, few)[e, t])
-                held.put(first, pictures.permute(0, 3, 1, 2), channel=3 * view)
-            first += len(e)
-    return {name: np.concatenate(parts) for name, parts in tables.items()}
+    chosen, held_out = zip(*(choose_episodes(source, seed) for source in sources), strict=True)
+    parts = [Selection(s, e, n if pixels else ()) for s, e, n in zip(subsets, chosen, names, strict=True)]
+    size, lengths = subsets[0].record.size, [part.subset.read("length", part.episodes) for part in parts]
+    needed = int((np.concatenate(lengths) + 1).sum()) * 3 * len(names[0]) * size * (size + 2 * PAD)
+    if memory is None:  # an accelerator's pictures are read into main memory first
+        memory = min(default_memory(place) for place in ("cpu", device))
+    table = StepTable.read(parts, PAD, None if needed <= memory else scratch or tempfile.gettempdir())
+    returns = np.concatenate([part.subset.read("return", part.episodes) for part in parts])
+    return TrainingData(table, np.concatenate(held_out), stack, returns, device)
 
 
 __all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data"]

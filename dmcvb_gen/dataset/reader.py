@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -43,6 +43,8 @@ class StoredArray:
       name: e.g. "pixels/top".
       shape, dtype, ndim: as in numpy; an entry for each episode that the subset will have.
       dimensions: names of the axes.
+      attributes: stored with the array.
+      chunking: its "chunks" and "shards", entries of each axis.
     """
 
     def __init__(self, array: zarr.Array, name: str, place: str, unpainted: np.ndarray | None = None, cure: str = ""):
@@ -50,6 +52,7 @@ class StoredArray:
         self._unpainted, self._cure = unpainted, cure
         self.shape, self.dtype, self.ndim = array.shape, array.dtype, array.ndim
         self.dimensions = tuple(map(str, getattr(array.metadata, "dimension_names", None) or ()))
+        self.attributes, self.chunking = dict(array.attrs), {"chunks": array.chunks, "shards": array.shards}
 
     def __repr__(self) -> str:
         return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
@@ -59,17 +62,26 @@ class StoredArray:
         with storage_errors(self._place, decoding=True):
             return cast(np.ndarray, self._array[selection])
 
-    def rows(self, episodes: np.ndarray) -> np.ndarray:
+    def outer(self, selection: tuple) -> np.ndarray:
+        """Values at a selection along each axis for itself: slices, indices or arrays of them."""
+        with storage_errors(self._place, decoding=True):
+            return cast(np.ndarray, self._array.oindex[selection])
+
+    def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
         """(episode, ...) values of episodes in any order; of arrays with steps, those in a row are read at once.
 
         Zarr's own selection of scattered rows takes thirty times as long for pictures.
+
+        Args:
+          rows: read the first rows of the step axis alone.
         """
         self._check_painted(episodes)
         with storage_errors(self._place, decoding=True):
             if self.ndim == 1:
                 return cast(np.ndarray, self._array.oindex[episodes])
             runs = np.split(episodes, np.flatnonzero(np.diff(episodes) != 1) + 1)
-            return np.concatenate([self._array[int(run[0]) : int(run[-1]) + 1] for run in runs])
+            read = [cast(np.ndarray, self._array[int(run[0]) : int(run[-1]) + 1, :rows]) for run in runs]
+            return read[0] if len(read) == 1 else np.concatenate(read)
 
     def _check_painted(self, selection: Any) -> None:
         """Raises StoreError for an episode without pictures, which would read as black."""
@@ -92,6 +104,10 @@ class Subset:
         self.root, self.record, self.commits = root, record, dict(commits)
         self._storage_options = storage_options
 
+    def read_as(self, kind: Callable[..., Any], *options: Any) -> Any:
+        """The same subset as another class of subset."""
+        return kind(self.root, self.record, self.commits, self._storage_options, *options)
+
     @property
     def name(self) -> str:
         return self.record.name
@@ -112,9 +128,12 @@ class Subset:
         return f"<Subset {self.name}: {len(self.episodes)} of {self.record.episodes} episodes>"
 
     def __getstate__(self) -> dict[str, Any]:  # zarr handles are opened again where the subset lands
-        return {
-            key: value for key, value in self.__dict__.items() if key not in ("group", "lengths", "returns", "paths")
-        }
+        handles = ("group", "lengths", "returns", "paths", "_opened")
+        return {key: value for key, value in self.__dict__.items() if key not in handles}
+
+    @functools.cached_property
+    def _opened(self) -> dict[str, StoredArray]:
+        return {}
 
     @functools.cached_property
     def group(self) -> zarr.Group:
@@ -151,6 +170,8 @@ class Subset:
           UnknownNameError: the subset has no such array.
         """
         picture = picture_of(name) is not None
+        if name in self._opened:
+            return self._opened[name]
         if name not in self.paths:
             if picture and not self.record.pixels:
                 raise StoreError(self._without_pictures)
@@ -160,7 +181,9 @@ class Subset:
             array = self.group[self.paths[name]]
             assert isinstance(array, zarr.Array)  # `paths` names arrays alone
             self._check_shape(array, name)
-            return StoredArray(array, name, f"{self.path}/{self.paths[name]}", unpainted, self._without_pictures)
+            place = f"{self.path}/{self.paths[name]}"
+            self._opened[name] = StoredArray(array, name, place, unpainted, self._without_pictures)
+        return self._opened[name]
 
     @property
     def unpainted(self) -> np.ndarray:
@@ -237,19 +260,41 @@ class Subset:
         Returns:
           (episode, step, ...) for arrays with steps, rows past an episode's length are zero; else (episode, ...).
         """
+        if isinstance(episodes, slice):
+            episodes = self.episodes[np.isin(self.episodes, np.arange(self.record.episodes)[episodes])]
+        return self._read(array, self.choose(episodes))
+
+    def _read(self, array: str, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
         source = self.array(array)
-        if episodes is None:
-            chosen = self.episodes
-        elif isinstance(episodes, slice):
-            chosen = self.episodes[np.isin(self.episodes, np.arange(self.record.episodes)[episodes])]
-        else:
-            chosen = np.atleast_1d(np.asarray(list(episodes), int))
-            missing = np.setdiff1d(chosen, self.episodes)
-            if len(missing):
-                raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
-        if not len(chosen):
-            return np.zeros((0, *source.shape[1:]), source.dtype)
-        return source.rows(chosen)
+        return source.rows(episodes, rows) if len(episodes) else np.zeros((0, *source.shape[1:]), source.dtype)
+
+    def choose(self, episodes: Iterable[int] | None = None) -> np.ndarray:
+        """(episode,) int: indices of committed episodes, all by default.
+
+        Raises:
+          StoreError: one of them is not there.
+        """
+        chosen = self.episodes if episodes is None else np.asarray(list(episodes), int)
+        missing = np.setdiff1d(chosen, self.episodes)
+        if len(missing):
+            raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
+        return chosen
+
+    def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
+        """Rows of episodes, one episode after the other.
+
+        Args:
+          arrays: names of arrays with steps.
+          episodes: indices of committed episodes.
+
+        Returns:
+          (row, ...) by name, L + 1 rows of each episode.
+        """
+        chosen = self.choose(episodes)
+        length = self.read("length", chosen).clip(0, self.record.max_steps)  # a damaged one asks for no more memory
+        used = np.arange(int(length.max(initial=-1)) + 1) <= length[:, None]
+        read = ((name, self._read(name, chosen, used.shape[1])) for name in arrays)
+        return {name: value.reshape(-1, *value.shape[2:]) if used.all() else value[used] for name, value in read}
 
     def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
         """The stored labels of the distractors, leading shape (episode, step); see `read`."""
@@ -261,14 +306,10 @@ class Subset:
         Returns:
           Arrays by name: L + 1 rows of pixels, state, physics and labels; L rows of action, reward and discount.
         """
-        length = int(self.read("length", [index])[0])
-        values = {}
-        for name in self.arrays if arrays is None else arrays:
-            value = self.read(name, [index])[0]
-            if self.array(name).ndim > 1:
-                value = value[: length if name in ("action", "reward", "discount") else length + 1]
-            values[name] = value
-        return values
+        names = self.arrays if arrays is None else tuple(arrays)
+        values = self.rows([name for name in names if self.array(name).ndim > 1], [index])
+        values |= {name: values[name][:-1] for name in ("action", "reward", "discount") if name in values}
+        return {name: values[name] if name in values else self.read(name, [index])[0] for name in names}
 
 
 def _ranges(indices: np.ndarray) -> str:

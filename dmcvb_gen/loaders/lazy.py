@@ -1,4 +1,4 @@
-"""xarray's lazy arrays, read within `storage_errors`: damaged bytes and lost connections are one line with a cure."""
+"""A subset as one lazy xarray data set; damaged bytes and lost connections are one line with a cure."""
 
 from __future__ import annotations
 
@@ -9,33 +9,31 @@ import xarray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.reader import StoredArray
 
 
-class Guarded(BackendArray):
-    """The values of a lazy variable.
+class _Lazy(BackendArray):
+    """The values of a lazy variable."""
 
-    Args:
-      place: the array's folder or URL, for errors.
-    """
-
-    def __init__(self, variable: xarray.Variable, place: str):
-        self._variable, self._place = variable, place
-        self.shape, self.dtype = variable.shape, variable.dtype
+    def __init__(self, array: StoredArray):
+        self._array, self.shape, self.dtype = array, array.shape, array.dtype
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
 
     def _read(self, key: tuple) -> np.ndarray:
-        with storage_errors(self._place, decoding=True):
-            return self._variable[key].values
+        return self._array.outer(key)
 
 
-def guarded(data: xarray.Dataset, place: str) -> xarray.Dataset:
-    """A lazy data set, opened at `place`, whose variables are read within `storage_errors`."""
-    lazy = {}
-    for name, variable in data.variables.items():
-        source = indexing.LazilyIndexedArray(Guarded(variable, f"{place}/{name}"))
-        held = indexing.MemoryCachedArray(source)
-        lazy[name] = xarray.Variable(variable.dims, held, variable.attrs, variable.encoding)
-    return xarray.Dataset(lazy, attrs=data.attrs)
+def lazy_dataset(subset: Subset, episodes: np.ndarray) -> xarray.Dataset:
+    """See `SubsetReader.xarray`."""
+    variables = {}
+    for name in subset.arrays:
+        array = subset.array(name)
+        # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
+        dimensions = [f"{name}_dim" if name in subset.arrays else name for name in array.dimensions]
+        held = indexing.MemoryCachedArray(indexing.LazilyIndexedArray(_Lazy(array)))
+        variables[name.replace("/", "_")] = xarray.Variable(dimensions, held, array.attributes, array.chunking)
+    data = xarray.Dataset(variables, attrs=subset.attrs).isel(episode=episodes)
+    return data.assign_coords(episode=episodes, step=np.arange(data.sizes["step"]))

@@ -73,9 +73,9 @@ class PaintedArray:
             return self._subset.painted(int(episodes), [self.name])[self.name][tuple(rest)]
         return self.rows(np.asarray(episodes))[(slice(None), *rest)]
 
-    def rows(self, episodes: np.ndarray) -> np.ndarray:
+    def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
         """(episode, row, height, width, 3) uint8, rows past an episode's end zero."""
-        return np.stack([self._subset.painted(int(episode), [self.name])[self.name] for episode in episodes])
+        return np.stack([self._subset.painted(int(episode), [self.name])[self.name][:rows] for episode in episodes])
 
 
 class PaintedSubset(SubsetReader):
@@ -153,14 +153,18 @@ class PaintedSubset(SubsetReader):
     def array(self, name: str) -> Any:
         return PaintedArray(self, name) if picture_of(name) is not None else super().array(name)
 
-    def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """See `Subset.episode`; all of its pictures are painted at once."""
-        names = self.arrays if arrays is None else tuple(arrays)
-        pictures = self.painted(int(index), [name for name in names if picture_of(name) is not None])
-        used = int(self.read("length", [index])[0]) + 1
-        values = super().episode(index, [name for name in names if name not in pictures])
-        values |= {name: value[:used] for name, value in pictures.items()}
-        return {name: values[name] for name in names}
+    def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
+        """See `Subset.rows`; all pictures of an episode are painted at once."""
+        names, chosen = tuple(arrays), self.choose(episodes)
+        pictures = [name for name in names if picture_of(name) is not None]
+        if not pictures or not len(chosen):
+            return super().rows(names, chosen)
+        counts = self.read("length", chosen) + 1
+        painted = [self.painted(int(episode), pictures) for episode in chosen]
+        values = super().rows([name for name in names if name not in pictures], chosen)
+        for name in pictures:
+            values[name] = np.concatenate([p[name][:count] for p, count in zip(painted, counts, strict=True)])
+        return values
 
     def painted(self, episode: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Picture arrays of an episode by name, each (row, height, width, 3) uint8.
@@ -236,11 +240,9 @@ def painted_release(release: Release, painting: Painting, missing: bool = False)
     if all(record.imported for record in release.manifest.subsets) and not missing:
         raise StoreError(f"{release.root} was imported and has no physics states to paint from; open it without paint")
     subsets = {
-        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
+        name: subset.read_as(SubsetReader)
         if subset.record.imported or (missing and subset.record.pixels and not subset.unpainted.any())
-        else PaintedSubset(
-            subset.root, subset.record, subset.commits, subset._storage_options, release.manifest, painting
-        )
+        else subset.read_as(PaintedSubset, release.manifest, painting)
         for name, subset in release.subsets.items()
     }
     return ReleaseReader(release.root, release.manifest, subsets)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, cast
-
-import numpy as np
 
 from dmcvb_gen.dataset import Release, Subset, open_release
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.loaders.blocks import choose, stream
 from dmcvb_gen.loaders.source import StepSource
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.loaders.stream import Steps, stream
 
 if TYPE_CHECKING:
     import xarray
-
-KINDS = ("steps", "transitions", "episodes", "stream")
 
 
 class SubsetReader(Subset):
@@ -36,28 +32,12 @@ class SubsetReader(Subset):
           StoreError: an episode is not there, or has not been painted where others have; also where values are used
             that are damaged or cannot be read.
         """
-        import xarray
+        from dmcvb_gen.loaders.lazy import lazy_dataset
 
-        from dmcvb_gen.loaders.lazy import guarded
-
-        chosen = choose(self, episodes)
+        chosen = self.choose(episodes)
         if any(name in self.paths for name in self.pixel_arrays) and self.unpainted[chosen].any():
             raise StoreError(self._without_pictures)  # they would read as black
-        options = self._storage_options if "://" in self.root else None
-        path = f"{self.root}/{self.name}.zarr"
-        parts = []
-        for folder in sorted({path.rpartition("/")[0] for path in self.paths.values()}):
-            with storage_errors(path, decoding=True):
-                part = xarray.open_zarr(
-                    path, group=folder or None, consolidated=None, chunks=None, storage_options=options
-                )
-            # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
-            part = part.reset_coords().rename_dims({name: f"{name}_dim" for name in part.dims if name in part})
-            part = guarded(part, f"{path}/{folder}".rstrip("/"))
-            parts.append(part.rename({name: f"{folder}_{name}".replace("/", "_") for name in part} if folder else {}))
-        merged = xarray.merge(parts, combine_attrs="override")
-        merged = merged.isel(episode=chosen).assign_coords(episode=chosen, step=np.arange(merged.sizes["step"]))
-        return merged.assign_attrs(self.attrs)
+        return lazy_dataset(self, chosen)
 
     def torch(self, kind: str = "steps", **options: Any) -> Any:
         """A torch data set.
@@ -72,23 +52,23 @@ class SubsetReader(Subset):
         """
         from dmcvb_gen.loaders import torch_data
 
-        if kind == "steps":
-            return torch_data.StepDataset(self, **options)
-        if kind == "transitions":
-            return torch_data.StepDataset(self, next_step=True, **options)
-        if kind == "episodes":
-            return torch_data.EpisodeDataset(self, **options)
-        if kind == "stream":
-            return torch_data.StreamDataset(self, **options)
-        raise UnknownNameError("kind of data set", kind, KINDS)
+        kinds: dict[str, Callable[..., Any]] = {
+            "steps": torch_data.StepDataset,
+            "transitions": functools.partial(torch_data.StepDataset, next_step=True),
+            "episodes": torch_data.EpisodeDataset,
+            "stream": torch_data.StreamDataset,
+        }
+        if kind not in kinds:
+            raise UnknownNameError("kind of data set", kind, kinds)
+        return kinds[kind](self, **options)
 
     def source(self, **options: Any) -> StepSource:
         """Any step at random, numpy alone: for Grain, tf.data or torch; `options` as for `StepSource`."""
         return StepSource(self, **options)
 
-    def batches(self, batch_size: int, **options: Any) -> Iterator[dict[str, np.ndarray]]:
+    def batches(self, batch_size: int, **options: Any) -> Iterator[Steps]:
         """One pass over the steps in shuffled numpy batches; `options` as for `StreamDataset`."""
-        yield from stream(self, batch_size=batch_size, **options)
+        return stream(self, batch_size=batch_size, **options)
 
 
 class ReleaseReader(Release):
@@ -103,8 +83,5 @@ class ReleaseReader(Release):
 def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseReader:
     """See `dmcvb_gen.open`."""
     release = open_release(path, storage_options)
-    subsets = {
-        name: SubsetReader(subset.root, subset.record, subset.commits, subset._storage_options)
-        for name, subset in release.subsets.items()
-    }
+    subsets = {name: subset.read_as(SubsetReader) for name, subset in release.subsets.items()}
     return ReleaseReader(release.root, release.manifest, subsets)

@@ -8,55 +8,53 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import shown
-from dmcvb_gen.loaders.blocks import choose, stack_channels, stream
+from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.loaders.source import StepSource
+from dmcvb_gen.loaders.stream import Steps, stream
 
 
-def _tensor(value: np.ndarray) -> torch.Tensor:
-    return torch.as_tensor(np.ascontiguousarray(value)).reshape(np.shape(value))  # that call makes () to (1,)
+def _tensors(values: Steps) -> dict[str, torch.Tensor]:
+    return {name: torch.as_tensor(value) for name, value in values.items()}
 
 
-def _tensors(values: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    return {name: _tensor(value) for name, value in values.items()}
+class _OfEpoch:
+    """Data of an epoch that a loader's persistent workers see too: in shared memory, as they keep the data they have.
 
+    Attributes:
+      subset: that is read.
+      epoch: 0 at the start.
+    """
 
-class _Epochs:
-    """An epoch that a loader's persistent workers see too: in shared memory, as they keep the data they began with."""
-
-    def __init__(self, subset: Subset, given: int | None = None):
-        self._subset = subset
-        self._epoch = torch.tensor(-1 if given is None else given).share_memory_()  # -1: nobody has given one
+    def __init__(self, subset: Subset, epoch: int | None = None):
+        self.subset = subset
+        self._epoch = torch.tensor(-1 if epoch is None else epoch).share_memory_()  # -1: nobody has given one
 
     @property
-    def number(self) -> int:
+    def epoch(self) -> int:
         return max(0, int(self._epoch))
 
-    def set(self, epoch: int) -> None:
+    def set_epoch(self, epoch: int) -> None:
+        """Show other distractors, if the subset's are fresh, and take another order (of a stream; the same one for the
+        same number), in a loader's workers too."""
         self._epoch.fill_(epoch)
 
-    @property
-    def given(self) -> int:
-        """The epoch; -1 where nobody has given one."""
-        return int(self._epoch)
-
-    def take(self, given: int | None = None) -> None:
-        """Let the subset know (one with fresh distractors), in whichever process reads it.
+    def _show(self, epoch: int | None = None) -> None:
+        """Let the subset know the epoch (one with fresh distractors), in whichever process reads it.
 
         At every read, as other data sets of the subset may be at another epoch. One that was given none shows that of
         the subset. A pass that has begun keeps the epoch that was given before it.
         """
-        given = self.given if given is None else given
-        if given >= 0 and getattr(self._subset, "epoch", given) != given:
-            self._subset.set_epoch(given)  # type: ignore[attr-defined]
+        epoch = int(self._epoch) if epoch is None else epoch
+        if epoch >= 0 and getattr(self.subset, "epoch", epoch) != epoch:
+            self.subset.set_epoch(epoch)  # type: ignore[attr-defined]
 
 
-class StepDataset(Dataset):
+class StepDataset(_OfEpoch, Dataset):
     """Any step at random: frame stack, state, action, reward, discount (see `source.StepSource`), as tensors.
 
     A `DataLoader` takes whole batches from it at once. Held in memory, as by default where it fits, it is as fast as
@@ -67,28 +65,24 @@ class StepDataset(Dataset):
     """
 
     def __init__(self, subset: Subset, **options: Any):
-        self.source, self._epochs = StepSource(subset, **options), _Epochs(subset)
+        super().__init__(subset)
+        self.source = StepSource(subset, **options)
         if self.source.in_memory:
-            _ = self.source.block  # read now, so that workers that are forked share it
+            _ = self.source.table  # read now, so that workers that are forked share it
 
     def __len__(self) -> int:
         return len(self.source)
 
-    def set_epoch(self, epoch: int) -> None:
-        """Show other distractors, if the subset's are fresh, in a loader's workers too."""
-        self._epochs.set(epoch)
-
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
-        self._epochs.take()
-        return _tensors(self.source[index])
+        return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, torch.Tensor]]:
-        self._epochs.take()
+        self._show()
         batch = _tensors(self.source.gather(indices))
         return [{name: value[row] for name, value in batch.items()} for row in range(len(indices))]
 
 
-class EpisodeDataset(Dataset):
+class EpisodeDataset(_OfEpoch, Dataset):
     """Whole episodes: "pixels" (L + 1, view * 3, height, width) uint8, "state" (L + 1, state), "action" (L, action),
     "reward", "discount" (L,), "episode"; episodes differ in length L where a task can end early.
 
@@ -102,68 +96,47 @@ class EpisodeDataset(Dataset):
         episodes: Sequence[int] | None = None,
         pictures: Sequence[str] | None = None,
     ):
-        self.subset, self.pictures = subset, shown(subset, pictures).arrays
-        self.episodes, self._epochs = choose(subset, episodes), _Epochs(subset)
+        super().__init__(subset)
+        self.pictures, self.episodes = shown(subset, pictures).arrays, subset.choose(episodes)
 
     def __len__(self) -> int:
         return len(self.episodes)
 
-    def set_epoch(self, epoch: int) -> None:
-        """Show other distractors, if the subset's are fresh, in a loader's workers too."""
-        self._epochs.set(epoch)
-
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
-        self._epochs.take()
-        episode = int(self.episodes[index])
-        values = self.subset.episode(episode, ["state", "action", "reward", "discount", *self.pictures])
-        if self.pictures:
-            frames = np.stack([values.pop(name) for name in self.pictures], axis=1)  # (row, view, height, width, 3)
-            values["pixels"] = stack_channels(frames[:, None])
-        return _tensors(values | {"episode": np.asarray(episode)})
+        self._show()
+        episode = self.episodes[index]
+        table = StepTable.read([Selection(self.subset, self.episodes[[index]], self.pictures)])
+        values = {name: getattr(table, name)[: len(table)] for name in ("action", "reward", "discount")}
+        values |= {"state": table.state, "episode": episode}
+        return _tensors(values if table.frames is None else values | {"pixels": table.frames})
 
 
-class StreamDataset(IterableDataset):
+class StreamDataset(_OfEpoch, IterableDataset):
     """All steps once an epoch, shuffled, read an episode at a time; shared among ranks and loader workers.
 
     Give it to a `DataLoader` with `batch_size=None` when it makes the batches itself (`batch_size` here), and call
     `set_epoch` before each epoch for another order.
 
     Args:
-      batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `blocks.stream`.
+      batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `stream.stream`.
       rank, world: this process's share; those of torch.distributed by default, where it runs.
     """
 
     def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options: Any):
-        self.subset, self.options = subset, options
-        self._epochs = _Epochs(subset, options.pop("epoch", None))
+        super().__init__(subset, options.pop("epoch", None))
+        self.options = options
         running = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else torch.distributed.get_rank() if running else 0
         self.world = world if world is not None else torch.distributed.get_world_size() if running else 1
 
-    @property
-    def epoch(self) -> int:
-        return self._epochs.number
-
-    def set_epoch(self, epoch: int) -> None:
-        """Take another order (and the same one for the same number), and show other distractors, if the subset's are
-        fresh; in a loader's workers too."""
-        self._epochs.set(epoch)
-
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
-        given = self._epochs.given  # of the whole pass, though others may read the subset between its batches
+        given = int(self._epoch)  # of the whole pass, though others may read the subset between its batches
         worker = get_worker_info()
-        place = (worker.id, worker.num_workers) if worker else (0, 1)
-        items = stream(
-            self.subset,
-            epoch=max(0, given),
-            rank=self.rank,
-            world=self.world,
-            worker=place[0],
-            workers=place[1],
-            **self.options,
-        )
+        place: dict[str, Any] = dict(rank=self.rank, world=self.world)
+        place |= dict(worker=worker.id, workers=worker.num_workers) if worker else {}
+        items = stream(self.subset, epoch=max(0, given), **place, **self.options)
         while True:
-            self._epochs.take(given)
+            self._show(given)
             values = next(items, None)
             if values is None:
                 return

@@ -8,8 +8,8 @@ import pytest
 import zarr
 
 import dmcvb_gen
-from dmcvb_gen.loaders.blocks import stack_channels
 from dmcvb_gen.release.export import export
+from tests.conftest import stack_channels
 
 
 def test_readers_stack_the_right_pictures(stored):
@@ -22,7 +22,9 @@ def test_readers_stack_the_right_pictures(stored):
         for held in (True, False):
             np.testing.assert_array_equal(subset.source(in_memory=held)[before + 5]["pixels"], expected)
             np.testing.assert_array_equal(subset.torch("steps", in_memory=held)[before + 5]["pixels"], expected)
-        np.testing.assert_array_equal(subset.torch("episodes")[1]["pixels"], stack_channels(values["pixels"][:, None]))
+        np.testing.assert_array_equal(
+            subset.torch("episodes")[1]["pixels"], [stack_channels([row]) for row in values["pixels"]]
+        )
         [batch] = subset.batches(10**6)
         chosen = (batch["episode"] == 1) & (batch["step"] == 5)
         np.testing.assert_array_equal(batch["pixels"][chosen][0], expected)
