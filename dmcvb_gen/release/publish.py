@@ -34,19 +34,12 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.shards import wrong_bytes
-from dmcvb_gen.dataset.transfer import (
-    create_object,
-    in_parallel,
-    put_object,
-    read_object,
-    retry,
-    upload,
-)
 from dmcvb_gen.dataset.writer import read_commits
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.storage.remote import file_system, public, storage_errors
+from dmcvb_gen.storage import Storage, open_storage
+from dmcvb_gen.storage.remote import storage_errors
 
 CLAIM = "publishing.json"
 
@@ -102,37 +95,28 @@ def publish(
     index = index_of(root, manifest)
     total = sum(file.bytes for file in index.files)
     _check_card(root, manifest, index)
-    if url.startswith("hf://"):
-        from dmcvb_gen.release.hub import publish_to_hub
-
-        return Moved(len(index.files), total, publish_to_hub(root, manifest, index, url, tick))
-    filesystem, base = file_system(url, options)
-    place = public(url)
-    before, same = _published(filesystem, place, base, index, manifest)
+    storage, tag = open_storage(url, options), (f"v{manifest.version}", f"{manifest.name} {manifest.version}")
+    storage.begin()
+    before, same = _published(storage, index, manifest)
     if same and before is not None and set(index.files) <= set(before):
+        storage.tag(*tag)
         return Moved(len(index.files), total, 0)
-    fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
-    fresh = fresh and before is None and read_object(filesystem, place, f"{base}/{INDEX}") is None
+    fresh = storage.needs_claim and _claim(storage, index.manifest_sha256, manifest, take_over)
+    fresh = fresh and before is None and storage.read(INDEX) is None
     kept = set(before or ())
     todo = [file for file in index.files if file not in kept]
     expect(tick, len(todo))
-    results = []
-    for part in _in_order(todo):
-        results += in_parallel(
-            lambda file: upload(filesystem, place, root / file.path, f"{base}/{file.path}", file, fresh),
-            part,
-            workers,
-            lambda result: tick(1),
-        )
-    retry(place, INDEX, lambda: put_object(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
-    with storage_errors(root / MANIFEST):
-        text = (root / MANIFEST).read_bytes()
-    if before is not None:
-        retry(place, MANIFEST, lambda: put_object(filesystem, f"{base}/{MANIFEST}", text))
-    elif not create_object(filesystem, place, f"{base}/{MANIFEST}", text):
-        _published(filesystem, place, base, index, manifest)  # another one's raises
-    retry(place, CLAIM, lambda: filesystem.rm_file(f"{base}/{CLAIM}"))
-    return Moved(len(index.files), total, sum(results))
+    moved = sum(storage.upload_all(root, part, workers, tick, fresh) for part in _in_order(todo))
+    last = {INDEX: files.json_bytes(index)}
+    if not same:
+        with storage_errors(root / MANIFEST):
+            last[MANIFEST] = (root / MANIFEST).read_bytes()
+    if not storage.write_last(last, new=before is None):
+        _published(storage, index, manifest)  # another one's raises
+    storage.tag(*tag)
+    if storage.needs_claim:
+        storage.remove(CLAIM)
+    return Moved(len(index.files), total, moved)
 
 
 def _check_card(root: Path, manifest: Manifest, index: Index) -> None:
@@ -154,7 +138,7 @@ def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     return [part for part in parts if part]
 
 
-def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tuple[tuple[FileRecord, ...] | None, bool]:
+def _published(storage: Storage, index: Index, manifest: Manifest) -> tuple[tuple[FileRecord, ...] | None, bool]:
     """The files that are listed there, and whether the manifest there is this one, not one that it has grown from.
 
     Returns:
@@ -163,12 +147,12 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
     Raises:
       StoreError: another release is there.
     """
-    found = read_object(filesystem, place, f"{base}/{MANIFEST}")
+    place, found = storage.place, storage.read(MANIFEST)
     if found is None:
         return None, False
     if files.sha256_bytes(found) == index.manifest_sha256:
         try:
-            return parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files, True
+            return parse_index(storage.read(INDEX) or b"", f"{place}/{INDEX}").files, True
         except StoreError:  # damaged, and put there again
             return (), True
     what = "something else"
@@ -176,7 +160,7 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
         other = parse_manifest(found, f"{place}/{MANIFEST}")
         what = f"{other.name} {other.version}"
         if is_grown_from(manifest, other):
-            before = parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
+            before = parse_index(storage.read(INDEX) or b"", f"{place}/{INDEX}").files
             if keeps(index, before):
                 return before, False
     except StoreError:
@@ -187,20 +171,19 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
     )
 
 
-def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
+def _claim(storage: Storage, digest: str, manifest: Manifest, take_over: bool) -> bool:
     """Say that this release is being published there; True if nobody had begun to.
 
     Raises:
       StoreError: another release is.
     """
     mine = {"name": manifest.name, "version": manifest.version, "manifest_sha256": digest}
-    data, path = json.dumps(mine).encode(), f"{base}/{CLAIM}"
-    created = create_object(filesystem, place, path, data)
-    found = None if created else read_object(filesystem, place, path)
+    data = json.dumps(mine).encode()
+    found = None if storage.create(CLAIM, data) else storage.read(CLAIM)
     if found is None or found == data:
         return found is None  # else ours, from an interrupted try: the files that are there already are kept
     if take_over:
-        retry(place, CLAIM, lambda: put_object(filesystem, path, data))
+        storage.write(CLAIM, data)
         return False
     try:
         other = json.loads(found)
@@ -208,6 +191,6 @@ def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
     except (ValueError, KeyError, TypeError):
         what = "another release"
     raise StoreError(
-        f"{what} is being published to {place} by someone else; choose another URL, or --take-over if that publisher "
-        "is gone"
+        f"{what} is being published to {storage.place} by someone else; choose another URL, or --take-over if that "
+        "publisher is gone"
     )
