@@ -295,7 +295,7 @@ def publish(
     Raises:
       StoreError: the release is not complete or damaged, another version is there, or access is refused.
     """
-    from dmcvb_gen.release.publishing import publish_folder
+    from dmcvb_gen.release.publish import publish_folder
 
     with _bar(progress, " files") as bar:
         given = dict(pixels=pixels, take_over=take_over, options=storage_options, workers=workers)

@@ -48,7 +48,7 @@ from dmcvb_gen.policies.header import OWN_CODE
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import SPLITS
 from dmcvb_gen.storage.base import in_parallel
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
@@ -108,7 +108,7 @@ def make_plan(
     Raises:
       DmcvbError: anything that would fail later, found before any work.
     """
-    target = out if isinstance(out, Target) else Target.at(out)
+    target = out if isinstance(out, Target) else Target.at(local_path(out))
     there = target.manifest()
     if recipe is not None:
         manifest, inputs = describe(recipe, device or "cpu", pixels)

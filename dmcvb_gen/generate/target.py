@@ -271,7 +271,7 @@ class StagingFolder:
         self._exit.close()
 
 
-_stages: dict[Target, StagingFolder] = {}
+_staging_folders: dict[Target, StagingFolder] = {}
 
 
 def rollouts_at_work(target: Target) -> list[str]:
@@ -281,21 +281,21 @@ def rollouts_at_work(target: Target) -> list[str]:
 
 def staging_folder_of(target: Target) -> StagingFolder:
     """This process's staging folder for a target."""
-    if target not in _stages:
-        _stages[target] = StagingFolder(target)
-    return _stages[target]
+    if target not in _staging_folders:
+        _staging_folders[target] = StagingFolder(target)
+    return _staging_folders[target]
 
 
 def leave(target: Target) -> None:
     """Remove this process's staging folder for a target."""
-    stage = _stages.pop(target, None)
-    if stage is not None:
-        stage.close()
+    folder = _staging_folders.pop(target, None)
+    if folder is not None:
+        folder.close()
 
 
 def remove_staging_folders() -> None:
-    """Remove this process's stages."""
-    for target in list(_stages):
+    """Remove this process's staging folders."""
+    for target in list(_staging_folders):
         leave(target)
 
 
@@ -311,7 +311,7 @@ class UploadQueue:
 
     def __init__(self, bound: int):
         self._bound, self._waiting, self._changed = bound, 0, threading.Condition()
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="sender")
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="upload")
 
     def send(self, size: int, work: Callable[[], None]) -> Callable[[], None]:
         """Have `work` done; the call that is given waits until it is, and raises what it raised.

@@ -86,9 +86,9 @@ def fetch(
         there is no room; access is refused.
     """
     folder, source = local_path(out), Source.find(url, options)
-    with Download.at(folder, source, only, episodes, workers, tick) as arrival:
-        moved = arrival.bring()
-        arrival.finish()
+    with Download.at(folder, source, only, episodes, workers, tick) as download:
+        moved = download.bring()
+        download.finish()
     return moved
 
 
@@ -117,26 +117,26 @@ def fetch_and_paint(
     from dmcvb_gen.generate.paint import RenderSession  # who only fetches has no simulator
 
     folder, source = local_path(out), Source.find(url, options)
-    with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
-        names, painted = {name for name, _ in arrival.shards}, arrival.painted
-        session = RenderSession.open(open_release(folder), names, painter, arrival.unpainted, painted)
-        session.expect(arrival.unpainted_commits)
+    with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as download:
+        names, painted = {name for name, _ in download.shards}, download.painted
+        session = RenderSession.open(open_release(folder), names, painter, download.unpainted, painted)
+        session.expect(download.unpainted_commits)
         arrived: queue.SimpleQueue = queue.SimpleQueue()
-        bringing = threading.Thread(target=_bring, args=(arrival, arrived), name="fetch")
-        bringing.start()
+        thread = threading.Thread(target=_bring, args=(download, arrived), name="fetch")
+        thread.start()
         try:
             found = list(session.paint(arrived))
         finally:
-            arrival.stop.set()
-            bringing.join()
-        manifest = arrival.finish()
-    return arrival.moved, session.report(manifest, found)
+            download.stop.set()
+            thread.join()
+        manifest = download.finish()
+    return download.moved, session.report(manifest, found)
 
 
-def _bring(arrival: Download, arrived: queue.SimpleQueue) -> None:
+def _bring(download: Download, arrived: queue.SimpleQueue) -> None:
     """Tell of each shard that has come without pictures, then of the end, or of what went wrong."""
     try:
-        arrival.bring(arrived.put)
+        download.bring(arrived.put)
         arrived.put(None)
     except BaseException as error:
         arrived.put(error)
@@ -249,7 +249,7 @@ class Download:
         tick: ProgressCallback,
         with_pictures: bool = False,
     ) -> Iterator[Download]:
-        """An arrival whose folder is locked and has the metadata and a manifest that says that it is a part.
+        """A download whose folder is locked and has the metadata and a manifest that says that it is a part.
 
         Args:
           with_pictures: room will be needed for pictures, too.
@@ -258,17 +258,17 @@ class Download:
           StoreError: see `fetch`.
         """
         shards = chosen_shards(source.manifest, only, episodes)
-        arrival = cls(out, source, shards, workers, tick)
+        download = cls(out, source, shards, workers, tick)
         with storage_errors(out, "write to"):
             out.mkdir(parents=True, exist_ok=True)
             with write_lock(out):
-                arrival._keep_painted()
-                arrival._check_room(with_pictures)
-                coming = [file for _, commit in arrival.commits.values() for file in commit.files]
-                expect(tick, sum(file.bytes for file in [*coming, *arrival._metadata]))
-                arrival._download([(None, file) for file in arrival._metadata], lambda key: None)
-                _write_part(out, source, arrival._base(), only, episodes)
-                yield arrival
+                download._keep_painted()
+                download._check_room(with_pictures)
+                coming = [file for _, commit in download.commits.values() for file in commit.files]
+                expect(tick, sum(file.bytes for file in [*coming, *download._metadata]))
+                download._download([(None, file) for file in download._metadata], lambda key: None)
+                _write_part(out, source, download._base(), only, episodes)
+                yield download
 
     @property
     def unpainted(self) -> set[str]:

@@ -11,7 +11,7 @@ from dmcvb_gen.dataset.manifest import FileRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export.registry import all_formats
-from dmcvb_gen.release.publish import Moved
+from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.storage import open_storage
 from dmcvb_gen.storage.hub import client_errors, new_api, newest_of, on_the_hub
 
