@@ -95,7 +95,7 @@ def rollout(
     from dmcvb_gen.generate.plan import make_plan, prepare
     from dmcvb_gen.generate.request import make_request
     from dmcvb_gen.generate.rollout import run_plan
-    from dmcvb_gen.generate.site import site_of
+    from dmcvb_gen.generate.target import Target
     from dmcvb_gen.loaders.release import open_for_reading
 
     several = dict(levels=levels, distractors=distractors, goals=goals, layouts=layouts, vary=vary)
@@ -127,9 +127,9 @@ def rollout(
     resuming = bool(out) and not (tasks or layouts or recipe or given)
     chosen = None if resuming else make_request(tasks, recipe, device=device, **given)
     place = str(out) if out else str(Path("releases") / (chosen.name if chosen else ""))
-    site = site_of(place, storage_options, workers=workers if isinstance(workers, int) else 1)
-    plan = make_plan(chosen, site, _names(only), device if chosen else None, None, (1, 1), pixels)
-    plan = prepare(plan, 0 if site.slow else raw_bytes(plan), other_versions)
+    target = Target.at(place, storage_options, workers=workers if isinstance(workers, int) else 1)
+    plan = make_plan(chosen, target, _names(only), device if chosen else None, None, (1, 1), pixels)
+    plan = prepare(plan, 0 if target.uploads else raw_bytes(plan), other_versions)
     with _bar(progress, " frames", plan.manifest.name) as bar:
         run_plan(plan, workers, bar)
     return open_for_reading(place, storage_options)
@@ -295,7 +295,7 @@ def publish(
     Raises:
       StoreError: the release is not complete or damaged, another version is there, or access is refused.
     """
-    from dmcvb_gen.release.publishing import publish_folder
+    from dmcvb_gen.release.publish import publish_folder
 
     with _bar(progress, " files") as bar:
         given = dict(pixels=pixels, take_over=take_over, options=storage_options, workers=workers)

@@ -25,7 +25,7 @@ import numpy as np
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe
-from dmcvb_gen.generate.site import site_of
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import Ray
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.storage.remote import file_system
@@ -58,7 +58,7 @@ def run_here(recipe, folder: Path, workers) -> tuple[float, float, int]:
 def run_parts(recipe, folder: Path, workers: int) -> tuple[float, float, int]:
     """The same by `workers` processes that share nothing but a bucket."""
     place = f"file://{folder}"
-    plan = prepare(make_plan(recipe, site_of(place)))
+    plan = prepare(make_plan(recipe, Target.at(place)))
     started, first = time.perf_counter(), None
     command = [sys.executable, "-m", "dmcvb_gen", "rollout", "--out", place]
     quiet = dict(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -116,8 +116,8 @@ def requests_table(options) -> None:
     print(f"{'task':8} {'what':10} {'all':>6} {'requests':40} {'MB':>8}")
     sent.clear()
     for task in TASKS:
-        site = site_of(f"s3://bucket/{task}", endpoint)
-        plan = prepare(make_plan(bench_recipe(4, 1, task), site))
+        target = Target.at(f"s3://bucket/{task}", endpoint)
+        plan = prepare(make_plan(bench_recipe(4, 1, task), target))
         row(task, "begin")
         made = [commit for result in run_jobs(plan.jobs) for commit in result.commits]
         row(task, "4 shards", sum(file.bytes for commit in made for file in commit.files))

@@ -26,7 +26,7 @@ from dmcvb_gen.generate.jobs import left_to_do, part_of
 from dmcvb_gen.generate.plan import describe, finish, make_plan, prepare
 from dmcvb_gen.generate.progress import progress_of
 from dmcvb_gen.generate.recipe import make_recipe
-from dmcvb_gen.generate.site import FolderSite, UploadQueue, site_of, staging_folder_of
+from dmcvb_gen.generate.target import Target, UploadQueue, staging_folder_of
 from dmcvb_gen.parallel import Ray
 from dmcvb_gen.spec import ANT_MAZE
 from tests.conftest import TINY_MAZE, roll_out
@@ -82,8 +82,8 @@ def test_parts_are_all_jobs_whatever_is_done(tmp_path):
 
 
 def test_a_bucket_ends_with_the_very_files_of_a_folder(whole, tmp_path):
-    site = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
-    plan = prepare(make_plan(quick_recipe(), site))
+    target = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    plan = prepare(make_plan(quick_recipe(), target))
     assert [job.inputs for job in plan.jobs] == [None] * 8  # workers need nothing but the bucket
     for command in (["verify"], ["fetch", "--out", str(tmp_path / "fetched")]):
         result = CliRunner().invoke(main, [command[0], f"file://{tmp_path}/bucket", *command[1:]])
@@ -92,7 +92,7 @@ def test_a_bucket_ends_with_the_very_files_of_a_folder(whole, tmp_path):
         pass
     assert finish(plan).complete and contents(tmp_path / "bucket") == contents(whole)
     assert not [path for path in (tmp_path / "scratch").rglob("*") if path.is_file()]
-    again = make_plan(None, site)
+    again = make_plan(None, target)
     assert again.jobs == () and again.done == 12
 
 
@@ -101,10 +101,10 @@ def test_a_shard_made_twice_ends_in_the_same_bytes_and_other_bytes_are_refused(w
     job = plan.jobs[0]
     [first], [second] = run_jobs([job]), run_jobs([job])  # a retry beside a slow one
     assert first.commits == second.commits
-    site, commit = FolderSite(tmp_path / "r"), first.commits[0]
+    target, commit = Target.at(tmp_path / "r"), first.commits[0]
     other = commit.model_copy(update={"files": commit.files[:-1], "environment": {"cpu": "another one"}})
     with pytest.raises(StoreError, match="committed meanwhile with other bytes"):
-        site.deliver(staging_folder_of(site).folder, other)
+        target.commit_shard(staging_folder_of(target).folder, other)
 
 
 def test_versions_other_than_those_of_the_beginning_are_refused_unless_asked_for(tmp_path):
@@ -121,13 +121,13 @@ def test_versions_other_than_those_of_the_beginning_are_refused_unless_asked_for
 
 
 def test_progress_is_told_from_the_commit_records_alone(tmp_path):
-    site = FolderSite(tmp_path / "r")
+    target = Target.at(tmp_path / "r")
     plan = prepare(make_plan(quick_recipe(), tmp_path / "r"))
-    assert progress_of(site).done == 0 and progress_of(site).steps_per_second is None
+    assert progress_of(target).done == 0 and progress_of(target).steps_per_second is None
     list(run_jobs(plan.jobs[1:3]))
     for number, path in enumerate(sorted((tmp_path / "r/commits").rglob("*.json"))):
         os.utime(path, (1000 + 10 * number, 1000 + 10 * number))
-    found = progress_of(site)
+    found = progress_of(target)
     assert (found.done, found.total, found.late, found.steps) == (4, 12, 2, 20)
     assert found.steps_per_second == pytest.approx(15 / 30) and found.seconds_left == pytest.approx(8 * 5 / 0.5)
 
@@ -150,8 +150,8 @@ def test_what_waits_to_be_sent_takes_a_bounded_room():
 
 
 def test_a_shard_that_scratch_cannot_hold_is_refused(tmp_path):
-    site = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path, scratch_bytes=1000)
-    plan = prepare(make_plan(quick_recipe(), site))
+    target = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path, scratch_bytes=1000)
+    plan = prepare(make_plan(quick_recipe(), target))
     with pytest.raises(StoreError, match="--scratch-size"):
         list(run_jobs(plan.jobs))
 
@@ -165,7 +165,7 @@ def test_a_release_grows_in_a_bucket_as_in_a_folder(tmp_path):
             manifest = finish(plan)
         return manifest
 
-    bucket = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
     grown = grow(bucket)
     assert grown.version == "1.1.0" and grown.complete and grow(tmp_path / "r").digest == grown.digest
     assert contents(tmp_path / "bucket") == contents(tmp_path / "r")
@@ -176,7 +176,7 @@ def test_a_release_grows_in_a_bucket_as_in_a_folder(tmp_path):
 
 def test_finishing_a_bucket_keeps_what_another_machine_adds_meanwhile(tmp_path, monkeypatch):
     walker, maze = (pattern | {"episodes": 1, "levels": "random"} for pattern in (WALKER, MAZE))
-    bucket = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
     plan, others = prepare(make_plan(quick_recipe(walker), bucket)), []
     list(run_jobs(plan.jobs))
 
@@ -214,7 +214,7 @@ def test_two_who_begin_in_one_new_folder_both_stay(tmp_path, monkeypatch):
 def test_places_that_would_go_astray_are_refused(place, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StoreError, match=words):
-        site_of(place, scratch=tmp_path)
+        Target.at(place, scratch=tmp_path)
     assert not (tmp_path / "s3:").exists()
 
 
@@ -226,7 +226,7 @@ def test_growing_in_a_bucket_is_refused_where_something_is_damaged_and_goes_on_w
         list(run_jobs(plan.jobs))
         return finish(plan)
 
-    bucket = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
     grow(bucket, 2)
     grow(tmp_path / "r", 2)
     wanted = grow(tmp_path / "r", 4)
@@ -237,7 +237,7 @@ def test_growing_in_a_bucket_is_refused_where_something_is_damaged_and_goes_on_w
         grow(bucket, 4)
     path.write_bytes(before)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(type(bucket), "remove", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(type(bucket.storage), "remove", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         prepare(make_plan(quick_recipe(WALKER | {"episodes": 4}), bucket))
     assert path.read_bytes() != before
     assert grow(bucket, 4).digest == wanted.digest
@@ -245,7 +245,7 @@ def test_growing_in_a_bucket_is_refused_where_something_is_damaged_and_goes_on_w
 
 
 def test_no_room_for_the_digests_of_a_bucket_is_one_line(tmp_path, monkeypatch):
-    plan = prepare(make_plan(quick_recipe(), site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")))
+    plan = prepare(make_plan(quick_recipe(), Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")))
     list(run_jobs(plan.jobs))
 
     def full(path, data):
@@ -288,19 +288,19 @@ def test_bad_requests_are_refused_and_leave_nothing(tmp_path, arguments, words):
 
 
 def test_another_release_or_other_files_in_the_bucket_are_refused(tmp_path):
-    here = site_of(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    here = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
     prepare(make_plan(quick_recipe(), here))
     with pytest.raises(StoreError, match="seed 2, asked for 4"):
         prepare(make_plan(quick_recipe(seed=4), here))
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis/thesis.tex").write_text("years of work")
     with pytest.raises(StoreError, match="other files.*thesis.tex"):
-        prepare(make_plan(quick_recipe(), site_of(f"file://{tmp_path}/thesis", scratch=tmp_path / "scratch")))
+        prepare(make_plan(quick_recipe(), Target.at(f"file://{tmp_path}/thesis", scratch=tmp_path / "scratch")))
 
 
 def test_nobody_at_the_address_is_one_line(tmp_path, monkeypatch):
     pytest.importorskip("s3fs")
-    monkeypatch.setattr("dmcvb_gen.dataset.transfer.PAUSE", 0.01)
+    monkeypatch.setattr("dmcvb_gen.storage.base.PAUSE", 0.01)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "x")
     options = ["--option", "endpoint_url=http://127.0.0.1:9", "--option", "max_attempts=1"]
@@ -324,7 +324,7 @@ def test_a_folder_is_listed_while_others_write_into_it(whole, tmp_path):
     writer.start()
     try:
         for _ in range(300):
-            assert set(FolderSite(tmp_path / "r").listing()) == {name.as_posix()}
+            assert set(Target.at(tmp_path / "r").storage.list()) == {name.as_posix()}
     finally:
         ended.set()
         writer.join()

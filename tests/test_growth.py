@@ -16,10 +16,10 @@ from dmcvb_gen.dataset.manifest import PolicyRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import copy_file
 from dmcvb_gen.generate.executors import run_jobs
-from dmcvb_gen.generate.plan import finish, finish_site, make_plan, prepare
+from dmcvb_gen.generate.plan import finish, finish_target, make_plan, prepare
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
-from dmcvb_gen.generate.site import site_of
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
@@ -111,7 +111,7 @@ def test_damage_never_becomes_what_is_right(grown, tmp_path, name, damage):
     assert (tmp_path / "copy/manifest.json").read_bytes() == manifest and not verify(tmp_path / "copy").sound
     for there in (tmp_path / "copy", f"file://{tmp_path}/copy"):
         with pytest.raises(StoreError, match=f"{path.name}.*(damaged|missing); mend it first"):
-            finish_site(site_of(there, scratch=tmp_path / "scratch"))
+            finish_target(Target.at(there, scratch=tmp_path / "scratch"))
     with pytest.raises(StoreError, match=f"{path.name}.*(damaged|missing); mend it first: dmcvb-gen regenerate"):
         prepare(make_plan(walker({"episodes": 3}), tmp_path / "copy"))
     Regeneration(tmp_path / "copy").repair()
@@ -223,8 +223,8 @@ def test_what_grows_by_parts_is_sound_at_every_moment(tmp_path, family, bucket):
         return small_recipe(subsets=[pattern], size=16)
 
     def done(recipe, only=(), shared=False):
-        site = site_of(there, scratch=tmp_path / "scratch")
-        plan = prepare(make_plan(recipe, site, only), shared=shared)
+        target = Target.at(there, scratch=tmp_path / "scratch")
+        plan = prepare(make_plan(recipe, target, only), shared=shared)
         for _ in run_jobs(plan.jobs):
             pass
         finish(plan)
@@ -248,7 +248,7 @@ def test_the_last_to_finish_keeps_what_others_added_meanwhile(tmp_path, bucket):
     maze = small_recipe(seed=8, subsets=[SHORT | {"tasks": TINY_MAZE, "settings": "hidden", "episodes": 1}])
 
     def begun(recipe):
-        return prepare(make_plan(recipe, site_of(there, scratch=tmp_path / "scratch")))
+        return prepare(make_plan(recipe, Target.at(there, scratch=tmp_path / "scratch")))
 
     def done(plan):
         for _ in run_jobs(plan.jobs):
@@ -260,7 +260,7 @@ def test_the_last_to_finish_keeps_what_others_added_meanwhile(tmp_path, bucket):
     assert not done(first).complete and len(open_release(there).manifest.subsets) == 2
     assert done(second).complete and verify(tmp_path / "r").sound
     written = (tmp_path / "r/manifest.json").read_bytes()
-    assert finish_site(site_of(there, scratch=tmp_path / "scratch")).complete
+    assert finish_target(Target.at(there, scratch=tmp_path / "scratch")).complete
     assert (tmp_path / "r/manifest.json").read_bytes() == written
 
 
@@ -271,19 +271,19 @@ def test_a_release_that_is_finished_in_between_is_never_called_damaged(tmp_path,
     there, scratch = f"file://{tmp_path}/r" if bucket else str(tmp_path / "r"), tmp_path / "scratch"
     pattern = MAZES | {"settings": "visible"} if family == "maze" else WALKER
     recipe = small_recipe(subsets=[pattern | {"episodes": 2}], size=16)
-    prepare(make_plan(recipe, site_of(there, scratch=scratch)), shared=True)
+    prepare(make_plan(recipe, Target.at(there, scratch=scratch)), shared=True)
     for part in (1, 2):
-        for _ in run_jobs(make_plan(recipe, site_of(there, scratch=scratch), part=(part, 2)).jobs):
+        for _ in run_jobs(make_plan(recipe, Target.at(there, scratch=scratch), part=(part, 2)).jobs):
             pass
         if part == 1:
-            assert not finish_site(site_of(there, scratch=scratch)).complete
+            assert not finish_target(Target.at(there, scratch=scratch)).complete
     looked = CliRunner().invoke(main, ["verify", there])
     assert looked.exit_code == 3 and "not finished" in looked.output, looked.output
     if not bucket:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr("dmcvb_gen.files.write_bytes", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-            finish_site(site_of(there))  # the index is new, the manifest is not
-    assert finish_site(site_of(there, scratch=scratch)).complete
+            finish_target(Target.at(there))  # the index is new, the manifest is not
+    assert finish_target(Target.at(there, scratch=scratch)).complete
     assert CliRunner().invoke(main, ["verify", there]).exit_code == 0 and verify(tmp_path / "r").sound
 
 

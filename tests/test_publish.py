@@ -7,14 +7,11 @@ import hashlib
 import json
 import logging
 import os
-import pathlib
 import re
 import resource
 import shutil
 import signal
-import tempfile
 import threading
-import types
 
 import numpy as np
 import pytest
@@ -22,9 +19,9 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release, transfer
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import INDEX, card_files, take_in_card
-from dmcvb_gen.dataset.manifest import commit_path
+from dmcvb_gen.dataset.manifest import MANIFEST, commit_path
 from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
 from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import StoreError, UnknownNameError
@@ -34,9 +31,12 @@ from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import CLAIM, publish
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.storage import base as storage
+from dmcvb_gen.storage.hub import HubStorage
 from dmcvb_gen.storage.remote import public, reason
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
+from tests.fake_hub import fake_hub
 from tests.faults.proxy import Proxy
 
 pytest.importorskip("s3fs")
@@ -93,7 +93,7 @@ def s3(server, bucket, monkeypatch):
     """A proxy before the server; credentials in the environment; nothing in "bucket/x"."""
     for name, value in CREDENTIALS.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(transfer, "PAUSE", 0.01)
+    monkeypatch.setattr(storage, "PAUSE", 0.01)
     bucket.invalidate_cache()
     if bucket.exists("bucket/x"):
         bucket.rm("bucket/x", recursive=True)
@@ -229,7 +229,7 @@ def test_wrong_bytes_at_the_source_are_refused(s3, tiny, tmp_path):
 
 
 def test_a_download_goes_on_after_its_last_whole_piece(s3, tmp_path, small_release, monkeypatch):
-    monkeypatch.setattr(transfer, "PIECE", 20_000)
+    monkeypatch.setattr(storage, "PIECE", 20_000)
     record = max(open_release(small_release)[NAME].commits[0].files, key=lambda file: file.bytes)
     assert record.bytes > 60_000
     asked = []
@@ -454,94 +454,57 @@ def test_a_full_disk_is_said_and_what_came_stays(s3, tmp_path, small_release):
     assert verify(tmp_path / "r").sound
 
 
-class FakeHub:
-    """The calls of huggingface_hub.HfApi that publishing makes, with a repository in memory."""
-
-    def __init__(self):
-        self.files, self.commits, self.tags, self.fail = {}, [], {}, None
-
-    def create_repo(self, repo_id, repo_type, exist_ok):
-        assert repo_type == "dataset" and exist_ok
-
-    def repo_info(self, repo_id, repo_type):
-        return types.SimpleNamespace(sha=str(len(self.commits)))
-
-    def get_paths_info(self, repo_id, paths, repo_type):
-        for path in paths:
-            if path in self.files:
-                data = self.files[path]
-                blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
-                yield types.SimpleNamespace(path=path, blob_id=blob, lfs=None)
-
-    def hf_hub_download(self, repo_id, filename, repo_type):
-        path = pathlib.Path(tempfile.mkdtemp(prefix="hub-")) / "file"
-        path.write_bytes(self.files[filename])
-        return str(path)
-
-    def create_tag(self, repo_id, tag, tag_message, revision, repo_type, exist_ok):
-        assert exist_ok and revision == str(len(self.commits))
-        self.tags.setdefault(tag, revision)
-
-    def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit=None):
-        if self.fail is not None and len(self.commits) == self.fail:
-            raise ConnectionError("the line went dead, token=hf_secret123")
-        if parent_commit is not None and parent_commit != str(len(self.commits)):
-            raise RuntimeError("412: a commit has happened since")
-        for operation in operations:
-            with operation.as_file() as file:
-                self.files[operation.path_in_repo] = file.read()
-        self.commits.append([operation.path_in_repo for operation in operations])
-        return types.SimpleNamespace(oid=str(len(self.commits)))
-
-
 def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(tiny, copy, monkeypatch, tmp_path):
-    pytest.importorskip("huggingface_hub")
-    from dmcvb_gen.release import hub
-    from dmcvb_gen.release.publish import index_of
-
-    monkeypatch.setattr(hub, "BATCH", 20)
-    api, url = FakeHub(), "hf://datasets/me/tiny"
-    manifest = open_release(tiny).manifest
-    index = index_of(tiny, manifest)
-    api.fail = 1
+    monkeypatch.setattr("dmcvb_gen.storage.hub.BATCH", 20)
+    hub, url = fake_hub(tmp_path / "hub", monkeypatch), "hf://datasets/me/tiny"
+    hub.fail = 1
     with pytest.raises(StoreError, match="run the same command again") as caught:
-        hub.publish_to_hub(tiny, manifest, index, url, api=api)
-    assert "hf_secret123" not in str(caught.value) and "manifest.json" not in api.files
-    api.fail = None
-    assert hub.publish_to_hub(tiny, manifest, index, url, api=api) == len(index.files) - 20
-    assert api.commits[-1] == [INDEX, "manifest.json"] and len(api.commits) == 4
-    for path, data in api.files.items():
-        (tmp_path / "there" / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "there" / path).write_bytes(data)
-    assert verify(tmp_path / "there").sound
-    assert hub.publish_to_hub(tiny, manifest, index, url, api=api) == 0
-    assert api.tags == {"v1.0.0": "4"} and max(map(len, api.commits)) < 100
+        publish(tiny, url)
+    assert "hf_secret123" not in str(caught.value) and MANIFEST not in hub.files
+    hub.fail = None
+    moved = publish(tiny, url)
+    assert moved.moved == moved.files - 20
+    assert hub.commits[-1] == [INDEX, MANIFEST] and max(map(len, hub.commits)) == 20
+    assert verify(hub.folder).sound
+    head = str(len(hub.commits))
+    assert publish(tiny, url).moved == 0 and hub.tags == {"v1.0.0": head} and len(hub.commits) == int(head)
     finish_release(copy, open_release(copy).manifest.model_copy(update={"version": "0.9.0"}))
-    changed = open_release(copy).manifest
     with pytest.raises(StoreError, match="never changes"):
-        hub.publish_to_hub(copy, changed, index_of(copy, changed), url, api=api)
+        publish(copy, url)
     with pytest.raises(StoreError, match="hf://datasets/OWNER/NAME"):
-        hub.publish_to_hub(tiny, manifest, index, "hf://models/x", api=api)
+        publish(tiny, "hf://models/x")
     with pytest.raises(StoreError, match="newest"):
-        hub.publish_to_hub(tiny, manifest, index, "hf://datasets/me/x@v1", api=api)
+        publish(tiny, "hf://datasets/me/x@v1")
 
 
-def test_a_card_that_is_new_goes_to_the_hub_too(copy):
-    pytest.importorskip("huggingface_hub")
-    from dmcvb_gen.release import hub
-    from dmcvb_gen.release.publish import index_of
+def test_of_two_publishers_to_the_hub_one_is_told(tiny, monkeypatch, tmp_path):
+    hub, url = fake_hub(tmp_path / "hub", monkeypatch), "hf://datasets/me/tiny"
+    upload_all = HubStorage.upload_all
 
-    api, manifest = FakeHub(), open_release(copy).manifest
-    hub.publish_to_hub(copy, manifest, index_of(copy, manifest), "hf://datasets/me/tiny", api=api)
+    def another_between(self, *arguments, **options):
+        moved = upload_all(self, *arguments, **options)
+        hub.create_commit("me/tiny", [], "of another", "dataset", str(len(hub.commits)))
+        return moved
+
+    with monkeypatch.context() as patch, pytest.raises(StoreError, match="a commit has happened since.* run the same"):
+        patch.setattr(HubStorage, "upload_all", another_between)
+        publish(tiny, url)
+    assert MANIFEST not in hub.files
+    publish(tiny, url)
+    assert verify(hub.folder).sound
+
+
+def test_a_card_that_is_new_goes_to_the_hub_too(copy, monkeypatch, tmp_path):
+    hub, url = fake_hub(tmp_path / "hub", monkeypatch), "hf://datasets/me/tiny"
+    publish(copy, url)
     write_card(copy)
-    cards = len(card_files(copy))
-    assert hub.publish_to_hub(copy, manifest, index_of(copy, manifest), "hf://datasets/me/tiny", api=api) == cards
-    assert api.files["README.md"] == (copy / "README.md").read_bytes() and api.commits[-1] == [INDEX]
-    assert json.loads(api.files[INDEX]) == json.loads((copy / INDEX).read_text())
-    assert hub.publish_to_hub(copy, manifest, index_of(copy, manifest), "hf://datasets/me/tiny", api=api) == 0
+    assert publish(copy, url).moved == len(card_files(copy))
+    assert hub.files["README.md"] == (copy / "README.md").read_bytes() and hub.commits[-1] == [INDEX]
+    assert json.loads(hub.files[INDEX]) == json.loads((copy / INDEX).read_text())
+    assert publish(copy, url).moved == 0
     (copy / "README.md").write_text("by hand")
     with pytest.raises(StoreError, match="README.md does not have its digest; run `dmcvb-gen card"):
-        publish(copy, "hf://datasets/me/tiny")
+        publish(copy, url)
 
 
 def test_a_damaged_index_is_put_there_again(copy, tmp_path):
@@ -551,56 +514,36 @@ def test_a_damaged_index_is_put_there_again(copy, tmp_path):
     assert json.loads((tmp_path / "there" / INDEX).read_text()) == json.loads((copy / INDEX).read_text())
 
 
-def hub_of(folder, monkeypatch):
-    """The Hub's client and its file system, with a published release in the folder "data" of a repository."""
-    import huggingface_hub
-    from fsspec.implementations.dirfs import DirFileSystem
-    from huggingface_hub.utils import filter_repo_objects
-
-    from dmcvb_gen.release import fetch as fetching
-
-    asked = []
-
-    def snapshot_download(repo_id, *, repo_type, revision, allow_patterns, local_dir):
-        assert (repo_id, repo_type, revision) == ("me/tiny", "dataset", "v1.0.0")
-        there = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-        for path in filter_repo_objects(there, allow_patterns=allow_patterns):
-            asked.append(path)
-            (pathlib.Path(local_dir) / path).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(folder / path, pathlib.Path(local_dir) / path)
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    monkeypatch.setattr(fetching, "file_system", lambda url, options: (DirFileSystem(str(folder)), "data"))
-    return asked
-
-
 def test_shards_come_from_the_hub_through_its_own_client(tiny, tmp_path, monkeypatch):
-    shutil.copytree(tiny, tmp_path / "hub" / "data")
-    asked = hub_of(tmp_path / "hub", monkeypatch)
+    hub = fake_hub(tmp_path / "hub", monkeypatch)
+    shutil.copytree(tiny, hub.folder / "data")
     url, files = "hf://datasets/me/tiny@v1.0.0/data", open_release(tiny)[NAME].commits
+
+    def asked():
+        assert {revision for _, revision in hub.asked} == {"v1.0.0"}
+        paths = {path for path, _ in hub.asked if "/c/" in path}
+        hub.asked.clear()
+        return paths
+
     moved = fetch(url, tmp_path / "r", episodes=(1, 2))
-    assert sorted(asked) == [f"data/{file.path}" for file in files[1].files]  # of that shard, all and no others
+    assert asked() == {f"data/{file.path}" for file in files[1].files}  # of that shard, all and no others
     assert moved.moved == moved.files and not list((tmp_path / "r").glob(".hub*"))
-    asked.clear()
     fetch(url, tmp_path / "r")
-    assert sorted(asked) == [f"data/{file.path}" for file in files[0].files]
+    assert asked() == {f"data/{file.path}" for file in files[0].files}
     assert open_release(tmp_path / "r").manifest == open_release(tiny).manifest and verify(tmp_path / "r").sound
 
 
-def test_a_grown_release_adds_to_its_repository(tmp_path):
-    from dmcvb_gen.release import hub
-    from dmcvb_gen.release.publish import index_of
-
+def test_a_grown_release_adds_to_its_repository(tmp_path, monkeypatch):
     pattern = {"tasks": "walker-walk", "levels": "random", "episodes": 1, "max_steps": 3}
-    api, versions = FakeHub(), []
+    hub, versions, before = fake_hub(tmp_path / "hub", monkeypatch), [], 0
     for settings in (["none"], ["none", "static"]):
         roll_out(small_recipe(name="grows", subsets=[pattern | {"settings": settings}]), tmp_path / "r")
-        manifest = open_release(tmp_path / "r").manifest
-        hub.publish_to_hub(tmp_path / "r", manifest, index_of(tmp_path / "r", manifest), "hf://datasets/me/g", api=api)
-        versions.append(manifest.version)
-    assert versions == ["1.0.0", "1.1.0"] and list(api.tags) == ["v1.0.0", "v1.1.0"]
-    assert not any("none.zarr" in path for commit in api.commits[2:] for path in commit)
-    assert api.files["manifest.json"] == (tmp_path / "r/manifest.json").read_bytes()
+        before = len(hub.commits)
+        publish(tmp_path / "r", "hf://datasets/me/tiny")
+        versions.append(open_release(tmp_path / "r").manifest.version)
+    assert versions == ["1.0.0", "1.1.0"] and list(hub.tags) == ["v1.0.0", "v1.1.0"]
+    assert not any("none.zarr" in path for commit in hub.commits[before:] for path in commit)
+    assert verify(hub.folder).sound
 
 
 def test_the_whole_release_has_fewer_files_than_the_hub_takes(small_release, small_mazes):
@@ -650,7 +593,7 @@ def test_whoever_stops_while_files_move_stops_the_rest(error):
         raise error
 
     with pytest.raises(error):
-        transfer.in_parallel(work, range(2000), 2, tick)
+        storage.in_parallel(work, range(2000), 2, tick)
     assert len(begun) < 1000
 
 

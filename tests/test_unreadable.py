@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release, transfer
+from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import INDEX
 from dmcvb_gen.dataset.manifest import MANIFEST, commit_path
 from dmcvb_gen.dataset.reader import load_manifest
@@ -23,6 +23,7 @@ from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import check_files
+from dmcvb_gen.storage import base as storage
 from dmcvb_gen.training.runs import RunConfig
 from dmcvb_gen.training.training import open_run
 from tests.faults import store_ops
@@ -50,7 +51,7 @@ def root(made, tmp_path):
 
 @pytest.fixture(autouse=True)
 def at_once(monkeypatch):
-    monkeypatch.setattr(transfer, "PAUSE", 0.001)
+    monkeypatch.setattr(storage, "PAUSE", 0.001)
 
 
 def deny(path, monkeypatch):

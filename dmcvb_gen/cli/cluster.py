@@ -132,9 +132,9 @@ def status(place, options, as_json):
     dmcvb-gen status s3://bucket/mine
     """
     from dmcvb_gen.generate.progress import progress_of
-    from dmcvb_gen.generate.site import site_of
+    from dmcvb_gen.generate.target import Target
 
-    found = progress_of(site_of(place, options))
+    found = progress_of(Target.at(place, options))
     if as_json:
         return print_json(found.facts())
     print_table(

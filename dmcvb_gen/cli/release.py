@@ -251,7 +251,7 @@ def publish(path, url, options, take_over, workers, no_pixels, as_json):
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
-    from dmcvb_gen.release.publishing import publish_folder
+    from dmcvb_gen.release.publish import publish_folder
     from dmcvb_gen.storage.remote import public
 
     with ProgressBar(as_json, unit=" files") as bar:

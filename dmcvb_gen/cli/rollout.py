@@ -176,9 +176,9 @@ def rollout(
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
     from dmcvb_gen.generate.estimate import raw_bytes
-    from dmcvb_gen.generate.plan import describe, finish_site, make_plan, prepare
+    from dmcvb_gen.generate.plan import describe, finish_target, make_plan, prepare
     from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
-    from dmcvb_gen.generate.site import site_of
+    from dmcvb_gen.generate.target import Target
 
     check_exclusive_options(context)
     executor = make_executor(workers, options["executor"], options["ray_address"])
@@ -192,11 +192,11 @@ def rollout(
             describe(chosen, pixels=not no_pixels)  # or says why each task would be refused; this one needs no GPU
         return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
     scratch = (options["scratch"], options["scratch_size"])
-    site = site_of(out or _out_default(chosen.name), options["options"], *scratch, workers)
+    target = Target.at(out or _out_default(chosen.name), options["options"], *scratch, workers)
     if finishing:
-        return _finish(site, finish_site, as_json)
+        return _finish(target, finish_target, as_json)
     where = device if chosen or is_given(context, "device") else None  # else where it was begun
-    plan = make_plan(chosen, site, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
+    plan = make_plan(chosen, target, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
     if device != "cpu" and chosen and not options["recipe"] and "renderer" not in given:
         click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
     if chosen:
@@ -205,7 +205,7 @@ def rollout(
         return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
     shared = init or bool(part)
     _tell_what_is_there(plan, shared)
-    plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
+    plan = prepare(plan, 0 if init or target.uploads else raw_bytes(plan), options["other_versions"], shared)
     if init:
         return _tell_begun(plan, as_json)
     _run(plan, executor, as_json, whole=not part)
@@ -213,15 +213,15 @@ def rollout(
 
 def _tell_what_is_there(plan, shared):
     """Notes on a release that gains subsets or episodes, and on another rollout that works on it."""
-    from dmcvb_gen.generate.site import rollouts_at_work
+    from dmcvb_gen.generate.target import rollouts_at_work
 
     if plan.growth:
         added = ", ".join(plan.growth[:3]) + (f" and {len(plan.growth) - 3} more" if len(plan.growth) > 3 else "")
-        click.echo(f"{plan.site.place} is a release already; this adds {added}.", err=True)
-    if not shared and (others := rollouts_at_work(plan.site)):
+        click.echo(f"{plan.target.place} is a release already; this adds {added}.", err=True)
+    if not shared and (others := rollouts_at_work(plan.target)):
         click.echo(
-            f"Another rollout is writing to {plan.site.place} ({', '.join(others)}), and both make the same shards. To "
-            "share the work, stop one and give --part 1/2 and --part 2/2.",
+            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. "
+            "To share the work, stop one and give --part 1/2 and --part 2/2.",
             err=True,
         )
 
@@ -240,20 +240,22 @@ def _tell_own_videos(source, split):
 
 def _tell_begun(plan, as_json):
     if as_json:
-        return print_json({"out": plan.site.place, "jobs": len(plan.jobs), "already_done": plan.done})
-    click.echo(f"{plan.site.place}: begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N")
+        return print_json({"out": plan.target.place, "jobs": len(plan.jobs), "already_done": plan.done})
+    click.echo(
+        f"{plan.target.place}: begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N"
+    )
 
 
-def _finish(site, finish_site, as_json):
-    manifest = finish_site(site)
+def _finish(target, finish_target, as_json):
+    manifest = finish_target(target)
     missing = [subset.name for subset in manifest.subsets if subset.digest is None]
     if as_json:
-        print_json({"out": site.place, "complete": manifest.complete, "incomplete": missing})
+        print_json({"out": target.place, "complete": manifest.complete, "incomplete": missing})
     elif missing:
         lacking = pluralize(len(missing), "subsets")
-        click.echo(f"{site.place}: not complete; shards are missing in {lacking}, e.g. {missing[0]}")
+        click.echo(f"{target.place}: not complete; shards are missing in {lacking}, e.g. {missing[0]}")
     else:
-        click.echo(f"{site.place}: complete")
+        click.echo(f"{target.place}: complete")
     click.get_current_context().exit(0 if manifest.complete else 1)
 
 
@@ -269,7 +271,7 @@ def _run(plan, workers, as_json, whole=True):
 
     with _interruption_message(), _progress(plan, as_json) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
-    manifest, steps, place = made.manifest, made.steps, plan.site.place
+    manifest, steps, place = made.manifest, made.steps, plan.target.place
     if as_json:
         print_json(
             dict(
@@ -381,7 +383,7 @@ def _show_plan(plan, cost, workers, as_json):
         title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
     )
     spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
-    click.echo(f"release: {plan.site.place}")
+    click.echo(f"release: {plan.target.place}")
     click.echo(
         f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; "
         f"{cost.steps:,} steps, {format_bytes(cost.bytes)}"

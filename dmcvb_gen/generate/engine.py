@@ -30,7 +30,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import Inputs
 from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, paint_labels, renderers
-from dmcvb_gen.generate.site import staging_folder_of
+from dmcvb_gen.generate.target import staging_folder_of
 from dmcvb_gen.parallel import Future, ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.policy_file import load_policy
@@ -107,7 +107,7 @@ def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobR
         commits = tuple(commit for commit, _ in sent)
         return JobResult(commits, sum(commit.steps for commit in commits), seconds)
 
-    return Future(committed) if job.site.slow else committed()
+    return Future(committed) if job.target.uploads else committed()
 
 
 # -- states ---------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def stored_episodes(job: Job) -> Episodes:
 
 def inputs_of(job: Job, record: SubsetRecord) -> Inputs:
     """The policy files and videos of a subset on this machine."""
-    return job.inputs or staging_folder_of(job.site).inputs(record)
+    return job.inputs or staging_folder_of(job.target).inputs(record)
 
 
 # -- rendering and storing ------------------------------------------------------------------------
@@ -222,10 +222,10 @@ def _write_and_commit(job: Job, record: SubsetRecord, arrays: Iterator[tuple[str
         subset = job.stored.subset
         added = write_pictures(Path(subset.root), record, subset.commits[job.shard], arrays, made_by)
         return added, lambda: None
-    folder = staging_folder_of(job.site).prepare(record)
+    folder = staging_folder_of(job.target).prepare(record)
     commit = write_shard(folder, record, job.shard, arrays, lengths, made_by)
-    (folder / commit_path(record.name, job.shard)).unlink()  # it is delivered last
-    return commit, job.site.deliver(folder, commit)
+    (folder / commit_path(record.name, job.shard)).unlink()  # it is committed last
+    return commit, job.target.commit_shard(folder, commit)
 
 
 class Stopwatch:

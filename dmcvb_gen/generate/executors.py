@@ -14,7 +14,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.engine import JobResult, run_job
 from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.render import frame_count
-from dmcvb_gen.generate.site import leave
+from dmcvb_gen.generate.target import leave
 from dmcvb_gen.parallel import Needs, Pool, ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.parallel.memory import free_memory
 from dmcvb_gen.tasks import get_task
@@ -52,8 +52,8 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallba
                 expect(progress, expected.frames)
                 yield result
         finally:
-            for site in {job.site for job in jobs}:
-                leave(site)
+            for target in {job.target for job in jobs}:
+                leave(target)
 
 
 def run_arriving(

@@ -17,7 +17,7 @@ from dmcvb_gen.dataset.writer import shard_episodes
 from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.generate.inputs import Inputs
 from dmcvb_gen.generate.recipe import Recipe, make_recipe
-from dmcvb_gen.generate.site import Site
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.spec import FIXED, is_maze
 
 
@@ -41,7 +41,7 @@ class Job:
     """One shard of subsets that share a trajectory: its states are simulated (or read) once and rendered for each.
 
     Attributes:
-      site: the release to write to.
+      target: the release to write to.
       subsets: the records of the subsets to write, one or more of a task and level.
       shard: index of the shard.
       inputs: policies and videos; None: the release's own copies.
@@ -51,7 +51,7 @@ class Job:
       labels: "depth" and "segmentation", stored beside the pixels.
     """
 
-    site: Site
+    target: Target
     subsets: tuple[SubsetRecord, ...]
     shard: int
     inputs: Inputs | None
@@ -79,7 +79,7 @@ class Job:
 def make_jobs(
     manifest: Manifest,
     shards: Mapping[ShardKey, SubsetRecord],
-    site: Site,
+    target: Target,
     inputs: Mapping[str, Inputs] | None = None,
     device: str | None = None,
     stored: Mapping[str, Stored] | None = None,
@@ -88,7 +88,7 @@ def make_jobs(
     """The jobs that make shards; subsets that share trajectories are simulated once.
 
     Args:
-      site: the release that the jobs write to.
+      target: the release that the jobs write to.
       inputs: of each subset, by name; the release's own copies by default.
       device: render there instead of on the manifest's device.
       stored: where the states of each subset are read from, by name; by default they are simulated.
@@ -107,7 +107,7 @@ def make_jobs(
         key = (*_trajectory(manifest, record), source, seed, shard, inputs and inputs[name], where)
         groups.setdefault(key, []).append(record)
     return tuple(
-        Job(site, tuple(records), shard, given, seed, names, where, source, labels)
+        Job(target, tuple(records), shard, given, seed, names, where, source, labels)
         for (names, *_, source, seed, shard, given, where), records in groups.items()
     )
 

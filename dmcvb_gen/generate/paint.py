@@ -40,7 +40,7 @@ from dmcvb_gen.generate.jobs import Job, Stored
 from dmcvb_gen.generate.plan import painting_facts, subset_attributes
 from dmcvb_gen.generate.regenerate import environment_diff
 from dmcvb_gen.generate.render import frame_count
-from dmcvb_gen.generate.site import FolderSite
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import GOAL_PICTURES, HIDDEN
@@ -258,7 +258,7 @@ class RenderSession:
             return None
         source = Stored(Subset(str(self.root), record, {shard: commit}, {}), in_place=True)
         inputs = Inputs(backgrounds=self.backgrounds[name])
-        return Job(FolderSite(self.root), (record,), shard, inputs, 0, (), self.config.device, source)
+        return Job(Target.at(self.root), (record,), shard, inputs, 0, (), self.config.device, source)
 
     def _compared(self, job: Job, painted: CommitRecord) -> tuple[str, bool, bool]:
         assert job.stored

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from dmcvb_gen.dataset.append import merged
 from dmcvb_gen.dataset.index import (
@@ -33,7 +33,6 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.dataset.shards import chosen_shards
-from dmcvb_gen.dataset.transfer import in_parallel
 from dmcvb_gen.dataset.writer import create_subset, finish_release, finish_together, mark_created, start_release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
@@ -42,12 +41,13 @@ from dmcvb_gen.generate.inputs import BUILTIN, Inputs
 from dmcvb_gen.generate.jobs import Job, left_to_do, make_jobs, part_of
 from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
 from dmcvb_gen.generate.render import check_renderer, renderer_for
-from dmcvb_gen.generate.site import CONNECTIONS, BucketSite, FolderSite, Site
+from dmcvb_gen.generate.target import CONNECTIONS, Target
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import SPLITS
+from dmcvb_gen.storage.base import in_parallel
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
@@ -60,7 +60,7 @@ class Plan:
     """Everything a rollout will do.
 
     Attributes:
-      site: where the release is made.
+      target: where the release is made.
       manifest: of the release as it will be.
       inputs: of each subset, by name; None where the release's own copies serve.
       jobs: what is still to do, settings that share trajectories together.
@@ -69,7 +69,7 @@ class Plan:
         (40 episodes more)" for one that grows.
     """
 
-    site: Site
+    target: Target
     manifest: Manifest
     inputs: Mapping[str, Inputs] | None
     jobs: tuple[Job, ...]
@@ -87,7 +87,7 @@ class Plan:
 
 def make_plan(
     recipe: Recipe | None,
-    out: str | Path | Site,
+    out: str | Path | Target,
     only: Sequence[str] = (),
     device: str | None = None,
     episodes: tuple[int, int] | None = None,
@@ -98,7 +98,7 @@ def make_plan(
 
     Args:
       recipe: None goes on with the release that is there, from its manifest alone.
-      out: the release's folder or site; what is committed there already is left out of the jobs.
+      out: the release's folder or target; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
       device: where pictures are painted; by default where the release that is there was begun, or on the CPU.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
@@ -108,26 +108,26 @@ def make_plan(
     Raises:
       DmcvbError: anything that would fail later, found before any work.
     """
-    site = out if isinstance(out, Site) else FolderSite(local_path(out))
-    there = site.manifest()
+    target = out if isinstance(out, Target) else Target.at(local_path(out))
+    there = target.manifest()
     if recipe is not None:
         manifest, inputs = describe(recipe, device or "cpu", pixels)
     elif there is not None:
-        _check_goes_on(there, site, device, pixels)
+        _check_goes_on(there, target, device, pixels)
         manifest, inputs = there, None
     else:
-        raise StoreError(f"{site.place} holds no release to go on with; give TASKs or --recipe")
+        raise StoreError(f"{target.place} holds no release to go on with; give TASKs or --recipe")
     asked = {record.name for record in manifest.subsets}
-    grown = manifest if there is None else merged(there, manifest, site.place)
+    grown = manifest if there is None else merged(there, manifest, target.place)
     grown = grown.model_copy(update={"subsets": tuple(record for record in grown.subsets if record.name in asked)})
     shards = chosen_shards(grown, only, episodes)
     records = list({record.name: record for record in shards.values()}.values())
-    done = site.commits(records) if there is not None else {}
-    _refuse_half_painted(there, records, done, site.place)
-    jobs = part_of(make_jobs(grown, shards, site, None if site.slow else inputs, device), part)
+    done = target.commits(records) if there is not None else {}
+    _refuse_half_painted(there, records, done, target.place)
+    jobs = part_of(make_jobs(grown, shards, target, None if target.uploads else inputs, device), part)
     left = left_to_do(jobs, done)
     growth = _growth(there, records) if there is not None else ()
-    return Plan(site, manifest, inputs, left, _count(jobs) - _count(left), growth)
+    return Plan(target, manifest, inputs, left, _count(jobs) - _count(left), growth)
 
 
 def _growth(there: Manifest, records: Iterable[SubsetRecord]) -> tuple[str, ...]:
@@ -151,16 +151,16 @@ def _refuse_half_painted(
             )
 
 
-def _check_goes_on(there: Manifest, site: Site, device: str | None, pixels: bool) -> None:
+def _check_goes_on(there: Manifest, target: Target, device: str | None, pixels: bool) -> None:
     """Raises StoreError where a release that goes on from its manifest cannot be as the options want it."""
     painted = any(record.pixels for record in there.subsets)
     if not pixels and painted:
         raise StoreError(
-            f"{site.place} was begun with images and keeps storing them; remove --no-pixels, or give TASKs or "
+            f"{target.place} was begun with images and keeps storing them; remove --no-pixels, or give TASKs or "
             "--recipe with another --out"
         )
     if device not in (None, "cpu") and not painted:
-        raise StoreError(f"{site.place} was begun without images, so none are rendered on {device}; remove --device")
+        raise StoreError(f"{target.place} was begun without images, so none are rendered on {device}; remove --device")
 
 
 def _count(jobs: Sequence[Job]) -> int:
@@ -287,16 +287,16 @@ def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False,
       StoreError: what is there contradicts this recipe or was begun with other versions; it cannot be written, or the
         disk lacks the room.
     """
-    there = plan.site.manifest()
+    there = plan.target.manifest()
     if there is not None:
         if not other_versions:
             check_versions(there)
-    if isinstance(plan.site, FolderSite):
-        manifest = _prepare_folder(plan, plan.site.root, there, expected_bytes, shared)
+    if plan.target.folder:
+        manifest = _prepare_folder(plan, plan.target.folder, there, expected_bytes, shared)
     elif there is None:
-        manifest = _prepare_bucket(plan, cast(BucketSite, plan.site))
+        manifest = _prepare_bucket(plan, plan.target)
     else:
-        manifest = _grow_bucket(plan, cast(BucketSite, plan.site), there)
+        manifest = _grow_bucket(plan, plan.target, there)
     return replace(plan, manifest=manifest)
 
 
@@ -337,28 +337,28 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
     return manifest
 
 
-def _prepare_bucket(plan: Plan, site: BucketSite) -> Manifest:
+def _prepare_bucket(plan: Plan, target: Target) -> Manifest:
     """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
-    with _desk(site) as folder:
+    with _desk(target) as folder:
         begun = _begun(folder, plan, plan.manifest, plan.manifest.subsets)
-        strange = set(site.listing()) - set(begun) - {MANIFEST}
-        if strange and site.manifest() is None:
+        strange = set(target.storage.list()) - set(begun) - {MANIFEST}
+        if strange and target.manifest() is None:
             raise StoreError(
-                f"{site.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
+                f"{target.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
             )
-        in_parallel(lambda name: site.write(name, begun[name].read_bytes()), list(begun), CONNECTIONS, ignore)
-    if site.create(MANIFEST, json_bytes(plan.manifest)):
+        in_parallel(lambda name: target.storage.write(name, begun[name].read_bytes()), list(begun), CONNECTIONS, ignore)
+    if target.storage.create(MANIFEST, json_bytes(plan.manifest)):
         return plan.manifest
-    first = site.manifest()
+    first = target.manifest()
     if first is None:
-        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
-    return _grow_bucket(plan, site, first)
+        raise StoreError(f"the manifest of {target.place} vanished; run the same command again")
+    return _grow_bucket(plan, target, first)
 
 
 @contextlib.contextmanager
-def _desk(site: Site) -> Iterator[Path]:
-    """A folder of one's own in a site's scratch, for a moment; no room there is one line."""
-    with storage_errors(site.workshop, "write to"), tempfile.TemporaryDirectory(dir=site.workshop) as folder:
+def _desk(target: Target) -> Iterator[Path]:
+    """A folder of one's own in a target's scratch, for a moment; no room there is one line."""
+    with storage_errors(target.scratch, "write to"), tempfile.TemporaryDirectory(dir=target.scratch) as folder:
         yield Path(folder)
 
 
@@ -371,58 +371,58 @@ def _begun(root: Path, plan: Plan, manifest: Manifest, records: Sequence[SubsetR
     return {name: path for name, path in made.items() if not Path(name).name.startswith(".")}
 
 
-def _grow_bucket(plan: Plan, site: BucketSite, there: Manifest) -> Manifest:
+def _grow_bucket(plan: Plan, target: Target, there: Manifest) -> Manifest:
     """The manifest of a bucket once it holds all that is asked for; what is new is put there first, the manifest last.
 
     Raises:
       StoreError: what is there contradicts what is asked for, or its manifest vanished.
     """
-    manifest = merged(there, plan.manifest, site.place)
+    manifest = merged(there, plan.manifest, target.place)
     if manifest is there:
         return there
     old = {record.name: record for record in there.subsets}
     changed = [record for record in manifest.subsets if record != old.get(record.name)]
-    with _desk(site) as root:
-        listed = site.listing()
+    with _desk(target) as root:
+        listed = target.storage.list()
         for record in changed:
             if record.name in old:  # its arrays are there, and get room for more episodes
-                _bring_metadata(site, record, listed, root)
+                _bring_metadata(target, record, listed, root)
         begun = _begun(root, plan, manifest, changed)
-        _refuse_altered_bucket(site, there, begun)
+        _refuse_altered_bucket(target, there, begun)
         new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
-        in_parallel(lambda name: site.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
-    with site.lock():
-        now = site.manifest()
+        in_parallel(lambda name: target.storage.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
+    with target.lock():
+        now = target.manifest()
         if now == there:
-            site.remove(INDEX)  # written again when the release is finished
-            site.write(MANIFEST, json_bytes(manifest))
+            target.storage.remove(INDEX)  # written again when the release is finished
+            target.storage.write(MANIFEST, json_bytes(manifest))
             return manifest
     if now is None:
-        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
-    return _grow_bucket(plan, site, now)  # another process changed it meanwhile
+        raise StoreError(f"the manifest of {target.place} vanished; run the same command again")
+    return _grow_bucket(plan, target, now)  # another process changed it meanwhile
 
 
-def _refuse_altered_bucket(site: BucketSite, there: Manifest, begun: Mapping[str, Path]) -> None:
+def _refuse_altered_bucket(target: Target, there: Manifest, begun: Mapping[str, Path]) -> None:
     """See `refuse_altered`; what is as it is to become was put there when growing was interrupted."""
-    text = site.read(INDEX) if there.digest else None
+    text = target.storage.read(INDEX) if there.digest else None
     if text is None:
         return
-    listed = metadata_files(parse_index(text, f"{site.place}/{INDEX}"))
+    listed = metadata_files(parse_index(text, f"{target.place}/{INDEX}"))
 
     def digest(file: FileRecord) -> str | None:
-        data = site.read(file.path)
+        data = target.storage.read(file.path)
         return None if data is None else sha256_bytes(data)
 
     found = dict(zip([file.path for file in listed], in_parallel(digest, listed, CONNECTIONS, ignore), strict=True))
     left = [f for f in listed if f.path not in begun or found[f.path] != sha256_file(begun[f.path])]
-    refuse_altered(left, found.get, site.place)
+    refuse_altered(left, found.get, target.place)
 
 
-def _bring_metadata(site: BucketSite, record: SubsetRecord, listed: Iterable[str], root: Path) -> None:
+def _bring_metadata(target: Target, record: SubsetRecord, listed: Iterable[str], root: Path) -> None:
     """A subset's zarr.json files as the bucket has them, to the byte."""
     folder = f"{subset_path(record.name)}/"
     names = [name for name in listed if name.startswith(folder) and name.endswith("/zarr.json")]
-    for name, text in zip(names, in_parallel(site.read, names, CONNECTIONS, ignore), strict=True):
+    for name, text in zip(names, in_parallel(target.storage.read, names, CONNECTIONS, ignore), strict=True):
         write_bytes(root / name, text or b"")
     mark_created(root, record)
 
@@ -492,7 +492,7 @@ def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any
 
 def finish(plan: Plan) -> Manifest:
     """Write the digests of what is whole into the manifest, when all workers are through."""
-    return plan.manifest if _is_done(plan.manifest, plan) else finish_site(plan.site)
+    return plan.manifest if _is_done(plan.manifest, plan) else finish_target(plan.target)
 
 
 def _is_done(manifest: Manifest, plan: Plan) -> bool:
@@ -500,47 +500,47 @@ def _is_done(manifest: Manifest, plan: Plan) -> bool:
     return manifest.complete and manifest.digest is not None and not plan.jobs
 
 
-def finish_site(site: Site) -> Manifest:
+def finish_target(target: Target) -> Manifest:
     """Write a release's digests: of every file, of the subsets that are whole, and of all; those it has, it keeps.
 
     Raises:
       StoreError: nothing was begun there, a file is missing or not what it was, or the place cannot be written.
     """
-    manifest = site.manifest()
+    manifest = target.manifest()
     if manifest is None:
-        raise StoreError(f"{site.place} holds no release; begin it with --init")
-    if isinstance(site, FolderSite):
-        whole = manifest.complete and manifest.digest and trusted_index(site.root, manifest)
+        raise StoreError(f"{target.place} holds no release; begin it with --init")
+    if target.folder:
+        whole = manifest.complete and manifest.digest and trusted_index(target.folder, manifest)
         if not whole:
-            return finish_together(site.root)
-        refuse_altered_folder(site.root, manifest)
+            return finish_together(target.folder)
+        refuse_altered_folder(target.folder, manifest)
         return manifest
-    return _finish_bucket(cast(BucketSite, site), manifest)
+    return _finish_bucket(target, manifest)
 
 
-def _finish_bucket(site: BucketSite, there: Manifest) -> Manifest:
-    """See `finish_site`. If another process changes the manifest meanwhile, it is read again and nothing is lost."""
-    _refuse_altered_bucket(site, there, {})
-    if there.complete and there.digest and site.read(INDEX):
+def _finish_bucket(target: Target, there: Manifest) -> Manifest:
+    """See `finish_target`. If another process changes the manifest meanwhile, it is read again and nothing is lost."""
+    _refuse_altered_bucket(target, there, {})
+    if there.complete and there.digest and target.storage.read(INDEX):
         return there
-    commits = site.commits(there.subsets)
-    with _desk(site) as mirror:
+    commits = target.commits(there.subsets)
+    with _desk(target) as mirror:
         shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
-        small = [path for path in site.listing() if path not in shards | {MANIFEST, INDEX}]
+        small = [path for path in target.storage.list() if path not in shards | {MANIFEST, INDEX}]
 
         def bring(path: str) -> None:
-            data = site.read(path)
+            data = target.storage.read(path)
             if data is not None:
                 write_bytes(mirror / path, data)
 
         in_parallel(bring, small, CONNECTIONS, ignore)
         manifest = finish_release(mirror, there, commits)
-        with site.lock():
-            now = site.manifest()
+        with target.lock():
+            now = target.manifest()
             if now == there:
                 for name in (INDEX, MANIFEST):
-                    site.write(name, (mirror / name).read_bytes())
+                    target.storage.write(name, (mirror / name).read_bytes())
                 return manifest
     if now is None:
-        raise StoreError(f"the manifest of {site.place} vanished; run the same command again")
-    return _finish_bucket(site, now)
+        raise StoreError(f"the manifest of {target.place} vanished; run the same command again")
+    return _finish_bucket(target, now)

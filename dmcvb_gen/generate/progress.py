@@ -13,7 +13,7 @@ from dmcvb_gen.dataset.manifest import commit_path, shard_count
 from dmcvb_gen.dataset.shards import chosen_shards
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import make_jobs
-from dmcvb_gen.generate.site import Site
+from dmcvb_gen.generate.target import Target
 
 RECENT = 3600.0
 """Seconds before the last commit whose commits tell the rate; pauses before them do not count."""
@@ -60,19 +60,19 @@ class ReleaseProgress:
         return dataclasses.asdict(self) | {"done": self.done, "late": self.late, "total": self.total}
 
 
-def progress_of(site: Site) -> ReleaseProgress:
-    """How much of the release at a site is done.
+def progress_of(target: Target) -> ReleaseProgress:
+    """How much of the release at a target is done.
 
     Raises:
       StoreError: there is none.
     """
-    manifest = site.manifest()
+    manifest = target.manifest()
     if manifest is None:
-        raise StoreError(f"{site.place} holds no release; begin one with `dmcvb-gen rollout`")
-    commits = site.commits(manifest.subsets)
-    listed = site.listing()
+        raise StoreError(f"{target.place} holds no release; begin one with `dmcvb-gen rollout`")
+    commits = target.commits(manifest.subsets)
+    listed = target.storage.list()
     late = dict.fromkeys((record.name for record in manifest.subsets), 0)
-    jobs = make_jobs(manifest, chosen_shards(manifest), site)
+    jobs = make_jobs(manifest, chosen_shards(manifest), target)
     missing = [[r.name for r in job.subsets if job.shard not in commits.get(r.name, {})] for job in jobs]
     through = [number for number, names in enumerate(missing) if not names]
     for names in missing[: through[-1] if through else 0]:

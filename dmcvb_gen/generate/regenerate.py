@@ -49,7 +49,7 @@ from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.inputs import release_inputs
 from dmcvb_gen.generate.jobs import make_jobs
 from dmcvb_gen.generate.plan import copy_inputs, create_groups
-from dmcvb_gen.generate.site import FolderSite
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.remote import is_url, local_path, storage_errors
 from dmcvb_gen.tasks import get_task
@@ -322,7 +322,7 @@ class Regeneration:
         inputs = release_inputs(root, records, self.backgrounds)
         if copy:
             copy_inputs(folder, records, inputs)
-        jobs = make_jobs(manifest, shards, FolderSite(folder), inputs, self.device)
+        jobs = make_jobs(manifest, shards, Target.at(folder), inputs, self.device)
         for result in run_jobs(jobs, self.workers, progress):
             yield from result.commits
 

@@ -29,7 +29,7 @@ from dmcvb_gen.generate.recipe import Recipe, make_recipe
 from dmcvb_gen.generate.render import (
     check_renderer,
 )
-from dmcvb_gen.generate.site import FolderSite
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import LABEL_TYPES, Distractor, is_maze, select
@@ -107,7 +107,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
       DmcvbError: nothing fits, two subsets would become one, a source shard is damaged, or `out` cannot be used.
     """
     out = local_path(request.out)
-    release, site = _source(request), FolderSite(out)
+    release, target = _source(request), Target.at(out)
     pairs: dict[str, Repainted] = {}
     names = select(list(release.subsets), list(request.only))
     for name in [name for name in names if not release[name].record.imported]:
@@ -134,7 +134,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
     inputs = {name: pair.inputs for name, pair in pairs.items()}
     copy_inputs(out, [pair.record for pair in pairs.values()], inputs)
     sources = {name: Stored(pair.source, new_labels=not pair.keeps_labels) for name, pair in pairs.items()}
-    jobs = make_jobs(manifest, todo, site, inputs, request.device, sources, tuple(request.labels))
+    jobs = make_jobs(manifest, todo, target, inputs, request.device, sources, tuple(request.labels))
     for _ in run_jobs(jobs, workers, progress):
         pass
     return finish_together(out)

@@ -11,7 +11,7 @@ from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 from dmcvb_gen.dataset.writer import sha256_file, subset_path
 from dmcvb_gen.release.episode_table import COLUMNS, PICTURE, TABLE
-from dmcvb_gen.release.hub import on_the_hub, parse_hub_url
+from dmcvb_gen.storage.hub import on_the_hub, parse_hub_url
 from dmcvb_gen.storage.remote import public
 
 LICENSES = {

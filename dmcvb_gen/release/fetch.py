@@ -46,15 +46,12 @@ from dmcvb_gen.dataset.manifest import (
     subset_path,
 )
 from dmcvb_gen.dataset.shards import ShardKey, chosen_shards
-from dmcvb_gen.dataset.transfer import download, in_parallel, protocol, read_object, retry
 from dmcvb_gen.dataset.writer import LOCK, finish_release, mark_created, read_commits, write_lock
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
-from dmcvb_gen.release.hub import on_the_hub
-from dmcvb_gen.storage.remote import file_system, local_path, public, storage_errors
-
-AHEAD = 64
-"""Shards of a Hugging Face repository that are asked for at once."""
+from dmcvb_gen.storage import Storage, open_storage
+from dmcvb_gen.storage.base import in_parallel
+from dmcvb_gen.storage.remote import local_path, storage_errors
 
 
 @dataclass(frozen=True)
@@ -89,9 +86,9 @@ def fetch(
         there is no room; access is refused.
     """
     folder, source = local_path(out), Source.find(url, options)
-    with Download.at(folder, source, only, episodes, workers, tick) as arrival:
-        moved = arrival.bring()
-        arrival.finish()
+    with Download.at(folder, source, only, episodes, workers, tick) as download:
+        moved = download.bring()
+        download.finish()
     return moved
 
 
@@ -120,26 +117,26 @@ def fetch_and_paint(
     from dmcvb_gen.generate.paint import RenderSession  # who only fetches has no simulator
 
     folder, source = local_path(out), Source.find(url, options)
-    with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as arrival:
-        names, painted = {name for name, _ in arrival.shards}, arrival.painted
-        session = RenderSession.open(open_release(folder), names, painter, arrival.unpainted, painted)
-        session.expect(arrival.unpainted_commits)
+    with Download.at(folder, source, only, episodes, workers, tick, with_pictures=True) as download:
+        names, painted = {name for name, _ in download.shards}, download.painted
+        session = RenderSession.open(open_release(folder), names, painter, download.unpainted, painted)
+        session.expect(download.unpainted_commits)
         arrived: queue.SimpleQueue = queue.SimpleQueue()
-        bringing = threading.Thread(target=_bring, args=(arrival, arrived), name="fetch")
-        bringing.start()
+        thread = threading.Thread(target=_bring, args=(download, arrived), name="fetch")
+        thread.start()
         try:
             found = list(session.paint(arrived))
         finally:
-            arrival.stop.set()
-            bringing.join()
-        manifest = arrival.finish()
-    return arrival.moved, session.report(manifest, found)
+            download.stop.set()
+            thread.join()
+        manifest = download.finish()
+    return download.moved, session.report(manifest, found)
 
 
-def _bring(arrival: Download, arrived: queue.SimpleQueue) -> None:
+def _bring(download: Download, arrived: queue.SimpleQueue) -> None:
     """Tell of each shard that has come without pictures, then of the end, or of what went wrong."""
     try:
-        arrival.bring(arrived.put)
+        download.bring(arrived.put)
         arrived.put(None)
     except BaseException as error:
         arrived.put(error)
@@ -149,10 +146,7 @@ def _bring(arrival: Download, arrived: queue.SimpleQueue) -> None:
 class Source:
     """A published release: where it lies, and what it says of itself."""
 
-    url: str
-    filesystem: Any
-    base: str
-    place: str
+    storage: Storage
     manifest_text: bytes
     index_text: bytes
     manifest: Manifest
@@ -165,13 +159,12 @@ class Source:
         Raises:
           StoreError: no release is there, or its manifest and index do not belong together.
         """
-        place = public(url)
-        filesystem, base = file_system(url, options)
-        text = read_object(filesystem, place, f"{base}/{MANIFEST}")
+        storage = open_storage(url, options)
+        place, text = storage.place, storage.read(MANIFEST)
         if text is None:
             raise StoreError(f"{place} holds no release (no {MANIFEST}); check the URL, or it is still being published")
         manifest = parse_manifest(text, f"{place}/{MANIFEST}")
-        listing = read_object(filesystem, place, f"{base}/{INDEX}")
+        listing = storage.read(INDEX)
         if listing is None and not manifest.complete:
             raise StoreError(f"{place} is not finished; finish it first: dmcvb-gen rollout --out {place} --finish")
         if listing is None:
@@ -181,13 +174,17 @@ class Source:
         index = parse_index(listing, f"{place}/{INDEX}")
         if index.manifest_sha256 != files.sha256_bytes(text):
             raise StoreError(f"{place}: {MANIFEST} does not have the digest that {INDEX} says; publish it again")
-        return cls(url, filesystem, base, place, text, listing, manifest, index)
+        return cls(storage, text, listing, manifest, index)
+
+    @property
+    def place(self) -> str:
+        """Its folder or URL, for messages."""
+        return self.storage.place
 
     @property
     def public_name(self) -> str:
         """What others are told that the release came from: the URL; of a folder of this machine, what lay in it."""
-        local = protocol(self.filesystem) in ("file", "local")
-        return f"{self.manifest.name} {self.manifest.version}" if local else self.place
+        return f"{self.manifest.name} {self.manifest.version}" if self.storage.folder else self.place
 
     @functools.cached_property
     def _by_path(self) -> dict[str, FileRecord]:
@@ -239,7 +236,6 @@ class Download:
         self.commits = _fetch_commits(source, listed, shards, workers)
         self._metadata = source.metadata(shards.values())
         self._kept: dict[ShardKey, CommitRecord] = {}
-        self._brought: set[str] = set()
 
     @classmethod
     @contextlib.contextmanager
@@ -253,7 +249,7 @@ class Download:
         tick: ProgressCallback,
         with_pictures: bool = False,
     ) -> Iterator[Download]:
-        """An arrival whose folder is locked and has the metadata and a manifest that says that it is a part.
+        """A download whose folder is locked and has the metadata and a manifest that says that it is a part.
 
         Args:
           with_pictures: room will be needed for pictures, too.
@@ -262,17 +258,17 @@ class Download:
           StoreError: see `fetch`.
         """
         shards = chosen_shards(source.manifest, only, episodes)
-        arrival = cls(out, source, shards, workers, tick)
+        download = cls(out, source, shards, workers, tick)
         with storage_errors(out, "write to"):
             out.mkdir(parents=True, exist_ok=True)
             with write_lock(out):
-                arrival._keep_painted()
-                arrival._check_room(with_pictures)
-                coming = [file for _, commit in arrival.commits.values() for file in commit.files]
-                expect(tick, sum(file.bytes for file in [*coming, *arrival._metadata]))
-                arrival._download([(None, file) for file in arrival._metadata], lambda key: None)
-                _write_part(out, source, arrival._base(), only, episodes)
-                yield arrival
+                download._keep_painted()
+                download._check_room(with_pictures)
+                coming = [file for _, commit in download.commits.values() for file in commit.files]
+                expect(tick, sum(file.bytes for file in [*coming, *download._metadata]))
+                download._download([(None, file) for file in download._metadata], lambda key: None)
+                _write_part(out, source, download._base(), only, episodes)
+                yield download
 
     @property
     def unpainted(self) -> set[str]:
@@ -333,39 +329,22 @@ class Download:
         Raises:
           StoreError: see `fetch`.
         """
-        keys = list(self.shards)
-        ahead = AHEAD if on_the_hub(self.source.url) else len(keys)
-        for first in range(0, len(keys), ahead):
-            part = keys[first : first + ahead]
-            if on_the_hub(self.source.url):
-                self._prefetch(part)
-            self._download([(key, file) for key in part for file in self.commits[key][1].files], arrived)
+        self._download([(key, file) for key in self.shards for file in self.commits[key][1].files], arrived)
+        self.source.storage.tidy(self.out)
         return self.moved
-
-    def _prefetch(self, keys: Sequence[ShardKey]) -> None:
-        """Have the Hub's own client bring files; what it did not bring, or not whole, is fetched one by one."""
-        from dmcvb_gen.release.hub import snapshot
-
-        missing = {
-            key: [file for file in self.commits[key][1].files if not (self.out / file.path).is_file()] for key in keys
-        }
-        wanted = [file for found in missing.values() for file in found]
-        self._brought |= snapshot(self.source.url, self.out, wanted, [key for key, found in missing.items() if found])
 
     def _download(self, items: Sequence[tuple[ShardKey | None, FileRecord]], arrived) -> None:
         left = collections.Counter(key for key, _ in items)
 
-        def work(item: tuple[ShardKey | None, FileRecord]) -> tuple[ShardKey | None, int, int]:
+        def work(item: tuple[ShardKey | None, FileRecord]) -> tuple[ShardKey | None, bool, int]:
             key, file = item
             if self.stop.is_set():
                 raise StoreError("stopped; what was moved stays, run the same command again")
-            remote = f"{self.source.base}/{file.path}"
-            moved = download(self.source.filesystem, self.source.place, remote, self.out / file.path, file)
-            return key, moved or file.path in self._brought, file.bytes
+            return key, self.source.storage.download(file, self.out), file.bytes
 
-        def done(result: tuple[ShardKey | None, int, int]) -> None:
+        def done(result: tuple[ShardKey | None, bool, int]) -> None:
             key, moved, size = result
-            self.moved = Moved(self.moved.files + 1, self.moved.bytes + size, self.moved.moved + bool(moved))
+            self.moved = Moved(self.moved.files + 1, self.moved.bytes + size, self.moved.moved + moved)
             self._tick(size)
             left[key] -= 1
             if key is None or left[key] or key in self._kept:
@@ -401,17 +380,12 @@ def _fetch_commits(
 
     def one(item):
         key, file = item
-
-        def attempt():
-            data = source.filesystem.cat_file(f"{source.base}/{file.path}")
-            if files.sha256_bytes(data) != file.sha256:
-                raise OSError(f"{file.path} does not have its digest")
-            return data
-
-        text = retry(source.place, file.path, attempt, "read")
+        text = source.storage.read(file.path, file.sha256)
+        if text is None:
+            raise StoreError(f"{file.path} of {source.place} is missing; publish the release again")
         return text, checked_commit(text, f"{source.place}/{file.path}", shards[key], key[1])
 
-    found = in_parallel(one, list(zip(shards, listed, strict=True)), workers, lambda _: 0)
+    found = in_parallel(one, list(zip(shards, listed, strict=True)), workers)
     return dict(zip(shards, found, strict=True))
 
 

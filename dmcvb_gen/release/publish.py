@@ -7,14 +7,18 @@ without a manifest is no release, so readers never see half of one.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.dataset.append import is_grown_from
 from dmcvb_gen.dataset.index import (
+    CARD_FILES,
     INDEX,
     Index,
     card_files,
@@ -34,19 +38,13 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.shards import wrong_bytes
-from dmcvb_gen.dataset.transfer import (
-    create_object,
-    in_parallel,
-    put_object,
-    read_object,
-    retry,
-    upload,
-)
 from dmcvb_gen.dataset.writer import read_commits
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.storage.remote import file_system, public, storage_errors
+from dmcvb_gen.storage import Storage, open_storage
+from dmcvb_gen.storage.remote import storage_errors
 
 CLAIM = "publishing.json"
 
@@ -72,7 +70,55 @@ def index_of(root: Path, manifest: Manifest) -> Index:
     return index
 
 
-# -- publish --------------------------------------------------------------------------------------
+def publish_folder(
+    path: str | Path,
+    url: str,
+    *,
+    pixels: bool = True,
+    take_over: bool = False,
+    options: dict[str, Any] | None = None,
+    workers: int = 8,
+    tick: ProgressCallback = ignore,
+) -> Moved:
+    """Put a complete release, or an export, at a URL; run again after an interruption, it resumes.
+
+    Args:
+      url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL.
+      pixels: False leaves the images out; `paint` renders them again.
+      take_over: publish even if another upload has claimed the URL.
+      options: of fsspec; credentials belong into the environment.
+      workers: parallel transfers.
+      tick: called with 1 for each file.
+
+    Raises:
+      StoreError: as `publish.publish` does, or an option of releases was given for an export.
+    """
+    if not (Path(path) / MANIFEST).exists() and export_format(path) is not None:
+        if not pixels or take_over:
+            raise StoreError("--no-pixels and --take-over are for releases, and this is an export: remove them")
+        return publish_export(path, url, options=options, workers=workers, tick=tick)
+    with contextlib.nullcontext(path) if pixels else light_copy(path) as sent:
+        return publish(sent, url, options=options, take_over=take_over, workers=workers, tick=tick)
+
+
+@contextlib.contextmanager
+def light_copy(path: str | Path) -> Iterator[str]:
+    """A copy (of links) of a release without its pictures, beside it, with a card of its own if the release has one."""
+    from dmcvb_gen.generate.paint import without_pictures  # the simulator, which publishing as it is does not need
+    from dmcvb_gen.release.card import README, write_card
+
+    folder = Path(path)
+    with storage_errors(folder, "write beside"):
+        made = tempfile.TemporaryDirectory(dir=folder.resolve().parent, prefix=f".{folder.name}-light-")
+    with made as light:
+        without_pictures(folder, light)
+        if (folder / README).is_file():
+            with storage_errors(folder):
+                for name in CARD_FILES:  # the day and the place, the changes so far
+                    if name != README and (folder / name).is_file():
+                        shutil.copyfile(folder / name, Path(light) / name)
+            write_card(light)
+        yield light
 
 
 def publish(
@@ -102,37 +148,28 @@ def publish(
     index = index_of(root, manifest)
     total = sum(file.bytes for file in index.files)
     _check_card(root, manifest, index)
-    if url.startswith("hf://"):
-        from dmcvb_gen.release.hub import publish_to_hub
-
-        return Moved(len(index.files), total, publish_to_hub(root, manifest, index, url, tick))
-    filesystem, base = file_system(url, options)
-    place = public(url)
-    before, same = _published(filesystem, place, base, index, manifest)
+    storage, tag = open_storage(url, options), (f"v{manifest.version}", f"{manifest.name} {manifest.version}")
+    storage.begin()
+    before, same = _published(storage, index, manifest)
     if same and before is not None and set(index.files) <= set(before):
+        storage.tag(*tag)
         return Moved(len(index.files), total, 0)
-    fresh = _claim(filesystem, place, base, index.manifest_sha256, manifest, take_over)
-    fresh = fresh and before is None and read_object(filesystem, place, f"{base}/{INDEX}") is None
+    fresh = storage.needs_claim and _claim(storage, index.manifest_sha256, manifest, take_over)
+    fresh = fresh and before is None and storage.read(INDEX) is None
     kept = set(before or ())
     todo = [file for file in index.files if file not in kept]
     expect(tick, len(todo))
-    results = []
-    for part in _in_order(todo):
-        results += in_parallel(
-            lambda file: upload(filesystem, place, root / file.path, f"{base}/{file.path}", file, fresh),
-            part,
-            workers,
-            lambda result: tick(1),
-        )
-    retry(place, INDEX, lambda: put_object(filesystem, f"{base}/{INDEX}", files.json_bytes(index)))
-    with storage_errors(root / MANIFEST):
-        text = (root / MANIFEST).read_bytes()
-    if before is not None:
-        retry(place, MANIFEST, lambda: put_object(filesystem, f"{base}/{MANIFEST}", text))
-    elif not create_object(filesystem, place, f"{base}/{MANIFEST}", text):
-        _published(filesystem, place, base, index, manifest)  # another one's raises
-    retry(place, CLAIM, lambda: filesystem.rm_file(f"{base}/{CLAIM}"))
-    return Moved(len(index.files), total, sum(results))
+    moved = sum(storage.upload_all(root, part, workers, tick, fresh) for part in _in_order(todo))
+    last = {INDEX: files.json_bytes(index)}
+    if not same:
+        with storage_errors(root / MANIFEST):
+            last[MANIFEST] = (root / MANIFEST).read_bytes()
+    if not storage.write_last(last, new=before is None):
+        _published(storage, index, manifest)  # another one's raises
+    storage.tag(*tag)
+    if storage.needs_claim:
+        storage.remove(CLAIM)
+    return Moved(len(index.files), total, moved)
 
 
 def _check_card(root: Path, manifest: Manifest, index: Index) -> None:
@@ -154,7 +191,7 @@ def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
     return [part for part in parts if part]
 
 
-def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tuple[tuple[FileRecord, ...] | None, bool]:
+def _published(storage: Storage, index: Index, manifest: Manifest) -> tuple[tuple[FileRecord, ...] | None, bool]:
     """The files that are listed there, and whether the manifest there is this one, not one that it has grown from.
 
     Returns:
@@ -163,12 +200,12 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
     Raises:
       StoreError: another release is there.
     """
-    found = read_object(filesystem, place, f"{base}/{MANIFEST}")
+    place, found = storage.place, storage.read(MANIFEST)
     if found is None:
         return None, False
     if files.sha256_bytes(found) == index.manifest_sha256:
         try:
-            return parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files, True
+            return parse_index(storage.read(INDEX) or b"", f"{place}/{INDEX}").files, True
         except StoreError:  # damaged, and put there again
             return (), True
     what = "something else"
@@ -176,7 +213,7 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
         other = parse_manifest(found, f"{place}/{MANIFEST}")
         what = f"{other.name} {other.version}"
         if is_grown_from(manifest, other):
-            before = parse_index(read_object(filesystem, place, f"{base}/{INDEX}") or b"", f"{place}/{INDEX}").files
+            before = parse_index(storage.read(INDEX) or b"", f"{place}/{INDEX}").files
             if keeps(index, before):
                 return before, False
     except StoreError:
@@ -187,20 +224,19 @@ def _published(filesystem, place, base, index: Index, manifest: Manifest) -> tup
     )
 
 
-def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
+def _claim(storage: Storage, digest: str, manifest: Manifest, take_over: bool) -> bool:
     """Say that this release is being published there; True if nobody had begun to.
 
     Raises:
       StoreError: another release is.
     """
     mine = {"name": manifest.name, "version": manifest.version, "manifest_sha256": digest}
-    data, path = json.dumps(mine).encode(), f"{base}/{CLAIM}"
-    created = create_object(filesystem, place, path, data)
-    found = None if created else read_object(filesystem, place, path)
+    data = json.dumps(mine).encode()
+    found = None if storage.create(CLAIM, data) else storage.read(CLAIM)
     if found is None or found == data:
         return found is None  # else ours, from an interrupted try: the files that are there already are kept
     if take_over:
-        retry(place, CLAIM, lambda: put_object(filesystem, path, data))
+        storage.write(CLAIM, data)
         return False
     try:
         other = json.loads(found)
@@ -208,6 +244,6 @@ def _claim(filesystem, place, base, digest, manifest, take_over) -> bool:
     except (ValueError, KeyError, TypeError):
         what = "another release"
     raise StoreError(
-        f"{what} is being published to {place} by someone else; choose another URL, or --take-over if that publisher "
-        "is gone"
+        f"{what} is being published to {storage.place} by someone else; choose another URL, or --take-over if that "
+        "publisher is gone"
     )

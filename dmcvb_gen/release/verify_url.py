@@ -15,13 +15,13 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import INDEX, root_digest
 from dmcvb_gen.dataset.manifest import FileRecord, commit_path, shard_count
 from dmcvb_gen.dataset.reader import Subset
-from dmcvb_gen.dataset.transfer import in_parallel, list_files, protocol, remote_sha256, retry
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.fetch import Source
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import Verification, subset_of
+from dmcvb_gen.storage.base import in_parallel
 
 SAMPLE_FILES = 40
 """Files that are read where not all are asked for; spread evenly over the release."""
@@ -56,9 +56,8 @@ def verify_url(
         chosen = [chosen[place] for place in places]
 
     def look(file: FileRecord) -> Issue | None:
-        path = f"{source.base}/{file.path}"
         try:
-            digest = retry(source.place, file.path, lambda: remote_sha256(source.filesystem, path, file.bytes), "read")
+            digest = source.storage.sha256(file)
         except StoreError as error:
             return Issue("files", subset_of(source.manifest, file.path), str(error))
         if digest == file.sha256:
@@ -91,15 +90,15 @@ def _missing(source: Source, damaged: Collection[str]) -> list[Issue]:
     Args:
       damaged: paths of what was found to be so already.
     """
-    if protocol(source.filesystem) in ("http", "https"):
-        return []  # whose lists are pages without sizes, or none; a sample was read
+    if not source.storage.lists_sizes:
+        return []  # a sample was read
     try:
-        there = list_files(source.filesystem, source.place, source.base.rstrip("/"))
+        there = source.storage.list()
     except StoreError:
         return []  # may be read and not listed; a sample was read
     found = []
     for file in source.index.files:
-        size = there[file.path].get("size") if file.path in there else -1
+        size = there[file.path].bytes if file.path in there else -1
         text = f"{file.path} is missing or has another size"
         if size not in (None, file.bytes) and file.path not in damaged:
             found.append(Issue("files", subset_of(source.manifest, file.path), text))

@@ -1,1 +1,36 @@
-"""Where releases lie: local folders, object stores, the Hugging Face Hub."""
+"""Where releases lie: local folders, object stores, the Hugging Face Hub. `open_storage` is the way in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen.storage.base import Storage
+from dmcvb_gen.storage.remote import file_system, is_url
+
+
+def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) -> Storage:
+    """The storage at a folder or URL; nothing is read or made there.
+
+    Args:
+      options: of fsspec, for a URL, e.g. {"endpoint_url": ...}.
+
+    Raises:
+      StoreError: the URL's protocol is unknown or not installed, or it names no bucket.
+    """
+    from dmcvb_gen.storage.local import LocalStorage
+    from dmcvb_gen.storage.object_store import ObjectStorage
+
+    url = str(place)
+    if not is_url(url):
+        return LocalStorage(Path(place))
+    protocol, pairs = url.split(":", 1)[0], tuple(sorted((options or {}).items()))
+    if protocol == "hf":
+        from dmcvb_gen.storage.hub import HubStorage
+
+        return HubStorage(url, pairs)
+    _, base = file_system(url, dict(pairs))
+    if protocol in ("file", "local"):
+        return LocalStorage(Path(base), url)
+    return ObjectStorage(url, pairs)

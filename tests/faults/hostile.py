@@ -429,7 +429,7 @@ def take_names(folder: Path) -> None:
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.release.export import export
     from dmcvb_gen.release.fetch import fetch
-    from dmcvb_gen.release.hub import parse_hub_url
+    from dmcvb_gen.storage.hub import parse_hub_url
     from dmcvb_gen.storage.remote import file_system
 
     name = json.loads((folder / "names.json").read_bytes())
@@ -636,9 +636,9 @@ class _Guard:
 
 def serve() -> None:
     """Take cases from standard input, a line each: its kind and its files."""
-    from dmcvb_gen.dataset import transfer
+    from dmcvb_gen.storage import base
 
-    transfer.PAUSE = 0  # what is damaged for good is fetched anew several times
+    base.PAUSE = 0  # what is damaged for good is fetched anew several times
     sys.dont_write_bytecode = True
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

@@ -8,13 +8,12 @@ from typing import Any
 
 from dmcvb_gen import files
 from dmcvb_gen.dataset.manifest import FileRecord
-from dmcvb_gen.dataset.transfer import in_parallel, upload
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export.registry import all_formats
-from dmcvb_gen.release.hub import client_errors, new_api, newest_of
-from dmcvb_gen.release.publish import Moved
-from dmcvb_gen.storage.remote import file_system, public
+from dmcvb_gen.release.fetch import Moved
+from dmcvb_gen.storage import open_storage
+from dmcvb_gen.storage.hub import client_errors, new_api, newest_of, on_the_hub
 
 LEROBOT_INFO = "meta/info.json"
 
@@ -57,16 +56,11 @@ def publish_export(
     records = [_record(path, folder) for path in paths]
     total = sum(record.bytes for record in records)
     expect(tick, len(records))
-    if url.startswith("hf://"):
+    if on_the_hub(url):
         _to_hub(folder, kind, url, api)
         tick(len(records))
         return Moved(len(records), total, len(records))
-    filesystem, base = file_system(url, options)
-
-    def send(record: FileRecord) -> bool:
-        return upload(filesystem, public(url), folder / record.path, f"{base}/{record.path}", record)
-
-    return Moved(len(records), total, sum(in_parallel(send, records, workers, lambda _: tick(1))))
+    return Moved(len(records), total, open_storage(url, options).upload_all(folder, records, workers, tick))
 
 
 def _record(path: Path, folder: Path) -> FileRecord:
@@ -77,13 +71,13 @@ def _record(path: Path, folder: Path) -> FileRecord:
 
 def _to_hub(folder: Path, kind: str, url: str, api: Any) -> None:
     """One commit of all files into a data set repository; LeRobot's loader then looks for a tag of its version."""
-    repository, inside = newest_of(url)
+    where, inside = newest_of(url)
     if kind == "lerobot" and (inside or not (folder / LEROBOT_INFO).is_file()):
         raise StoreError(
             f"LeRobot finds one data set a repository: publish one folder with {LEROBOT_INFO} to "
             "hf://datasets/OWNER/NAME, or export the subsets as one data set with --merge"
         )
-    api, where = api or new_api(), dict(repo_id=repository, repo_type="dataset")
+    api = api or new_api()
     with client_errors(url):
         api.create_repo(**where, exist_ok=True)
         message = f"{folder.name}: exported to {kind} by dmcvb-gen"

@@ -1,0 +1,86 @@
+"""The Hugging Face Hub in a folder: what we call of `huggingface_hub.HfApi`, and its file system."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import types
+from pathlib import Path
+
+import pytest
+from fsspec.implementations.dirfs import DirFileSystem
+
+
+class FakeHub:
+    """One repository of data sets, the newest version of its files in `folder`.
+
+    Attributes:
+      commits: the paths of each commit. tags: name -> commit.
+      fail: the number of the commit that a lost connection keeps from being made.
+      asked: paths that were downloaded, with the revision.
+    """
+
+    def __init__(self, root: Path, repository: str):
+        self.root, self.folder = root, root / "datasets" / repository
+        self.commits, self.tags, self.fail, self.asked = [], {}, None, []
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        paths = [path for path in self.folder.rglob("*") if path.is_file()]
+        return {path.relative_to(self.folder).as_posix(): path.read_bytes() for path in paths}
+
+    def create_repo(self, repo_id, repo_type, exist_ok):
+        assert repo_type == "dataset" and exist_ok
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def repo_info(self, repo_id, repo_type):
+        return types.SimpleNamespace(sha=str(len(self.commits)))
+
+    def get_paths_info(self, repo_id, paths, repo_type):
+        for path in paths:
+            if (self.folder / path).is_file():
+                data = (self.folder / path).read_bytes()
+                blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+                yield types.SimpleNamespace(path=path, blob_id=blob, lfs=None)
+
+    def hf_hub_download(self, repo_id, filename, repo_type, revision, local_dir):
+        self.asked.append((filename, revision))
+        target = Path(local_dir) / filename
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(self.folder / filename, target)
+        return str(target)
+
+    def create_tag(self, repo_id, tag, tag_message, revision, repo_type, exist_ok):
+        assert exist_ok and revision == str(len(self.commits))
+        self.tags.setdefault(tag, revision)
+
+    def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit):
+        if self.fail is not None and len(self.commits) == self.fail:
+            raise ConnectionError("the line went dead, token=hf_secret123")
+        if parent_commit in (None, str(len(self.commits))):
+            for operation in operations:
+                path = self.folder / operation.path_in_repo
+                if not hasattr(operation, "as_file"):
+                    path.unlink()
+                    continue
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with operation.as_file() as file:
+                    path.write_bytes(file.read())
+        else:
+            raise RuntimeError("412 Precondition Failed: a commit has happened since")
+        self.commits.append([operation.path_in_repo for operation in operations])
+        return types.SimpleNamespace(oid=str(len(self.commits)))
+
+
+def fake_hub(root: Path, monkeypatch, repository: str = "me/tiny") -> FakeHub:
+    """A Hub that hf:// URLs lead to while a test runs."""
+    pytest.importorskip("huggingface_hub")
+    hub = FakeHub(root, repository)
+
+    def file_system(url, options):
+        return DirFileSystem(str(root)), re.sub(r"@[^/]*", "", url.removeprefix("hf://")).rstrip("/")
+
+    monkeypatch.setattr("dmcvb_gen.storage.hub.new_api", lambda: hub)
+    monkeypatch.setattr("dmcvb_gen.storage.hub.file_system", file_system)
+    return hub
