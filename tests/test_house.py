@@ -30,6 +30,7 @@ FLOORS = (
         "arithmetic",
         "precision",
         "compilation",
+        "progress",
         "own_code",
     ),  # the ground
     ("tasks",),

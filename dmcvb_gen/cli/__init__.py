@@ -18,7 +18,7 @@ from dmcvb_gen.version import __version__
 GROUPS = {
     "Make data": {
         "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of episodes."),
-        "status": ("cluster:status", "Show the progress of a release that is being made."),
+        "status": ("status:status", "Show the progress of a release that is being made."),
         "paint": ("paint:paint", "Render the images of a release stored without pixels."),
         "repaint": ("release:repaint", "Render stored episodes again: other distractors, size or renderer."),
         "regenerate": ("release:regenerate", "Generate a release again from its manifest: check, repair or copy."),
@@ -44,7 +44,7 @@ GROUPS = {
     "Share": {
         "card": ("release:card", "Write the card of a release: README.md, croissant.json, images."),
         "publish": ("release:publish", "Upload a release: s3://, gs://, hf:// or any fsspec URL."),
-        "fetch": ("fetch:fetch", "Download a published release, or a part of it."),
+        "fetch": ("paint:fetch", "Download a published release, or a part of it."),
     },
     "Convert": {
         "convert-policy": ("behaviours:convert_policy", "Convert a policy of Stable-Baselines3 or torch (CleanRL)."),

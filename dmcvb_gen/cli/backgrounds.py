@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, json_option, print_json
+from dmcvb_gen.progress import ProgressBar
 
 
 @click.command()
@@ -26,7 +27,7 @@ def backgrounds(videos, seed, out, sheet, as_json):
 
     from dmcvb_gen.distractors.clips import clip_sheet, make_clips
 
-    with ProgressBar(as_json, total=2 * videos, unit=" clips") as bar:
+    with ProgressBar(not as_json, total=2 * videos, unit=" clips") as bar:
         made = make_clips(videos, seed, out, bar.update)
     if sheet:
         sheet.parent.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, print_table
+from dmcvb_gen.cli.common import OutPath, json_option, print_json, print_table
+from dmcvb_gen.progress import ProgressBar
 
 
 @click.command("train-behaviour")
@@ -89,7 +90,7 @@ def train_behaviour(
     done = saved["step"] if saved else 0
     expert = paper_returns(task, "expert")
     with ProgressBar(
-        as_json, total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task_folder(task)
+        not as_json, total=configuration.steps, initial=done, unit=" steps", unit_scale=True, desc=task_folder(task)
     ) as bar:
 
         def report(progress):
@@ -121,7 +122,7 @@ def train_behaviour(
 def _select(folder, as_json, episodes=100, seed=20_000, sample=False, converged=None):
     from dmcvb_gen.training.selection import select_checkpoints
 
-    with ProgressBar(as_json, unit=" checkpoints", desc="selection") as bar:
+    with ProgressBar(not as_json, unit=" checkpoints", desc="selection") as bar:
         return select_checkpoints(folder, episodes, seed, not sample, converged, bar)
 
 

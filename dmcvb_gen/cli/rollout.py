@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shlex
 import textwrap
 from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.cluster import executor_option, make_executor, parse_bytes, parse_part, ray_option, slurm_script
+from dmcvb_gen import commands
 from dmcvb_gen.cli.common import (
-    GroupedCommand,
     OutPath,
-    ProgressBar,
     format_bytes,
     format_duration,
     json_option,
@@ -21,27 +20,20 @@ from dmcvb_gen.cli.common import (
     print_table,
     remote_option,
 )
-from dmcvb_gen.cli.unused_options import check_exclusive_options, given_options, is_given
-from dmcvb_gen.spec import (
-    DIFFICULTIES,
-    REWARDS,
-    SPLITS,
-)
+from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.cli.slurm import script_for_slurm
+from dmcvb_gen.cli.unused_options import check_exclusive_options
+from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.storage.remote import is_url, public
 from dmcvb_gen.text import pluralize
-
-
-def _out_default(name: str) -> str:
-    return str(Path("releases") / name)
-
 
 OPTION_GROUPS = {
     "What": ("recipe", "only", "levels", "behaviour", "sample", "independent", "seed"),
     "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count", "correlated"),
     "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
-    "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "no_pixels"),
-    "Where": ("out", "options", "scratch", "scratch_size"),
+    "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "pixels"),
+    "Where": ("out", "storage_options", "scratch", "scratch_size"),
     "Workers and many machines": (
         *("workers", "executor", "ray_address", "init", "part", "finishing", "other_versions", "slurm_script"),
     ),
@@ -49,118 +41,14 @@ OPTION_GROUPS = {
 """Heading -> options of `rollout --help`."""
 
 
-@click.command(cls=GroupedCommand, option_groups=OPTION_GROUPS)
-@click.argument("tasks", nargs=-1, metavar="[TASK]...")
-@click.option("--recipe", metavar="FILE|NAME", help="Recipe: a YAML file or the name of a shipped one.")
-@click.option(
-    "--only", multiple=True, metavar="PATTERN", help="Roll out only these subsets, e.g. 'walker-walk/*/static'."
-)
-@click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
-@click.option(
-    "--distractor",
-    "distractors",
-    multiple=True,
-    help="none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. Repeatable.  [default: none]",
-)
-@click.option(
-    "--difficulty",
-    type=click.Choice(DIFFICULTIES),
-    default="medium",
-    show_default=True,
-    help="Strength of the distractors.",
-)
-@click.option(
-    "--intensity",
-    type=click.FloatRange(0, 1, min_open=True),
-    help="Scale of the distractors instead of a difficulty: easy is 0.1, medium 0.2, hard 0.3.",
-)
-@click.option(
-    "--vary",
-    metavar="PART,...",
-    help="Vary only these parts: camera, color, background, shake.  [default: the first three]",
-)
-@click.option("--video-count", type=click.IntRange(1), help="Background videos in use.  [default: by the difficulty]")
-@click.option(
-    "--correlated",
-    type=click.FloatRange(0, 1, min_open=True),
-    metavar="RHO",
-    help="dynamic: also show a spurious cue that correlates with the last action.",
-)
-@click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
-@click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
-@click.option(
-    "--episodes-per-goal",
-    type=click.IntRange(1),
-    default=10,
-    show_default=True,
-    help="Mazes: episodes of each fixed pair.",
-)
-@click.option("--layout", "layouts", multiple=True, help="Mazes: name or text file of a layout, instead of TASK.")
-@click.option(
-    "--reward", type=click.Choice(REWARDS), help="Mazes: DMC-VB's distance to the goal, or the shortest path."
-)
-@click.option("--episodes", type=click.IntRange(1), help="Episodes per subset.  [default: 20]")
-@click.option("--steps", type=click.IntRange(1), help="Steps per subset, instead of --episodes.")
-@click.option("--max-steps", type=click.IntRange(1), help="Longest episode, in steps.  [default: 500, mazes 600]")
-@click.option("--range", "episode_range", metavar="A:B", help="Generate only the shards with episodes A to B - 1.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed of the release.")
-@click.option("--size", type=int, default=64, show_default=True, help="Width and height of the images, in pixels.")
-@click.option(
-    "--renderer", default="native", help="native, warp or opengl.  [default: native; with --device cuda: warp]"
-)
-@click.option(
-    "--samples",
-    type=click.IntRange(1, 8),
-    help="Samples per pixel: 1, 2, 4 or 8; native has 4.  [default: warp 2, others 4]",
-)
-@click.option("--device", default="cpu", show_default=True, help="Device that renders: cpu, or cuda with warp.")
-@click.option("--backgrounds", default="builtin", show_default=True, help="Background videos: builtin, or a folder.")
-@click.option(
-    "--split", type=click.Choice(SPLITS), default="train", help="Background videos and maze styles: train or val."
-)
-@click.option(
-    "--behaviour",
-    metavar="FILE|RUN|MODULE:FUNCTION",
-    help="Policy instead of the bundled one: a policy file, a training run, an SB3 zip, a torch state dict (.pt), or a "
-    "function of your own.",
-)
-@click.option("--sample", is_flag=True, help="Sample actions instead of using the policy mean.")
-@click.option("--no-pixels", is_flag=True, help="Store no images; `paint` renders them later.")
-@click.option("--independent", is_flag=True, help="Simulate separate episodes for each distractor.")
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Worker processes.")
-@executor_option
-@ray_option
-@click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes per shard.  [default: 50, mazes 10]")
-@click.option("--out", help="Folder or URL (s3://bucket/name, gs://, ...).  [default: releases/NAME]")
-@remote_option
-@click.option(
-    "--scratch", type=OutPath(), help="With a URL: local folder for unfinished shards.  [default: the system's]"
-)
-@click.option(
-    "--scratch-size",
-    metavar="BYTES",
-    callback=parse_bytes,
-    help="Maximum scratch space, e.g. 20GB.  [default: half of what is free]",
-)
+@command_of(commands.rollout, groups=OPTION_GROUPS)
 @click.option("--init", is_flag=True, help="Create the release without generating any episodes.")
-@click.option(
-    "--part", metavar="K/N", callback=parse_part, help="Run only part K of N: every N-th job, starting with the K-th."
-)
 @click.option("--finish", "finishing", is_flag=True, help="Finish the release: write its digests. Generates nothing.")
-@click.option("--other-versions", is_flag=True, help="Resume even if package versions have changed.")
 @click.option(
     "--slurm-script", type=click.IntRange(1), metavar="N", help="Print a Slurm script for an array of N tasks."
 )
-@click.option(
-    "--dry-run",
-    is_flag=True,
-    help="Show jobs, steps, bytes and time for --workers, and write nothing.",
-)
-@json_option
-@click.pass_context
-def rollout(
-    context, only, episode_range, out, workers, device, init, part, finishing, dry_run, no_pixels, as_json, **options
-):
+@click.option("--dry-run", is_flag=True, help="Show jobs, steps, bytes and time for --workers, and write nothing.")
+def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options):
     """Roll out behaviour policies into a release of episodes.
 
     Rerun the same command to resume: finished shards are kept. With --recipe, the options TASK, --level, --distractor
@@ -175,40 +63,45 @@ def rollout(
         --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
-    from dmcvb_gen.generate.estimate import raw_bytes
-    from dmcvb_gen.generate.plan import describe, finish_site, make_plan, prepare
-    from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
-    from dmcvb_gen.generate.site import site_of
+    from dmcvb_gen.generate.plan import describe, finish_site
+    from dmcvb_gen.generate.rollout import prepare_rollout, request_of, rollout_plan, site_for
 
-    check_exclusive_options(context)
-    executor = make_executor(workers, options["executor"], options["ray_address"])
-    given = {name: context.params[name] for name in RECIPE_OPTIONS & given_options(context)}
-    if "vary" in given:
-        given["vary"] = [part.strip() for part in given["vary"].split(",")]
-    resuming = bool(out) and not (options["tasks"] or options["layouts"] or options["recipe"] or given)
-    chosen = None if resuming else make_request(options["tasks"], options["recipe"], device=device, **given)
-    if options["slurm_script"]:
-        if chosen:
-            describe(chosen, pixels=not no_pixels)  # or says why each task would be refused; this one needs no GPU
-        return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
-    scratch = (options["scratch"], options["scratch_size"])
-    site = site_of(out or _out_default(chosen.name), options["options"], *scratch, workers)
+    check_exclusive_options(click.get_current_context())
+    request, workers = request_of(options), options["workers"]
+    if slurm_script:
+        if request:
+            describe(request, pixels=options["pixels"])  # or says why each task would be refused; this needs no GPU
+        return click.echo(script_for_slurm(slurm_script, workers), nl=False)
+    site = site_for(options, request)
     if finishing:
         return _finish(site, finish_site, as_json)
-    where = device if chosen or is_given(context, "device") else None  # else where it was begun
-    plan = make_plan(chosen, site, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
-    if device != "cpu" and chosen and not options["recipe"] and "renderer" not in given:
-        click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
-    if chosen:
-        _tell_own_videos(chosen.backgrounds, chosen.split)
+    plan = rollout_plan(options, request, site)
+    if request:
+        _tell_what_is_asked(request, options)
     if dry_run:
-        return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
-    shared = init or bool(part)
+        return _show_plan(plan, workers, as_json)
+    shared = init or bool(options["part"])
     _tell_what_is_there(plan, shared)
-    plan = prepare(plan, 0 if init or site.slow else raw_bytes(plan), options["other_versions"], shared)
+    plan = prepare_rollout(plan, options, init)
     if init:
         return _tell_begun(plan, as_json)
-    _run(plan, executor, as_json, whole=not part)
+    _run(plan, workers, as_json, whole=not options["part"])
+
+
+def _tell_what_is_asked(request, options):
+    """Notes on another renderer than the usual one, and on the use of one's own videos."""
+    from dmcvb_gen.distractors.backgrounds import videos_by_split
+
+    device, source, split = options["device"] or "cpu", request.backgrounds, request.split
+    if device != "cpu" and not options["recipe"] and not options["renderer"]:
+        click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
+    if source != "builtin" and (counts := videos_by_split(source)):
+        other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
+        click.echo(
+            f"{counts[split]} of {sum(counts.values())} videos in {source} are used; the others are kept for {other}. "
+            "To choose them yourself, put them into folders named train and val.",
+            err=True,
+        )
 
 
 def _tell_what_is_there(plan, shared):
@@ -222,18 +115,6 @@ def _tell_what_is_there(plan, shared):
         click.echo(
             f"Another rollout is writing to {plan.site.place} ({', '.join(others)}), and both make the same shards. To "
             "share the work, stop one and give --part 1/2 and --part 2/2.",
-            err=True,
-        )
-
-
-def _tell_own_videos(source, split):
-    from dmcvb_gen.distractors.backgrounds import videos_by_split
-
-    if source != "builtin" and (counts := videos_by_split(source)):
-        other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
-        click.echo(
-            f"{counts[split]} of {sum(counts.values())} videos in {source} are used; the others are kept for {other}. "
-            "To choose them yourself, put them into folders named train and val.",
             err=True,
         )
 
@@ -267,7 +148,7 @@ def _run(plan, workers, as_json, whole=True):
         finished += sum(commit.episode_count for commit in result.commits)
         bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
 
-    with _interruption_message(), _progress(plan, as_json) as bar:
+    with _interruption_message(), commands.progress_bar(not as_json, " frames", plan.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     manifest, steps, place = made.manifest, made.steps, plan.site.place
     if as_json:
@@ -294,30 +175,6 @@ def _run(plan, workers, as_json, whole=True):
     click.echo(f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else ""))
 
 
-def parse_range(text: str | None) -> tuple[int, int] | None:
-    """ "100:150" -> (100, 150).
-
-    Raises:
-      click.UsageError: not two numbers, or an empty range.
-    """
-    if text is None:
-        return None
-    first, colon, last = text.partition(":")
-    if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
-        raise click.UsageError(f"--range {text!r} is not A:B with A < B, e.g. 100:150")
-    return int(first), int(last)
-
-
-def _progress(plan, as_json):
-    return ProgressBar(
-        as_json,
-        unit=" frames",
-        unit_scale=True,
-        desc=plan.manifest.name,
-        smoothing=0.1,
-    )
-
-
 @contextlib.contextmanager
 def _interruption_message():
     try:
@@ -327,17 +184,12 @@ def _interruption_message():
         raise
 
 
-def _measured(plan, workers, as_json):
+def _show_plan(plan, workers, as_json):
     from dmcvb_gen.generate.estimate import estimate, measurements
 
-    with ProgressBar(as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
-        return estimate(plan, workers, bar.update)
-
-
-def _show_plan(plan, cost, workers, as_json):
-    import os
-
-    cores = os.cpu_count() or 1
+    cores, workers = os.cpu_count() or 1, workers if isinstance(workers, int) else 1
+    with ProgressBar(not as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
+        cost = estimate(plan, workers, bar.update)
     if as_json:
         rates = {
             name: dict(
