@@ -5,15 +5,30 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.options import (
+    Between,
+    Count,
+    Difficulty,
+    GoalPictures,
+    Local,
+    Names,
+    Place,
+    Precision,
+    Reward,
+    Samples,
+    Seed,
+    Share,
+    Span,
+    Split,
+)
 from dmcvb_gen.parallel import Workers, ignore
-from dmcvb_gen.spec import DIFFICULTIES, GOAL_PICTURES, LABEL_TYPES, REWARDS, SPLITS
+from dmcvb_gen.spec import LABEL_TYPES
 from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
@@ -25,34 +40,6 @@ if TYPE_CHECKING:
     from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.release.fetch import Moved
     from dmcvb_gen.release.verify import Verification
-
-
-@dataclass(frozen=True)
-class Between:
-    """Mark of a number's type: its bounds, the lowest one left out if `open`."""
-
-    lowest: float
-    highest: float | None = None
-    open: bool = False
-
-
-LOCAL = "local"
-"""Mark of a folder or file to write to, which cannot be a URL."""
-
-Names = str | Sequence[str]
-"""One name or several."""
-Place = str | Path
-"""A folder, file or URL."""
-Local = Annotated[Place, LOCAL]
-Count = Annotated[int, Between(1)]
-Seed = Annotated[int, Between(0)]
-Share = Annotated[float, Between(0, 1, open=True)]
-Samples = Annotated[int, Between(1, 8)]
-Span = tuple[int, int]
-"""(first, last + 1)."""
-Difficulty = Annotated[str, DIFFICULTIES]
-Split = Annotated[str, SPLITS]
-GoalPictures = Annotated[str, GOAL_PICTURES]
 
 
 def rollout(
@@ -71,7 +58,7 @@ def rollout(
     fixed_goals: Count | None = None,
     episodes_per_goal: Count | None = None,
     layouts: Names = (),
-    reward: Annotated[str, REWARDS] | None = None,
+    reward: Reward | None = None,
     episodes: Count | None = None,
     steps: Count | None = None,
     max_steps: Count | None = None,
@@ -481,7 +468,7 @@ def validate(
     workers: Workers | None = None,
     threads: Count | None = None,
     device: Annotated[str, ("cpu", "cuda")] = "cpu",
-    precision: Annotated[str, ("auto", "float32", "bfloat16")] = "auto",
+    precision: Precision = "auto",
     compile: bool = False,
     memory: Annotated[float, Between(0)] | None = None,
     seed: Annotated[int, Between(0, 2**31 - 1)] = 0,

@@ -31,6 +31,7 @@ FLOORS = (
         "precision",
         "compilation",
         "progress",
+        "options",
         "own_code",
     ),  # the ground
     ("tasks",),

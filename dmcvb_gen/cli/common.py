@@ -90,6 +90,21 @@ def print_table(
         console.print(Text(f"(not shown: {', '.join(hidden)}; a wider terminal or --json shows them)", "dim"))
 
 
+def answer(as_json: bool, facts: Any, *lines: Any, code: int = 0) -> None:
+    """Print facts as JSON for programs, or lines for people, and end the command.
+
+    Args:
+      code: exit code.
+    """
+    if as_json:
+        print_json(facts)
+    else:
+        for line in lines:
+            click.echo(line)
+    if code:
+        click.get_current_context().exit(code)
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; numpy numbers and paths are turned into plain ones."""
     click.echo(json.dumps(value, indent=2, default=_plain))
@@ -119,6 +134,11 @@ def format_bytes(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     raise AssertionError("unreachable")
+
+
+def moved_files(moved: Any) -> str:
+    """What a publish or fetch moved, in words."""
+    return f"{moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now"
 
 
 def format_duration(seconds: float) -> str:

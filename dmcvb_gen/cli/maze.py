@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, answer, json_option
 
 
 def _cell(context, parameter, value):
@@ -49,7 +49,6 @@ def show_maze(layout, start, goal, out, as_json):
         raise UnknownNameError("layout", layout, LAYOUTS)
     out = out or Path(f"{chosen.name}.png")
     facts = save_maze_picture(chosen, out, start, goal)
-    if as_json:
-        return print_json({"layout": chosen.name, "rows": list(chosen.rows), "picture": str(out), **facts})
-    click.echo("\n".join(chosen.rows))
-    click.echo(f"{out}: path of {facts['path_m']:.1f} m from {tuple(facts['start'])} to {tuple(facts['goal'])}")
+    path = f"{out}: path of {facts['path_m']:.1f} m from {tuple(facts['start'])} to {tuple(facts['goal'])}"
+    facts |= {"layout": chosen.name, "rows": list(chosen.rows), "picture": str(out)}
+    answer(as_json, facts, *chosen.rows, path)

@@ -1,4 +1,4 @@
-"""The options of a command, from the function of `dmcvb_gen.commands` that it calls.
+"""The options of a command, from the function that it calls.
 
 A function's signature has the types and the defaults, its docstring the help; nothing is written twice::
 
@@ -26,10 +26,10 @@ import click
 
 from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
 from dmcvb_gen.cli.unused_options import is_given
-from dmcvb_gen.commands import LOCAL, Between
+from dmcvb_gen.options import LOCAL, Between
 from dmcvb_gen.parallel import Ray, Workers
 
-FLAGS = {"storage_options": "option", "everything": "all", "episode_range": "range"}
+FLAGS = {"settings": "set", "storage_options": "option", "everything": "all", "episode_range": "range"}
 """Parameter -> flag, if it has another name."""
 
 
@@ -55,7 +55,7 @@ def command_of(function: Callable, *arguments: str, groups: dict[str, tuple[str,
         callback.__click_params__ = []
         json_option(callback)
         callback.__click_params__ += [*own, *reversed(parameters_of(function, arguments))]
-        return click.command(show.__name__, cls=GroupedCommand, option_groups=groups)(callback)
+        return click.command(show.__name__.replace("_", "-"), cls=GroupedCommand, option_groups=groups)(callback)
 
     return decorate
 

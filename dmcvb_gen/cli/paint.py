@@ -7,7 +7,7 @@ import dataclasses
 import click
 
 from dmcvb_gen import commands
-from dmcvb_gen.cli.common import format_bytes, print_json
+from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.text import pluralize
 
@@ -25,11 +25,8 @@ def paint(release, as_json, **options):
     dmcvb-gen paint releases/light --workers 2
     """
     done = commands.paint(release, notify=_tell, **options)
-    if as_json:
-        print_json({"out": release} | _painted_facts(done))
-    else:
-        _show_painted(release, done)
-    click.get_current_context().exit(1 if done.differing else 0)
+    facts = {"out": release} | _painted_facts(done)
+    answer(as_json, facts, *_painted(release, done), code=1 if done.differing else 0)
 
 
 @command_of(commands.fetch)
@@ -43,25 +40,20 @@ def fetch(url, out, episodes, as_json, **options):
     dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
     """
     moved, done = commands.download(url, out, episodes=episodes, notify=_tell, **options)
-    if as_json:
-        print_json(dataclasses.asdict(moved) | (_painted_facts(done) if done else {}))
-    else:
-        click.echo(f"{out}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
-        if episodes:
-            _tell_whole_shards(out, episodes)
-        if done:
-            _show_painted(out, done)
-    click.get_current_context().exit(1 if done and done.differing else 0)
+    facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
+    lines = [f"{out}: {moved_files(moved)}", *(_whole_shards(out, episodes) if episodes else ())]
+    lines += _painted(out, done) if done else ()
+    answer(as_json, facts, *lines, code=1 if done and done.differing else 0)
 
 
-def _tell_whole_shards(out, episodes):
-    """Say so if shards brought more episodes than were asked for."""
+def _whole_shards(out, episodes):
+    """A line if shards brought more episodes than were asked for."""
     from dmcvb_gen.dataset import open_release
 
     here = {name: len(subset.episodes) for name, subset in open_release(out).subsets.items()}
     name = max(here, key=here.get, default=None)
     if name and here[name] > (asked := episodes[1] - episodes[0]):
-        click.echo(f"Shards come whole: {name} has {here[name]} episodes here, and {asked} were asked for.")
+        yield f"Shards come whole: {name} has {here[name]} episodes here, and {asked} were asked for."
 
 
 def _tell(text):
@@ -81,14 +73,13 @@ def _painted_facts(done):
     )
 
 
-def _show_painted(place, done):
-    """What painting gave, for people."""
+def _painted(place, done):
+    """What painting gave, in lines."""
     painted = f"{pluralize(done.shards, 'shards')} painted; {_compared(done)}."
-    click.echo(f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}")
-    for name in done.differing[:10]:
-        click.echo(f"  differs: {name}")
+    yield f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}"
+    yield from (f"  differs: {name}" for name in done.differing[:10])
     if done.differing:
-        click.echo(
+        yield (
             "  what differs here is noted above" if done.drift else "  versions and processor are those of the release"
         )
 

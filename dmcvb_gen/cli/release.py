@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from dmcvb_gen import commands
-from dmcvb_gen.cli.common import OutPath, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.text import pluralize
 
@@ -26,22 +26,18 @@ def verify(release, as_json, **options):
     dmcvb-gen verify releases/demo
     """
     result = commands.verify(release, **options)
-    if as_json:
-        findings = [dataclasses.asdict(finding) for finding in result.findings]
-        facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest}
-        print_json(facts | {"checked": result.checked, "findings": findings, "incomplete": result.incomplete})
-    else:
-        _tell_verified(release, result)
-    click.get_current_context().exit(1 if not result.sound else 0 if result.complete else 3)
+    facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest, "checked": result.checked}
+    facts |= {"findings": [dataclasses.asdict(finding) for finding in result.findings], "incomplete": result.incomplete}
+    code = 1 if not result.sound else 0 if result.complete else 3
+    answer(as_json, facts, *_verified(release, result), code=code)
 
 
-def _tell_verified(path, result):
-    for finding in result.findings[:50]:
-        click.echo(f"FAIL {finding}")
+def _verified(path, result):
+    """What verify found, in lines."""
+    yield from (f"FAIL {finding}" for finding in result.findings[:50])
     if len(result.findings) > 50:
-        click.echo(f"... and {len(result.findings) - 50} more")
-    for name, (here, planned) in result.incomplete.items():
-        click.echo(f"{name}: {here:,} of {planned:,} episodes")
+        yield f"... and {len(result.findings) - 50} more"
+    yield from (f"{name}: {here:,} of {planned:,} episodes" for name, (here, planned) in result.incomplete.items())
     checked = ", ".join(pluralize(count, name) for name, count in result.checked.items())
     verdict = "sound" if result.sound else pluralize(len(result.findings), "findings")
     if result.incomplete:
@@ -50,9 +46,9 @@ def _tell_verified(path, result):
         verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
         verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
-    click.echo(f"{path}: {verdict} ({checked})")
+    yield f"{path}: {verdict} ({checked})"
     if result.digest:
-        click.echo(f"digest {result.digest}")
+        yield f"digest {result.digest}"
 
 
 @command_of(commands.regenerate)
@@ -69,38 +65,28 @@ def regenerate(release, out, as_json, **options):
     dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --episodes 0:3 --out data/part
     """
     outcome = commands.regenerate(release, out=out, **options)
-    if as_json:
-        print_json(
-            {
-                "sound": outcome.sound,
-                "shards": [dataclasses.asdict(shard) for shard in outcome.shards],
-                "environment": outcome.environment,
-                "not_here": outcome.left,
-                "restored": outcome.restored,
-            }
-        )
-    else:
-        _tell_regenerated(out or release, outcome)
-    click.get_current_context().exit(1 if not outcome.sound else 3 if outcome.left else 0)
+    facts = {"sound": outcome.sound, "shards": [dataclasses.asdict(shard) for shard in outcome.shards]}
+    facts |= {"environment": outcome.environment, "not_here": outcome.left, "restored": outcome.restored}
+    code = 1 if not outcome.sound else 3 if outcome.left else 0
+    answer(as_json, facts, *_regenerated(out or release, outcome), code=code)
 
 
-def _tell_regenerated(place, outcome):
-    for shard in outcome.shards:
-        click.echo(shard)
+def _regenerated(place, outcome):
+    """What regenerate did, in lines."""
+    yield from outcome.shards
     if any(shard.equal is False for shard in outcome.shards):
         for name, (there, here) in outcome.environment.items():
-            click.echo(f"environment: {name} was {there}, is {here}")
+            yield f"environment: {name} was {there}, is {here}"
         if not outcome.environment:
-            click.echo("environment: the same versions and processor as when the release was made")
+            yield "environment: the same versions and processor as when the release was made"
     if outcome.restored:
         files = pluralize(len(outcome.restored), "other files")
-        click.echo(f"{place}: {files} put back, e.g. {outcome.restored[0]}")
+        yield f"{place}: {files} put back, e.g. {outcome.restored[0]}"
     if outcome.shards:
         left = f"; {outcome.left} more not here" if outcome.left else ""
-        click.echo(f"{place}: {pluralize(len(outcome.shards), 'shards')} made again{left}")
+        yield f"{place}: {pluralize(len(outcome.shards), 'shards')} made again{left}"
     elif not outcome.restored:
-        nothing = "none of these shards is here" if outcome.left else "nothing is damaged or missing"
-        click.echo(f"{place}: {nothing}")
+        yield f"{place}: " + ("none of these shards is here" if outcome.left else "nothing is damaged or missing")
 
 
 @command_of(commands.repaint)
@@ -112,11 +98,9 @@ def repaint(release, out, as_json, **options):
         --out releases/mini84
     """
     manifest = commands.repaint(release, out=out, **options).manifest
-    if as_json:
-        return print_json({"out": out, "complete": manifest.complete, "subsets": [s.name for s in manifest.subsets]})
-    for subset in manifest.subsets:
-        click.echo(f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}")
-    click.echo(f"{out}: repainted; look at it: dmcvb-gen preview {out}")
+    facts = {"out": out, "complete": manifest.complete, "subsets": [subset.name for subset in manifest.subsets]}
+    made = (f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}" for subset in manifest.subsets)
+    answer(as_json, facts, *made, f"{out}: repainted; look at it: dmcvb-gen preview {out}")
 
 
 @command_of(commands.publish, "release", "url")
@@ -133,9 +117,7 @@ def publish(release, url, as_json, **options):
     from dmcvb_gen.storage.remote import public
 
     moved = commands.publish(release, url, **options)
-    if as_json:
-        return print_json(dataclasses.asdict(moved))
-    click.echo(f"{public(url)}: {moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now")
+    answer(as_json, dataclasses.asdict(moved), f"{public(url)}: {moved_files(moved)}")
 
 
 @click.command()
@@ -144,8 +126,7 @@ def publish(release, url, as_json, **options):
 @click.option("--out", metavar="FOLDER", type=OutPath(), help="Folder of the card.  [default: the release]")
 @click.option("--url", help="URL of the published release.  [default: the card's]")
 @json_option
-@click.pass_context
-def card(context, path, check, out, url, as_json):
+def card(path, check, out, url, as_json):
     """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, CHANGELOG.md, a table.
 
     The table, card/episodes.parquet, has a row an episode with its first frame; `datasets.load_dataset` reads it.
@@ -161,16 +142,10 @@ def card(context, path, check, out, url, as_json):
         if out:
             raise click.UsageError("Give --check or --out, not both.")
         findings, left = check_card(path), left_unchecked(path)
-        if as_json:
-            print_json(findings)
-        else:
-            fits = f"the episodes that are here; {left:,} are not" if left else "the release"
-            click.echo("\n".join(findings) or f"{path}: the card fits {fits}")
-        context.exit(1 if findings else 3 if left else 0)
-    files = write_card(path, out, url)
-    if as_json:
-        return print_json([str(file) for file in files])
-    click.echo("\n".join(str(file) for file in files))
+        fits = f"{path}: the card fits " + (f"the episodes that are here; {left:,} are not" if left else "the release")
+        return answer(as_json, findings, *(findings or [fits]), code=1 if findings else 3 if left else 0)
+    files = list(map(str, write_card(path, out, url)))
+    answer(as_json, files, *files)
 
 
 @command_of(commands.export)
@@ -184,9 +159,7 @@ def export(release, to, out, as_json, **options):
     """
     folders = commands.export(release, to, out, **options)
     shown = [str(Path(out) / folder.relative_to(Path(out).absolute())) for folder in folders]  # as --out names them
-    if as_json:
-        return print_json(shown)
-    click.echo("\n".join(shown))
+    answer(as_json, shown, *shown)
 
 
 @click.command("import")
@@ -211,10 +184,8 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
     with commands.progress_bar(not as_json, " episodes", scaled=False) as bar:
         given = dict(task=task, level=level, setting=setting, name=name, partial=partial, progress=bar)
         manifest = import_tfds(folder, out, **given)
-    if as_json:
-        return print_json({"out": out, "subsets": [subset.name for subset in manifest.subsets]})
-    for subset in manifest.subsets:
-        click.echo(f"{subset.name}: {pluralize(subset.episodes, 'episodes')}")
+    made = (f"{subset.name}: {pluralize(subset.episodes, 'episodes')}" for subset in manifest.subsets)
+    answer(as_json, {"out": out, "subsets": [subset.name for subset in manifest.subsets]}, *made)
 
 
 @click.command("diff")
@@ -222,8 +193,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
 @click.argument("other", metavar="RELEASE|URL")
 @remote_option
 @json_option
-@click.pass_context
-def diff_command(context, one, other, options, as_json):
+def diff_command(one, other, options, as_json):
     """Say which subsets, episodes and digests differ between two releases, by their manifests and commit records.
 
     Exit code 0 when nothing differs, 1 when something does.
@@ -234,8 +204,5 @@ def diff_command(context, one, other, options, as_json):
     from dmcvb_gen.release.diff import diff
 
     found = diff(one, other, options)
-    if as_json:
-        print_json([dataclasses.asdict(difference) for difference in found])
-    else:
-        click.echo("\n".join(str(difference) for difference in found) or "no difference")
-    context.exit(1 if found else 0)
+    facts = [dataclasses.asdict(difference) for difference in found]
+    answer(as_json, facts, *(found or ["no difference"]), code=1 if found else 0)

@@ -1,30 +1,27 @@
-"""rollout, info, preview, list."""
+"""rollout."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import shlex
-import textwrap
-from pathlib import Path
 
 import click
 
 from dmcvb_gen import commands
 from dmcvb_gen.cli.common import (
-    OutPath,
+    answer,
     format_bytes,
     format_duration,
-    json_option,
     print_json,
     print_table,
-    remote_option,
 )
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.cli.unused_options import check_exclusive_options
 from dmcvb_gen.progress import ProgressBar
-from dmcvb_gen.storage.remote import is_url, public
+from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import pluralize
 
 OPTION_GROUPS = {
@@ -120,22 +117,19 @@ def _tell_what_is_there(plan, shared):
 
 
 def _tell_begun(plan, as_json):
-    if as_json:
-        return print_json({"out": plan.site.place, "jobs": len(plan.jobs), "already_done": plan.done})
-    click.echo(f"{plan.site.place}: begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N")
+    begun = f"begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N"
+    facts = {"out": plan.site.place, "jobs": len(plan.jobs), "already_done": plan.done}
+    answer(as_json, facts, f"{plan.site.place}: {begun}")
 
 
 def _finish(site, finish_site, as_json):
     manifest = finish_site(site)
     missing = [subset.name for subset in manifest.subsets if subset.digest is None]
-    if as_json:
-        print_json({"out": site.place, "complete": manifest.complete, "incomplete": missing})
-    elif missing:
-        lacking = pluralize(len(missing), "subsets")
-        click.echo(f"{site.place}: not complete; shards are missing in {lacking}, e.g. {missing[0]}")
-    else:
-        click.echo(f"{site.place}: complete")
-    click.get_current_context().exit(0 if manifest.complete else 1)
+    state = "complete"
+    if missing:
+        state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
+    facts = {"out": site.place, "complete": manifest.complete, "incomplete": missing}
+    answer(as_json, facts, f"{site.place}: {state}", code=0 if manifest.complete else 1)
 
 
 def _run(plan, workers, as_json, whole=True):
@@ -151,28 +145,19 @@ def _run(plan, workers, as_json, whole=True):
     with _interruption_message(), commands.progress_bar(not as_json, " frames", plan.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     manifest, steps, place = made.manifest, made.steps, plan.site.place
-    if as_json:
-        print_json(
-            dict(
-                out=place,
-                complete=manifest.complete,
-                steps=steps,
-                seconds=round(made.seconds, 2),
-                seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()},
-                already_done=plan.done,
-                digests={subset.name: subset.digest for subset in manifest.subsets},
-            )
-        )
-        return
+    facts = dict(out=place, complete=manifest.complete, steps=steps, seconds=round(made.seconds, 2))
+    facts |= dict(seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()})
+    facts |= dict(already_done=plan.done, digests={subset.name: subset.digest for subset in manifest.subsets})
     state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
     if not whole:
         state = "finished with --finish when all parts are there"
     kept = f", {pluralize(plan.done, 'shards')} there already" if plan.done else ""
     rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
-    click.echo(f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}.")
+    done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}."
     named = shlex.quote(str(place))
     painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
-    click.echo(f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else ""))
+    look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else "")
+    answer(as_json, facts, done, look)
 
 
 @contextlib.contextmanager
@@ -191,44 +176,18 @@ def _show_plan(plan, workers, as_json):
     with ProgressBar(not as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
         cost = estimate(plan, workers, bar.update)
     if as_json:
-        rates = {
-            name: dict(
-                steps_per_second=1 / rate.seconds_per_step,
-                bytes_per_step=rate.bytes_per_step,
-                steps_per_episode=rate.steps_per_episode,
-            )
-            for name, rate in cost.rates.items()
-        }
-        print_json(
-            dict(
-                jobs=cost.jobs,
-                shards_done=cost.done,
-                subsets=len(plan.manifest.subsets),
-                episodes=cost.episodes,
-                steps=cost.steps,
-                bytes=round(cost.bytes),
-                core_hours=cost.core_seconds / 3600,
-                hours=cost.seconds(workers) / 3600,
-                workers=workers,
-                rates=rates,
-            )
-        )
-        return
-    rows: dict[str, list[float]] = {}
-    for job in plan.jobs:
-        for record in job.subsets:
-            rate = cost.rates[record.name]
-            steps = len(job.episodes) * rate.steps_per_episode
-            row = rows.setdefault(record.name, [0, 0.0, 0.0, 0.0])
-            row[0] += len(job.episodes)
-            row[1] += steps
-            row[2] += steps * rate.bytes_per_step
-            row[3] += steps * rate.seconds_per_step / 3600
+        facts = dict(jobs=cost.jobs, shards_done=cost.done, subsets=len(plan.manifest.subsets), episodes=cost.episodes)
+        facts |= dict(steps=cost.steps, bytes=round(cost.bytes), core_hours=cost.core_seconds / 3600)
+        facts |= dict(hours=cost.seconds(workers) / 3600, workers=workers)
+        rates = {name: dataclasses.asdict(rate) for name, rate in cost.rates.items()}
+        for rate in rates.values():
+            rate["steps_per_second"] = 1 / rate.pop("seconds_per_step")
+        return print_json(facts | {"rates": rates})
     print_table(
         ("subset", "episodes", "steps", "bytes", "core-hours"),
         [
-            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
-            for name, (episodes, steps, size, hours) in rows.items()
+            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{seconds / 3600:.2f}")
+            for name, (episodes, steps, size, seconds) in cost.of_subsets(plan).items()
         ],
         title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
     )
@@ -241,139 +200,4 @@ def _show_plan(plan, workers, as_json):
     click.echo(
         f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
         f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64"
-    )
-
-
-@click.command()
-@click.argument("path", metavar="RELEASE|URL")
-@remote_option
-@json_option
-def info(path, options, as_json):
-    """Show the subsets, episodes, bytes and returns of a release beside the paper's.
-
-    \b
-    dmcvb-gen info releases/demo
-    """
-    from dmcvb_gen.generate.info import describe_release
-
-    facts = describe_release(path, options)
-    if as_json:
-        return print_json(facts)
-    statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
-    rows = []
-    for subset in facts["subsets"]:
-        planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
-        mark = " *" if subset["paper"] and subset["shorter"] else ""
-        rows.append(
-            (
-                subset["name"] + mark,
-                f"{subset['episodes']:,}{planned}",
-                f"{subset['steps']:,}",
-                format_bytes(subset["bytes"]),
-                f"{subset['bytes_per_step']:,.0f}",
-                *(f"{subset['returns'][key]:.1f}" for key in statistics),
-            )
-        )
-        if paper := subset["paper"]:
-            numbers = (f"{paper[key]:.1f}" for key in statistics)
-            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers))
-    print_table(
-        ("subset", "episodes", "steps", "size", "B/step", *statistics),
-        rows,
-        title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
-        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
-    )
-    click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
-    if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
-        click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
-    if facts["digest"]:
-        click.echo(f"digest {facts['digest']}")
-
-
-@click.command()
-@click.argument("path")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Show only these subsets.")
-@click.option("--out", type=OutPath(path_type=Path), help="Output folder.  [default: PATH/preview]")
-@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes per subset.")
-@click.option("--scale", type=click.IntRange(1, 8), help="Enlarge the images.  [default: 2; videos of 512 pixels]")
-@click.option(
-    "--frames", type=click.IntRange(1), default=200, show_default=True, help="Frames of the video, at 20 per second."
-)
-@click.option("--episode", type=click.IntRange(0), help="Episode of the video.  [default: the first of each subset]")
-@click.option(
-    "--video",
-    type=click.Choice(["mp4", "webp", "gif"]),
-    help="Format of the video.  [default: mp4, or webp without imageio-ffmpeg]",
-)
-@json_option
-def preview(path, only, out, as_json, **options):
-    """Write a contact sheet (PNG) and a video of a release.
-
-    \b
-    dmcvb-gen preview releases/demo
-    """
-    from dmcvb_gen.generate.preview import write_preview
-
-    files = write_preview(path, out, only=only, **options)
-    if as_json:
-        return print_json([str(file) for file in files])
-    for file in files:
-        click.echo(file)
-
-
-@click.command("list")
-@click.option("--remote", metavar="URL", help="List the releases at a URL instead.")
-@remote_option
-@json_option
-def list_command(remote, options, as_json):
-    """List tasks, levels, distractors, bundled policies, recipes and the renderers that work here."""
-    from dmcvb_gen.generate.info import describe_package
-
-    if remote:
-        return _list_remote(remote, options, as_json)
-    facts = describe_package()
-    if as_json:
-        return print_json(facts)
-    print_table(
-        ("task", "state", "action", "steps", "<views", "<bundled behaviours"),
-        [
-            (
-                task["id"],
-                str(task["state"]),
-                str(task["action"]),
-                str(task["max_steps"]),
-                ", ".join(task["views"]),
-                ", ".join(task["behaviours"]) or "-",
-            )
-            for task in facts["tasks"]
-        ],
-        title="tasks",
-        optional=(("views",),),
-    )
-    for heading, names in (
-        ("tasks of dm_control's suite", facts["suite_tasks"]),
-        ("levels", facts["levels"]),
-        ("distractors", facts["distractors"]),
-        ("difficulties", [*facts["difficulties"], "or a scale up to 1 (dynamic_0.35)"]),
-        ("maze goals", facts["maze_settings"]),
-        ("recipes", facts["recipes"]),
-        ("manifests", facts["manifests"]),
-    ):
-        click.echo(textwrap.fill(f"{heading}: {', '.join(names)}", 80, break_on_hyphens=False))
-    for name, reason in facts["renderers"].items():
-        click.echo(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
-
-
-def _list_remote(url, options, as_json) -> None:
-    from dmcvb_gen.dataset.catalog import releases_at
-
-    found = releases_at(url, options)
-    if as_json:
-        return print_json(found)
-    shown = ("url", "name", "version", "subsets", "episodes", "complete")
-    print_table(
-        ("release", "<name", "<version", "subsets", "episodes", "complete", "<digest"),
-        [(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12]) for facts in found],
-        title=public(url),
-        optional=(("subsets",), ("name",)),
     )
