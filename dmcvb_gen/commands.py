@@ -17,8 +17,8 @@ from dmcvb_gen.options import (
     Difficulty,
     GoalPictures,
     Local,
+    Location,
     Names,
-    Place,
     Precision,
     Reward,
     Samples,
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 def rollout(
     tasks: Names = (),
     *,
-    recipe: Place | None = None,
+    recipe: Location | None = None,
     only: Names = (),
     levels: Names = (),
     distractors: Names = (),
@@ -68,15 +68,15 @@ def rollout(
     renderer: str | None = None,
     samples: Samples | None = None,
     device: str | None = None,
-    backgrounds: Place | None = None,
+    backgrounds: Location | None = None,
     split: Split | None = None,
-    behaviour: Place | None = None,
+    behaviour: Location | None = None,
     sample: bool = False,
     pixels: bool = True,
     independent: bool = False,
     workers: Workers = 1,
     episodes_per_shard: Count | None = None,
-    out: Place | None = None,
+    out: Location | None = None,
     storage_options: dict[str, Any] | None = None,
     scratch: Local | None = None,
     scratch_size: int | None = None,
@@ -127,7 +127,6 @@ def rollout(
       episodes_per_shard: Episodes per shard. [default: 50, mazes 10]
       out: Folder or URL (s3://bucket/name, gs://, ...). [default: releases/NAME]
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-        Repeatable.
       scratch: With a URL: local folder for unfinished shards. [default: the system's]
       scratch_size (BYTES): Maximum scratch space, e.g. 20GB. [default: half of what is free]
       part (K/N): Run only part K of N: every N-th job, starting with the K-th.
@@ -158,7 +157,7 @@ def paint(
     goal: GoalPictures | None = None,
     workers: Workers = 1,
     device: str = "cpu",
-    backgrounds: Place | None = None,
+    backgrounds: Location | None = None,
     progress: bool = True,
     notify: Callable[[str], None] = ignore,
 ) -> "RenderResult":
@@ -188,7 +187,7 @@ def paint(
 
 
 def repaint(
-    release: Place,
+    release: Location,
     *,
     only: Names = (),
     distractor: str | None = None,
@@ -196,7 +195,7 @@ def repaint(
     size: int | None = None,
     renderer: str | None = None,
     samples: Samples | None = None,
-    backgrounds: Place | None = None,
+    backgrounds: Location | None = None,
     split: Split | None = None,
     labels: Annotated[Names, tuple(LABEL_TYPES)] = (),
     device: str = "cpu",
@@ -237,14 +236,14 @@ def repaint(
 
 
 def regenerate(
-    release: Place | None = None,
+    release: Location | None = None,
     *,
-    manifest: Place | None = None,
+    manifest: Location | None = None,
     only: Names = (),
     episodes: Span | None = None,
     check: bool = False,
     out: Local | None = None,
-    backgrounds: Place | None = None,
+    backgrounds: Location | None = None,
     device: str | None = None,
     workers: Workers = 1,
     progress: bool = True,
@@ -284,10 +283,10 @@ def regenerate(
 
 
 def verify(
-    release: Place,
+    release: Location,
     *,
     everything: bool = False,
-    backgrounds: Place | None = None,
+    backgrounds: Location | None = None,
     workers: Workers | None = None,
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
@@ -300,7 +299,6 @@ def verify(
       backgrounds (FOLDER): Folder of the background videos, if it has moved.
       workers: Worker processes; at a URL: parallel downloads. [default: 1; 8]
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-        Repeatable.
 
     Raises:
       DmcvbError: there is no release, nothing is committed, or an option has no effect there.
@@ -319,7 +317,7 @@ def verify(
 
 
 def publish(
-    release: Place,
+    release: Location,
     url: str,
     *,
     storage_options: dict[str, Any] | None = None,
@@ -334,7 +332,6 @@ def publish(
       release (RELEASE): Folder of the release, or of an export.
       url (URL): Where to put it: s3://, gs://, hf:// or any fsspec URL.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-        Repeatable.
       take_over: Publish even if another upload has claimed the URL.
       workers: Parallel transfers.
       pixels: False: Publish without images; `paint` renders them again.
@@ -375,7 +372,6 @@ def fetch(
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
       goal: Mazes: render only images with, or without, the goal. [default: both]
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-        Repeatable.
       workers: Parallel transfers.
 
     Raises:
@@ -390,7 +386,7 @@ def fetch(
 
 def download(
     url: str,
-    out: Place,
+    out: Location,
     *,
     only: Names,
     episodes: Span | None,
@@ -418,7 +414,7 @@ def download(
 
 
 def export(
-    release: Place,
+    release: Location,
     to: str,
     out: Local,
     *,
@@ -442,7 +438,6 @@ def export(
       video: lerobot: store images as mp4 (smaller, lossy) instead of PNG.
       workers: Worker processes, one subset each.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-        Repeatable.
 
     Raises:
       DmcvbError: no such format or subset, or a package is not installed.
@@ -455,7 +450,7 @@ def export(
 
 
 def validate(
-    release: Place,
+    release: Location,
     *,
     profile: str = "smoke",
     scale: Annotated[float, Between(0, open=True)] = 1.0,
@@ -472,8 +467,8 @@ def validate(
     compile: bool = False,
     memory: Annotated[float, Between(0)] | None = None,
     seed: Annotated[int, Between(0, 2**31 - 1)] = 0,
-    dino_weights: Place | None = None,
-    backgrounds: Place | None = None,
+    dino_weights: Location | None = None,
+    backgrounds: Location | None = None,
     progress: bool = True,
 ) -> "Validation":
     """Check a release, run the paper's benchmarks on it and write a report.
@@ -542,7 +537,7 @@ def run_validation(
             patterns=as_names(options["only"]),
             workers=options["workers"] or default_workers(setup.device),
             train_unsound=options["train_unsound"],
-            progress=Progress(checking=bar, total=train, training=bar.told, done=on_score),
+            progress=Progress(checking=bar, total=train, training=bar.advance, done=on_score),
         )
 
 
@@ -560,7 +555,7 @@ def _refuse(reason: str, **given: Any) -> None:
             raise DmcvbError(f"--{name} has no effect: {reason}; remove it")
 
 
-def _videos(backgrounds: Place | None) -> str | None:
+def _videos(backgrounds: Location | None) -> str | None:
     from dmcvb_gen.generate.request import background_source
 
     return None if backgrounds is None else background_source(backgrounds)

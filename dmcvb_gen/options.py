@@ -27,9 +27,9 @@ LOCAL = "local"
 
 Names = str | Sequence[str]
 """One name or several."""
-Place = str | Path
+Location = str | Path
 """A folder, a file or a URL."""
-Local = Annotated[Place, LOCAL]
+Local = Annotated[Location, LOCAL]
 Count = Annotated[int, Between(1)]
 Seed = Annotated[int, Between(0)]
 Share = Annotated[float, Between(0, 1, open=True)]

@@ -39,7 +39,7 @@ class ProgressBar(tqdm):
         """Set the expected total, which may change later."""
         self.total = count
 
-    def told(self, what: str, steps: int) -> None:
+    def advance(self, what: str, steps: int) -> None:
         """Name the item in progress, and count steps."""
         self.set_description(what, refresh=False)
         self.update(steps)

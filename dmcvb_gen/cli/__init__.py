@@ -12,7 +12,7 @@ import warnings
 import click
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.extras import cure
+from dmcvb_gen.extras import install_hint
 from dmcvb_gen.version import __version__
 
 GROUPS = {
@@ -95,7 +95,7 @@ class LazyGroup(click.Group):
                 raise click.Abort() from None
             what = str(error) if isinstance(error, DmcvbError) else None
             if isinstance(error, ModuleNotFoundError):
-                what = cure(error.name or "")
+                what = install_hint(error.name or "")
             if what is None:
                 raise
             click.echo(f"error: {what}", err=True)

@@ -83,7 +83,9 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
         elif default is False:
             given = dict(is_flag=True)
         elif metavar in FORMATS:
-            given |= dict(callback=FORMATS[metavar], type=str, multiple=metavar == "NAME=VALUE")
+            several = metavar == "NAME=VALUE"
+            given |= dict(callback=FORMATS[metavar], type=str, multiple=several)
+            text = _repeatable(text) if several else text
         elif several:
             flag, text = flag.removesuffix("s"), _repeatable(text)
             given |= dict(multiple=True, default=default or None, show_default=bool(default))

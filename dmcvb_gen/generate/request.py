@@ -98,9 +98,9 @@ def renderer_of(tasks: Sequence[str], device: str = "cpu") -> str:
 
 def _changed_recipe(recipe: Recipe, tasks: Sequence[str], given: Mapping[str, Any]) -> Recipe:
     """A recipe, narrowed and overridden by the options that were given beside it; none is ignored."""
-    for name, cure in _NOT_WITH_RECIPE.items():
+    for name, instead in _NOT_WITH_RECIPE.items():
         if name in given:
-            raise RecipeError(f"--recipe takes no {cure} instead")
+            raise RecipeError(f"--recipe takes no {instead} instead")
     settings = [Distractor.parse(name).name for name in given.get("distractors", ())] + list(given.get("goals", ()))
     if tasks or given.get("levels") or settings:
         recipe = narrow(recipe, tasks, given.get("levels", ()), settings)

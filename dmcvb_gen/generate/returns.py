@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Between, Local, Names, Place, Seed
+from dmcvb_gen.options import Between, Local, Location, Names, Seed
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.text import as_names
 
@@ -14,7 +14,7 @@ def evaluate_behaviour(
     tasks: Names = (),
     *,
     levels: Names = (),
-    behaviour: Place | None = None,
+    behaviour: Location | None = None,
     episodes: Annotated[int, Between(2)] = 100,
     seed: Seed = 1,
     sample: bool = False,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Count, Local, Names, Place, Precision, Seed
+from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.spec import MazeName, task_folder
@@ -31,14 +31,14 @@ class TrainedRun:
 def train_behaviour(
     task: str | None = None,
     *,
-    layout: Place | None = None,
+    layout: Location | None = None,
     out: Local | None = None,
     steps: Count | None = None,
     seed: Seed | None = None,
     algo: str | None = None,
     settings: Names = (),
-    config: Place | None = None,
-    init_from: Place | None = None,
+    config: Location | None = None,
+    init_from: Location | None = None,
     evaluate_every: Count | None = None,
     precision: Precision = "auto",
     resume: bool = False,
