@@ -380,37 +380,28 @@ def fetch(
     options = locals()
     from dmcvb_gen.loaders.release import open_for_reading
 
-    download(**options)
+    download(options)
     return open_for_reading(str(out))
 
 
-def download(
-    url: str,
-    out: Location,
-    *,
-    only: Names,
-    episodes: Span | None,
-    paint: bool,
-    size: int | None,
-    views: Names | None,
-    goal: str | None,
-    storage_options: dict[str, Any] | None,
-    workers: int,
-    progress: bool,
-    notify: Callable[[str], None] = ignore,
-) -> "tuple[Moved, RenderResult | None]":
-    """`fetch` that opens nothing: what was moved and, with `paint`, what was painted."""
+def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore) -> "tuple[Moved, RenderResult | None]":
+    """What the arguments of `fetch` ask for: what was moved and, with `paint`, what was painted."""
     from dmcvb_gen.release.fetch import fetch, fetch_and_paint
 
-    given: dict[str, Any] = dict(options=storage_options, workers=workers)
-    if not paint:
-        if size or views or goal:
+    what = (options["url"], options["out"], as_names(options["only"]), options["episodes"])
+    look = (options["size"], options["views"], options["goal"])
+    given: dict[str, Any] = dict(options=options["storage_options"], workers=options["workers"])
+    if not options["paint"]:
+        if any(look):
             raise DmcvbError("--size, --views and --goal say what to --paint (in Python, paint=True)")
-        with progress_bar(progress, "B") as bar:
-            return fetch(url, out, as_names(only), episodes, tick=bar, **given), None
-    with progress_bar(progress, "B", "fetched") as moved, progress_bar(progress, " frames", "painted") as frames:
-        painter = _render_config(size, views, goal, None, os.cpu_count() or 1, "cpu", frames, notify)
-        return fetch_and_paint(url, out, as_names(only), episodes, painter=painter, tick=moved, **given)
+        with progress_bar(options["progress"], "B") as bar:
+            return fetch(*what, tick=bar, **given), None
+    with (
+        progress_bar(options["progress"], "B", "fetched") as moved,
+        progress_bar(options["progress"], " frames", "painted") as frames,
+    ):
+        painter = _render_config(*look, None, os.cpu_count() or 1, "cpu", frames, notify)
+        return fetch_and_paint(*what, painter=painter, tick=moved, **given)
 
 
 def export(

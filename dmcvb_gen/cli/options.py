@@ -12,8 +12,6 @@ parameter that takes several names can be repeated and loses its "s" (levels: --
 switched off (pixels: --no-pixels). With `workers` come --executor and --ray-address.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import re
@@ -83,9 +81,9 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
         elif default is False:
             given = dict(is_flag=True)
         elif metavar in FORMATS:
-            several = metavar == "NAME=VALUE"
-            given |= dict(callback=FORMATS[metavar], type=str, multiple=several)
-            text = _repeatable(text) if several else text
+            given |= dict(callback=_read, type=str)
+        elif dict in map(typing.get_origin, kinds):
+            given, text = dict(metavar=metavar, multiple=True, callback=parse_options), _repeatable(text)
         elif several:
             flag, text = flag.removesuffix("s"), _repeatable(text)
             given |= dict(multiple=True, default=default or None, show_default=bool(default))
@@ -93,7 +91,7 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
             given |= dict(default=default, show_default=True)
         found.append(click.Option([f"--{flag}", name], help=text, **given))
         if Ray in kinds:
-            found += _cluster_options()
+            found += parameters_of(_cluster, ("",))
     return found
 
 
@@ -134,21 +132,13 @@ def _repeatable(text: str) -> str:
     return f"{words} Repeatable.{mark}{default}"
 
 
-def _cluster_options() -> list[click.Parameter]:
-    return [
-        click.Option(
-            ["--executor"],
-            type=click.Choice(["processes", "ray"]),
-            default="processes",
-            show_default=True,
-            help="Executor that runs the jobs: local processes or Ray.",
-        ),
-        click.Option(
-            ["--ray-address"],
-            metavar="ADDRESS",
-            help="Address of the Ray cluster.  [default: RAY_ADDRESS, or a local one]",
-        ),
-    ]
+def _cluster(*, executor: Annotated[str, ("processes", "ray")] = "processes", ray_address: str | None = None):
+    """What comes with `workers`.
+
+    Args:
+      executor: Executor that runs the jobs: local processes or Ray.
+      ray_address (ADDRESS): Address of the Ray cluster. [default: RAY_ADDRESS, or a local one]
+    """
 
 
 def _executor(workers: int, executor: str, address: str | None) -> Workers:
@@ -171,52 +161,47 @@ def _executor(workers: int, executor: str, address: str | None) -> Workers:
 # -- how values are written -----------------------------------------------------------------------
 
 
-def parse_range(context, parameter, text):
+def parse_range(flag: str, text: str) -> tuple[int, int]:
     """ "100:150" -> (100, 150)."""
-    if text is None:
-        return None
     first, colon, last = text.partition(":")
     if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
-        raise click.UsageError(f"{parameter.opts[0]} {text!r} is not A:B with A < B, e.g. 100:150")
+        raise click.UsageError(f"{flag} {text!r} is not A:B with A < B, e.g. 100:150")
     return int(first), int(last)
 
 
-def parse_part(context, parameter, text):
+def parse_part(flag: str, text: str) -> tuple[int, int]:
     """ "2/8" -> (2, 8)."""
-    if text is None:
-        return None
     number, slash, count = text.partition("/")
     if not (slash and number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
-        raise click.UsageError(f"{parameter.opts[0]} {text!r} is not K/N with K from 1 to N, e.g. 2/8.")
+        raise click.UsageError(f"{flag} {text!r} is not K/N with K from 1 to N, e.g. 2/8.")
     return int(number), int(count)
 
 
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
-def parse_bytes(context, parameter, text):
+def parse_bytes(flag: str, text: str) -> int:
     """ "20GB" -> 20000000000."""
-    if text is None:
-        return None
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)B?", text.strip().upper())
     if not found or float(found[1]) <= 0:
-        raise click.UsageError(f"{parameter.opts[0]} {text!r} is no size; give bytes, or e.g. 500MB or 20GB.")
+        raise click.UsageError(f"{flag} {text!r} is no size; give bytes, or e.g. 500MB or 20GB.")
     return int(float(found[1]) * UNITS[found[2]])
 
 
-def split_names(context, parameter, text):
+def split_names(flag: str, text: str) -> tuple[str, ...]:
     """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between names and in agents' options."""
-    if text is None:
-        return None
     return tuple(name.strip() for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip())
 
 
-FORMATS = {
+FORMATS: dict[str | None, Callable[[str, str], Any]] = {
     "A:B": parse_range,
     "K/N": parse_part,
     "BYTES": parse_bytes,
     "A,B": split_names,
     "PART,...": split_names,
-    "NAME=VALUE": parse_options,
 }
-"""Metavar -> callback that reads the value."""
+"""Metavar -> function that reads the value of a flag."""
+
+
+def _read(context: click.Context, parameter: click.Parameter, text: str | None) -> Any:
+    return None if text is None else FORMATS[parameter.metavar](parameter.opts[0], text)

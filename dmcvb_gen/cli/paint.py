@@ -30,7 +30,7 @@ def paint(release, as_json, **options):
 
 
 @command_of(commands.fetch)
-def fetch(url, out, episodes, as_json, **options):
+def fetch(as_json, **options):
     """Download a published release, or a part of it. Rerun the command to resume or to add more.
 
     With --paint, images are rendered during the download; the exit code is 1 if they differ from the published ones.
@@ -39,7 +39,8 @@ def fetch(url, out, episodes, as_json, **options):
     dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
     dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
     """
-    moved, done = commands.download(url, out, episodes=episodes, notify=_tell, **options)
+    moved, done = commands.download(options, notify=_tell)
+    out, episodes = options["out"], options["episodes"]
     facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
     lines = [f"{out}: {moved_files(moved)}", *(_whole_shards(out, episodes) if episodes else ())]
     lines += _painted(out, done) if done else ()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 
 from dmcvb_gen import commands
-from dmcvb_gen.cli.common import json_option, print_json
+from dmcvb_gen.cli.common import answer, json_option, print_json
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.progress import ProgressBar
@@ -44,11 +45,8 @@ def validate(own, strict, as_json, **options):
         click.echo(f"Networks that see images compute in {setup.precision}, the faster one here.", err=True)
     on_score = (lambda *_: None) if as_json else functools.partial(_show_score, setup.profile)
     result = commands.run_validation(setup, options, on_score)
-    if as_json:
-        print_json(json.loads(result.facts.read_text()))
-    else:
-        _show(result, setup.profile)
-    context.exit(0 if result.sound and result.complete and not (strict and result.warnings) else 1)
+    code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1
+    answer(as_json, json.loads(result.facts.read_text()), *_validated(result, setup.profile), code=code)
 
 
 def _show_score(profile, cell, facts) -> None:
@@ -78,19 +76,17 @@ def _agents(names: tuple[str, ...] | None, own: tuple[str, ...]) -> list[str]:
     return [*(names or (["state-bc"] if own else [])), *own]
 
 
-def _show(result, profile) -> None:
-    for finding in result.structure.findings[:50]:
-        click.echo(f"FAIL {finding}")
-    for cell, error in result.failed:
-        click.echo(f"FAIL {cell.id}: {error}")
-    for finding in result.warnings:
-        click.echo(f"warning: {finding}")
+def _validated(result, profile) -> Iterator[str]:
+    """What validate found, in lines."""
+    yield from (f"FAIL {finding}" for finding in result.structure.findings[:50])
+    yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
+    yield from (f"warning: {finding}" for finding in result.warnings)
     for entry in result.missing:
         if entry.subsets:
             names = ", ".join(entry.subsets)
-            click.echo(f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}")
+            yield f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}"
         if entry.left_out:
-            click.echo(f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}")
+            yield f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}"
     checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
     verdict = ["sound" if result.sound else pluralize(found, "findings")]
@@ -101,8 +97,8 @@ def _show(result, profile) -> None:
             "what is there is sound" if result.sound else verdict[0],
         ]
     note = f"; {profile.note}" if result.results else ""
-    click.echo(f"{'; '.join(verdict)} ({checked}){note}")
-    click.echo(f"Report: {result.report}")
+    yield f"{'; '.join(verdict)} ({checked}){note}"
+    yield f"Report: {result.report}"
 
 
 @click.command()
@@ -141,8 +137,8 @@ def claims(reports, as_json):
         found = [answer for answer in answers if answer.claim == name]
         if found:
             click.echo(f"\n{words}")
-        for answer in found:
-            click.echo(f"  {answer.answer:>4}  {answer.where}: {answer.numbers}")
+        for one in found:
+            click.echo(f"  {one.answer:>4}  {one.where}: {one.numbers}")
     if ranks:
         click.echo("\nAre scores ranked as in the paper? Spearman's rho [95 % interval]")
     for one in ranks:
