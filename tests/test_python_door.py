@@ -15,6 +15,7 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
 FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")
+FUNCTIONS += ("train_behaviour", "evaluate_behaviour")
 FAMILIES = {
     "locomotion": dict(tasks="walker-walk", distractors=["none", "dynamic"]),
     "suite": dict(tasks="cartpole-swingup", distractors="static"),
@@ -33,9 +34,9 @@ def family(request, tmp_path_factory):
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_command_has_the_options_of_its_function(name):
-    command = main.get_command(None, name)
+    command = main.get_command(None, name.replace("_", "-"))
     parameters = dict(inspect.signature(getattr(dmcvb_gen, name)).parameters)
-    assert name in COMMANDS and name in dmcvb_gen.__all__
+    assert command.name in COMMANDS and name in dmcvb_gen.__all__
     options = {parameter.name: parameter for parameter in command.params if parameter.name not in COMMANDS_ALONE}
     assert options.keys() == parameters.keys() - {"progress", "notify"}
     words = []

@@ -31,7 +31,6 @@ from dmcvb_gen.parallel.base import (
     ignore,
     limit_threads,
 )
-from dmcvb_gen.parallel.processes import ProcessPool
 
 __all__ = [
     "IN_FLIGHT",
@@ -39,7 +38,6 @@ __all__ = [
     "Future",
     "Needs",
     "Pool",
-    "ProcessPool",
     "Ray",
     "SerialPool",
     "ProgressCallback",
@@ -68,7 +66,7 @@ def open_pool(
 
     Args:
       threads: of a worker process's libraries.
-      tick, kept: see `ProcessPool`.
+      tick, kept: see `processes.ProcessPool`.
       needs: of a piece of work, where it is placed on a cluster.
       most: how many pieces of work there will be at most; no more processes are of use.
 
@@ -80,7 +78,11 @@ def open_pool(
 
         return RayPool(workers.address, needs, tick, threads)
     workers = workers if most is None else min(workers, most)
-    return SerialPool(tick) if workers <= 1 else ProcessPool(workers, threads, tick, kept)
+    if workers <= 1:
+        return SerialPool(tick)
+    from dmcvb_gen.parallel.processes import ProcessPool
+
+    return ProcessPool(workers, threads, tick, kept)
 
 
 def run_all(

@@ -8,7 +8,6 @@ from typing import Any
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed
 from dmcvb_gen.parallel import ignore
-from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.spec import MazeName, task_folder
 from dmcvb_gen.text import as_names
 
@@ -72,6 +71,7 @@ def train_behaviour(
 
     from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.paper import paper_returns
+    from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.tasks.ant_maze import layout_task_id
     from dmcvb_gen.training.defaults import parse_settings, run_config
