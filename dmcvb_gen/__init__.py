@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.commands import export, fetch, paint, publish, regenerate, repaint, rollout, validate, verify
+from dmcvb_gen.generate.returns import evaluate_behaviour
 from dmcvb_gen.loaders.register import register_with_gymnasium
+from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = [
     "__version__",
     "evaluate",
+    "evaluate_behaviour",
     "export",
     "fetch",
     "open",
@@ -22,6 +25,7 @@ __all__ = [
     "regenerate",
     "repaint",
     "rollout",
+    "train_behaviour",
     "validate",
     "verify",
 ]

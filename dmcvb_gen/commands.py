@@ -1,228 +1,265 @@
 """The commands as functions: `dmcvb_gen.rollout(...)` does what `dmcvb-gen rollout ...` does.
 
-Names, defaults and errors are those of the commands; `dmcvb-gen COMMAND --help` explains every option. A call that
-was interrupted resumes if it is made again.
+The options of a command are made from its function: types and defaults from the signature, help from "Args:" in the
+docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resumes if it is made again.
 """
 
-from __future__ import annotations
-
-import contextlib
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.options import (
+    Between,
+    Count,
+    Difficulty,
+    GoalPictures,
+    Local,
+    Location,
+    Names,
+    Precision,
+    Reward,
+    Samples,
+    Seed,
+    Share,
+    Span,
+    Split,
+)
+from dmcvb_gen.parallel import Workers, ignore
+from dmcvb_gen.spec import LABEL_TYPES
+from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
+    from dmcvb_gen.benchmarks.setup import Setup
     from dmcvb_gen.benchmarks.validate import Validation
     from dmcvb_gen.generate.paint import RenderResult
     from dmcvb_gen.generate.regenerate import Outcome
     from dmcvb_gen.loaders.release import ReleaseReader
-    from dmcvb_gen.parallel import Workers
+    from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.release.fetch import Moved
     from dmcvb_gen.release.verify import Verification
-
-Names = str | Sequence[str]
-"""One name or several."""
 
 
 def rollout(
     tasks: Names = (),
     *,
-    levels: Names | None = None,
-    distractors: Names | None = None,
-    out: str | Path | None = None,
-    recipe: str | Path | None = None,
+    recipe: Location | None = None,
     only: Names = (),
-    difficulty: str | None = None,
-    intensity: float | None = None,
-    vary: Names | None = None,
-    video_count: int | None = None,
-    correlated: float | None = None,
-    goals: Names | None = None,
-    fixed_goals: int | None = None,
-    episodes_per_goal: int | None = None,
-    layouts: Names | None = None,
-    reward: str | None = None,
-    episodes: int | None = None,
-    steps: int | None = None,
-    max_steps: int | None = None,
-    episodes_per_shard: int | None = None,
-    seed: int | None = None,
+    levels: Names = (),
+    distractors: Names = (),
+    difficulty: Difficulty | None = None,
+    intensity: Share | None = None,
+    vary: Names = (),
+    video_count: Count | None = None,
+    correlated: Share | None = None,
+    goals: Names = (),
+    fixed_goals: Count | None = None,
+    episodes_per_goal: Count | None = None,
+    layouts: Names = (),
+    reward: Reward | None = None,
+    episodes: Count | None = None,
+    steps: Count | None = None,
+    max_steps: Count | None = None,
+    episode_range: Span | None = None,
+    seed: Seed | None = None,
     size: int | None = None,
     renderer: str | None = None,
-    samples: int | None = None,
-    backgrounds: str | Path | None = None,
-    split: str | None = None,
-    behaviour: str | Path | None = None,
+    samples: Samples | None = None,
+    device: str | None = None,
+    backgrounds: Location | None = None,
+    split: Split | None = None,
+    behaviour: Location | None = None,
     sample: bool = False,
-    independent: bool = False,
     pixels: bool = True,
+    independent: bool = False,
     workers: Workers = 1,
-    device: str = "cpu",
+    episodes_per_shard: Count | None = None,
+    out: Location | None = None,
     storage_options: dict[str, Any] | None = None,
+    scratch: Local | None = None,
+    scratch_size: int | None = None,
+    part: Span | None = None,
     other_versions: bool = False,
     progress: bool = True,
-) -> ReleaseReader:
+) -> "ReleaseReader":
     """Roll out behaviour policies into a release of episodes, and open it.
 
     `dmcvb_gen.rollout("walker-walk", levels="expert", distractors="dynamic", episodes=4, out="releases/demo")`
 
+    With a recipe, tasks, levels, distractors and goals select a part of it, and other arguments override its values.
+    Without tasks and recipe, the release at `out` resumes from its own manifest.
+
     Args:
-      tasks: a name or several; so are levels, distractors, only, goals and layouts.
-      levels: expert, medium, mixed or random.
-      distractors: none, static, dynamic, or at a strength: dynamic_0.35.
-      only: patterns of subsets.
-      goals: of mazes: visible or hidden.
-      layouts: of mazes: names or text files.
-      out: folder or URL of the release, by default releases/<name>. Without tasks and recipe, that release resumes.
-      recipe: a YAML file or the name of a shipped recipe; other arguments narrow or override it.
-      difficulty: easy, medium (the default) or hard; or intensity, the scale of the distractors, above 0 and up to 1.
-      vary: parts that vary, of camera, color and background; all by default. video_count: background videos in use.
-      correlated: above 0 and up to 1: a spurious cue in the colors that correlates so with the last action.
-      episodes: of each subset, 20 by default; or steps, in agent steps.
-      size: width and height of the images, 64 pixels by default.
-      behaviour: a policy file, a training run, an SB3 zip, a torch state dict or "module:function".
-      sample: draw actions instead of taking the policy's mean.
-      pixels: False stores no images; `paint` renders them later.
-      workers: processes, or a `dmcvb_gen.parallel.Ray` cluster.
-      progress: show a bar.
+      tasks (TASK): Tasks, all of one family.
+      recipe (FILE|NAME): Recipe: a YAML file or the name of a shipped one.
+      only (PATTERN): Roll out only these subsets, e.g. 'walker-walk/*/static'.
+      levels: expert, medium, mixed, random. [default: random]
+      distractors: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: none]
+      difficulty: Strength of the distractors. [default: medium]
+      intensity: Scale of the distractors instead of a difficulty: easy is 0.1, medium 0.2, hard 0.3.
+      vary (PART,...): Vary only these parts: camera, color, background, shake. [default: the first three]
+      video_count: Background videos in use. [default: by the difficulty]
+      correlated (RHO): dynamic: also show a spurious cue that correlates with the last action.
+      goals: Mazes: visible or hidden. [default: visible]
+      fixed_goals: Mazes: this many fixed (start, goal) pairs (B3).
+      episodes_per_goal: Mazes: episodes of each fixed pair. [default: 10]
+      layouts: Mazes: name or text file of a layout, instead of TASK.
+      reward: Mazes: DMC-VB's distance to the goal, or the shortest path.
+      episodes: Episodes per subset. [default: 20]
+      steps: Steps per subset, instead of --episodes.
+      max_steps: Longest episode, in steps. [default: 500, mazes 600]
+      episode_range (A:B): Generate only the shards with episodes A to B - 1.
+      seed: Random seed of the release. [default: 0]
+      size: Width and height of the images, in pixels. [default: 64]
+      renderer: native, warp or opengl. [default: native; with --device cuda: warp]
+      samples: Samples per pixel: 1, 2, 4 or 8; native has 4. [default: warp 2, others 4]
+      device: Device that renders: cpu, or cuda with warp. [default: cpu]
+      backgrounds: Background videos: builtin, or a folder. [default: builtin]
+      split: Background videos and maze styles: train or val. [default: train]
+      behaviour (FILE|RUN|MODULE:FUNCTION): Policy instead of the bundled one: a policy file, a training run, an SB3
+        zip, a torch state dict (.pt), or a function of your own.
+      sample: Sample actions instead of using the policy mean.
+      pixels: False: Store no images; `paint` renders them later.
+      independent: Simulate separate episodes for each distractor.
+      workers: Worker processes.
+      episodes_per_shard: Episodes per shard. [default: 50, mazes 10]
+      out: Folder or URL (s3://bucket/name, gs://, ...). [default: releases/NAME]
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+      scratch: With a URL: local folder for unfinished shards. [default: the system's]
+      scratch_size (BYTES): Maximum scratch space, e.g. 20GB. [default: half of what is free]
+      part (K/N): Run only part K of N: every N-th job, starting with the K-th.
+      other_versions: Resume even if package versions have changed.
 
     Raises:
       DmcvbError: an unknown name, a value that is wrong, an option that would have no effect, or no room.
     """
-    from dmcvb_gen.generate.estimate import raw_bytes
-    from dmcvb_gen.generate.plan import make_plan, prepare
-    from dmcvb_gen.generate.request import make_request
-    from dmcvb_gen.generate.rollout import run_plan
-    from dmcvb_gen.generate.target import Target
+    options = locals()
+    from dmcvb_gen.generate.rollout import prepare_rollout, request_of, rollout_plan, run_plan, target_for
     from dmcvb_gen.loaders.release import open_for_reading
 
-    several = dict(levels=levels, distractors=distractors, goals=goals, layouts=layouts, vary=vary)
-    given: dict[str, Any] = {name: _names(value) for name, value in several.items() if value is not None}
-    single = dict(
-        difficulty=difficulty,
-        intensity=intensity,
-        video_count=video_count,
-        correlated=correlated,
-        fixed_goals=fixed_goals,
-        episodes_per_goal=episodes_per_goal,
-        reward=reward,
-        episodes=episodes,
-        steps=steps,
-        max_steps=max_steps,
-        episodes_per_shard=episodes_per_shard,
-        seed=seed,
-        size=size,
-        renderer=renderer,
-        samples=samples,
-        backgrounds=backgrounds,
-        split=split,
-        behaviour=behaviour,
-        sample=sample or None,
-        independent=independent or None,
-    )
-    given |= {name: value for name, value in single.items() if value is not None}
-    tasks = _names(tasks)
-    resuming = bool(out) and not (tasks or layouts or recipe or given)
-    chosen = None if resuming else make_request(tasks, recipe, device=device, **given)
-    place = str(out) if out else str(Path("releases") / (chosen.name if chosen else ""))
-    target = Target.at(place, storage_options, workers=workers if isinstance(workers, int) else 1)
-    plan = make_plan(chosen, target, _names(only), device if chosen else None, None, (1, 1), pixels)
-    plan = prepare(plan, 0 if target.uploads else raw_bytes(plan), other_versions)
-    with _bar(progress, " frames", plan.manifest.name) as bar:
-        run_plan(plan, workers, bar)
-    return open_for_reading(place, storage_options)
+    request = request_of(options)
+    target = target_for(options, request)
+    plan = prepare_rollout(rollout_plan(options, request, target), options)
+    with progress_bar(progress, " frames", plan.manifest.name) as bar:
+        run_plan(plan, workers, bar, finishing=part is None)
+    return open_for_reading(target.place, storage_options)
 
 
 def paint(
-    release: str | Path,
+    release: Local,
     *,
     only: Names = (),
-    episodes: tuple[int, int] | None = None,
-    size: int | None = None,
+    episodes: Span | None = None,
+    size: Count | None = None,
     views: Names | None = None,
-    goal: str | None = None,
-    backgrounds: str | Path | None = None,
+    goal: GoalPictures | None = None,
     workers: Workers = 1,
     device: str = "cpu",
+    backgrounds: Location | None = None,
     progress: bool = True,
-) -> RenderResult:
+    notify: Callable[[str], None] = ignore,
+) -> "RenderResult":
     """Render the images of a release that has none, and compare them with their known digests.
 
     Args:
-      episodes: (first, last + 1): the shards that hold any of them.
-      size: width and height instead of the manifest's; the release becomes another one, as with views and goal.
-      views: to render, instead of the manifest's.
-      goal: of mazes: visible or hidden, instead of the manifest's.
+      release: Folder of the release.
+      only (PATTERN): Use only these subsets.
+      episodes (A:B): Use only the shards with episodes A to B - 1.
+      size: Width and height in pixels. [default: the manifest's]
+      views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
+      goal: Mazes: render only images with, or without, the goal. [default: both]
+      workers: Worker processes.
+      device: Device that renders: cpu, or cuda with warp.
+      backgrounds (FOLDER): Folder of the background videos, if the release has no copies.
+
+    `notify` is called with each difference to the environment that made the release, before rendering.
 
     Raises:
       DmcvbError: nothing matches, a shard is damaged, or the videos are not those of the manifest.
     """
     from dmcvb_gen.generate.paint import paint_release
 
-    with _bar(progress, " frames") as bar:
-        config = _render_config(size, views, goal, backgrounds, workers, device, bar)
-        return paint_release(release, _names(only), episodes, config)
+    with progress_bar(progress, " frames") as bar:
+        config = _render_config(size, views, goal, backgrounds, workers, device, bar, notify)
+        return paint_release(release, as_names(only), episodes, config)
 
 
 def repaint(
-    release: str | Path,
+    release: Location,
     *,
-    out: str | Path,
     only: Names = (),
     distractor: str | None = None,
-    difficulty: str | None = None,
+    difficulty: Difficulty | None = None,
     size: int | None = None,
     renderer: str | None = None,
-    samples: int | None = None,
-    backgrounds: str | Path | None = None,
-    split: str | None = None,
-    labels: Names = (),
-    name: str | None = None,
-    workers: Workers = 1,
+    samples: Samples | None = None,
+    backgrounds: Location | None = None,
+    split: Split | None = None,
+    labels: Annotated[Names, tuple(LABEL_TYPES)] = (),
     device: str = "cpu",
+    name: str | None = None,
+    out: Local,
+    workers: Workers = 1,
     progress: bool = True,
-) -> ReleaseReader:
+) -> "ReleaseReader":
     """Give episodes new images, from their stored physics states, in a new release; open that.
 
     Args:
-      labels: "depth" and "segmentation", stored beside the images.
-      name: of the new release.
+      release (RELEASE): Folder of the release.
+      only (PATTERN): Use only these subsets.
+      distractor: none, static or dynamic. [default: as each subset has]
+      difficulty: Strength of the distractors. [default: as each subset has]
+      size: Width and height in pixels. [default: as each subset has]
+      renderer: native, warp or opengl. [default: as each subset has]
+      samples: Samples per pixel: 1, 2, 4 or 8.
+      backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
+      split: Background videos and maze styles. [default: the recipe's]
+      labels: Also store depth or segmentation.
+      device: Device that renders: cpu, or cuda with warp.
+      name: Name of the new release. [default: NAME-repainted]
+      out (FOLDER): Folder of the new release.
+      workers: Worker processes.
 
     Raises:
       DmcvbError: nothing fits, a shard is damaged, or `out` cannot be used.
     """
     from dmcvb_gen.generate.repaint import Repainting
     from dmcvb_gen.generate.repaint import repaint as run
-    from dmcvb_gen.generate.request import background_source
     from dmcvb_gen.loaders.release import open_for_reading
 
-    videos = None if backgrounds is None else background_source(backgrounds)
-    what = (_names(only), distractor, difficulty, size, renderer, samples, videos, split, device, _names(labels), name)
-    with _bar(progress, " frames") as bar:
-        run(Repainting(release, out, *what), workers, bar)
+    look = (distractor, difficulty, size, renderer, samples, _videos(backgrounds), split, device)
+    with progress_bar(progress, " frames") as bar:
+        run(Repainting(release, out, as_names(only), *look, as_names(labels), name), workers, bar)
     return open_for_reading(str(out))
 
 
 def regenerate(
-    release: str | Path | None = None,
+    release: Location | None = None,
     *,
-    manifest: str | Path | None = None,
-    out: str | Path | None = None,
+    manifest: Location | None = None,
     only: Names = (),
-    episodes: tuple[int, int] | None = None,
+    episodes: Span | None = None,
     check: bool = False,
-    backgrounds: str | Path | None = None,
+    out: Local | None = None,
+    backgrounds: Location | None = None,
     device: str | None = None,
     workers: Workers = 1,
     progress: bool = True,
-) -> Outcome:
+) -> "Outcome":
     """Make a release's shards again from its manifest alone, bit for bit: to repair, to check, or into `out`.
 
     Args:
-      manifest: a manifest's file or the name of a shipped one, instead of a release; needs `out`.
-      check: compare digests and change nothing.
+      release (RELEASE): Folder of the release.
+      manifest (NAME|FILE): A shipped manifest or a manifest's file, instead of a release.
+      only (PATTERN): Use only these subsets.
+      episodes (A:B): Use only the shards with episodes A to B - 1.
+      check: Compare digests and change nothing.
+      out (FOLDER): Write the shards to this folder instead.
+      backgrounds (FOLDER): Folder of the background videos, if it has moved.
+      device: Render on cpu or cuda instead of the manifest's device.
+      workers: Worker processes.
 
     Raises:
       DmcvbError: there is no such release, or its shards cannot be made here.
@@ -230,31 +267,38 @@ def regenerate(
     from dmcvb_gen.generate.regenerate import Regeneration
     from dmcvb_gen.generate.shipped import manifest_source
 
-    if (release is None) == (manifest is None) or (manifest is not None and not out) or (check and out):
-        raise DmcvbError("give a release, or a manifest with out=FOLDER; give check or out, not both")
+    if (release is None) == (manifest is None):
+        raise DmcvbError("give a RELEASE, or a manifest with --manifest")
+    if manifest is not None and not out:
+        raise DmcvbError("a manifest alone has no shards to repair: add --out FOLDER (in Python, out=FOLDER)")
+    if check and out:
+        raise DmcvbError("give --check or --out, not both")
     videos = None if backgrounds is None else str(backgrounds)
-    with contextlib.ExitStack() as stack:
-        source = stack.enter_context(manifest_source(manifest)) if manifest is not None else release
+    with ExitStack() as stack:
+        source = release if manifest is None else stack.enter_context(manifest_source(manifest))
         assert source is not None
-        bar = stack.enter_context(_bar(progress, " frames"))
-        work = Regeneration(source, _names(only), episodes, videos, device, workers)
+        bar = stack.enter_context(progress_bar(progress, " frames"))
+        work = Regeneration(source, as_names(only), episodes, videos, device, workers)
         return work.remake(out, bar) if out else work.check(bar) if check else work.repair(bar)
 
 
 def verify(
-    release: str | Path,
+    release: Location,
     *,
     everything: bool = False,
-    backgrounds: str | Path | None = None,
+    backgrounds: Location | None = None,
     workers: Workers | None = None,
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
-) -> Verification:
+) -> "Verification":
     """Check that a release is what it says; at a URL manifest, index, commit records and a sample of files.
 
     Args:
-      everything: at a URL, read every file.
-      workers: 1 process by default; at a URL 8 parallel downloads.
+      release (RELEASE|URL): Folder or URL of the release.
+      everything: At a URL: read every file instead of a sample.
+      backgrounds (FOLDER): Folder of the background videos, if it has moved.
+      workers: Worker processes; at a URL: parallel downloads. [default: 1; 8]
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
     Raises:
       DmcvbError: there is no release, nothing is committed, or an option has no effect there.
@@ -264,106 +308,127 @@ def verify(
     from dmcvb_gen.storage.remote import is_url
 
     if is_url(str(release)):
-        if backgrounds is not None or not isinstance(workers, int | None):
-            raise DmcvbError("backgrounds and Ray have no effect at a URL, where nothing is painted: remove them")
-        with _bar(progress, " files") as bar:
-            downloads = workers if isinstance(workers, int) else WORKERS
-            return verify_url(str(release), storage_options, everything, bar, downloads)
-    if everything or storage_options:
-        raise DmcvbError(f"{release} is no URL, and is read whole: remove everything and storage_options")
-    with _bar(progress, " checks") as bar:
+        _refuse("at a URL nothing is painted or simulated", backgrounds=backgrounds, executor=not _is_count(workers))
+        with progress_bar(progress, " files", scaled=False) as bar:
+            return verify_url(str(release), storage_options, everything, bar, workers or WORKERS)  # type: ignore[arg-type]
+    _refuse(f"{release} is no URL, and is read whole", all=everything, option=storage_options)
+    with progress_bar(progress, " checks", scaled=False) as bar:
         return run(release, None if backgrounds is None else str(backgrounds), bar, workers or 1)
 
 
 def publish(
-    release: str | Path,
+    release: Location,
     url: str,
     *,
-    pixels: bool = True,
-    take_over: bool = False,
-    workers: int = 8,
     storage_options: dict[str, Any] | None = None,
+    take_over: bool = False,
+    workers: Count = 8,
+    pixels: bool = True,
     progress: bool = True,
-) -> Moved:
+) -> "Moved":
     """Put a complete release, or an export, at a URL: every file checked, the manifest last.
 
     Args:
-      pixels: False publishes without images.
-      take_over: publish even if another upload has claimed the URL.
-      workers: parallel transfers.
+      release (RELEASE): Folder of the release, or of an export.
+      url (URL): Where to put it: s3://, gs://, hf:// or any fsspec URL.
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+      take_over: Publish even if another upload has claimed the URL.
+      workers: Parallel transfers.
+      pixels: False: Publish without images; `paint` renders them again.
 
     Raises:
       StoreError: the release is not complete or damaged, another version is there, or access is refused.
     """
     from dmcvb_gen.release.publish import publish_folder
 
-    with _bar(progress, " files") as bar:
-        given = dict(pixels=pixels, take_over=take_over, options=storage_options, workers=workers)
-        return publish_folder(release, url, tick=bar, **given)  # type: ignore[arg-type]
+    given: dict[str, Any] = dict(pixels=pixels, take_over=take_over, options=storage_options, workers=workers)
+    with progress_bar(progress, " files", scaled=False) as bar:
+        return publish_folder(release, url, tick=bar, **given)
 
 
 def fetch(
     url: str,
-    out: str | Path,
+    out: Local,
     *,
     only: Names = (),
-    episodes: tuple[int, int] | None = None,
+    episodes: Span | None = None,
     paint: bool = False,
-    size: int | None = None,
+    size: Count | None = None,
     views: Names | None = None,
-    goal: str | None = None,
-    workers: int = 8,
+    goal: GoalPictures | None = None,
     storage_options: dict[str, Any] | None = None,
+    workers: Count = 8,
     progress: bool = True,
-) -> ReleaseReader:
+) -> "ReleaseReader":
     """Download a published release, or a part of it, and open it.
 
     Args:
-      episodes: (first, last + 1): the shards that hold any of them.
-      paint: render the images of each shard as it arrives; `size`, `views` and `goal` are its.
-      workers: parallel transfers.
+      url (URL): Where it was published.
+      out (FOLDER): Local folder for the release.
+      only (PATTERN): Use only these subsets.
+      episodes (A:B): Use only the shards with episodes A to B - 1.
+      paint: Render the images of each shard as it arrives.
+      size: Width and height in pixels. [default: the manifest's]
+      views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
+      goal: Mazes: render only images with, or without, the goal. [default: both]
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+      workers: Parallel transfers.
 
     Raises:
       DmcvbError: no release is there, a file is not what its digest says, `out` holds something else, or no room.
     """
-    import os
-
+    options = locals()
     from dmcvb_gen.loaders.release import open_for_reading
-    from dmcvb_gen.release.fetch import fetch as run
-    from dmcvb_gen.release.fetch import fetch_and_paint
 
-    given: dict[str, Any] = dict(options=storage_options, workers=workers)
-    if not paint and (size or views or goal):
-        raise DmcvbError("size, views and goal say what to paint: add paint=True")
-    with _bar(progress, "B") as moved, _bar(progress and paint, " frames") as painted:
-        if paint:
-            config = _render_config(size, views, goal, None, os.cpu_count() or 1, "cpu", painted)
-            fetch_and_paint(url, out, _names(only), episodes, painter=config, tick=moved, **given)
-        else:
-            run(url, out, _names(only), episodes, tick=moved, **given)
+    download(options)
     return open_for_reading(str(out))
 
 
+def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore) -> "tuple[Moved, RenderResult | None]":
+    """What the arguments of `fetch` ask for: what was moved and, with `paint`, what was painted."""
+    from dmcvb_gen.release.fetch import fetch, fetch_and_paint
+
+    what = (options["url"], options["out"], as_names(options["only"]), options["episodes"])
+    look = (options["size"], options["views"], options["goal"])
+    given: dict[str, Any] = dict(options=options["storage_options"], workers=options["workers"])
+    if not options["paint"]:
+        if any(look):
+            raise DmcvbError("--size, --views and --goal say what to --paint (in Python, paint=True)")
+        with progress_bar(options["progress"], "B") as bar:
+            return fetch(*what, tick=bar, **given), None
+    with (
+        progress_bar(options["progress"], "B", "fetched") as moved,
+        progress_bar(options["progress"], " frames", "painted") as frames,
+    ):
+        painter = _render_config(*look, None, os.cpu_count() or 1, "cpu", frames, notify)
+        return fetch_and_paint(*what, painter=painter, tick=moved, **given)
+
+
 def export(
-    release: str | Path,
+    release: Location,
     to: str,
-    out: str | Path,
+    out: Local,
     *,
     only: Names = (),
-    episodes: tuple[int, int] | None = None,
+    episodes: Span | None = None,
     merge: bool = False,
     video: bool = False,
     workers: Workers = 1,
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> list[Path]:
-    """Write subsets in another format ("hdf5", "minari", "lerobot", "rlds", "rerun", ...); the folders.
+    """Write subsets in another format, a folder for each; the folders.
 
     Args:
-      release: a folder or URL.
-      episodes: (first, last + 1); all by default.
-      merge: lerobot: all subsets as the tasks of one data set.
-      video: lerobot: images as mp4.
+      release (RELEASE|URL): Folder or URL of the release.
+      to: Format, for example hdf5, minari, lerobot, rlds or rerun.
+      out (FOLDER): Output folder, one folder per subset.
+      only (PATTERN): Use only these subsets.
+      episodes (A:B): Export only episodes A to B - 1.
+      merge: lerobot: write all subsets as the tasks of one data set.
+      video: lerobot: store images as mp4 (smaller, lossy) instead of PNG.
+      workers: Worker processes, one subset each.
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
     Raises:
       DmcvbError: no such format or subset, or a package is not installed.
@@ -371,97 +436,133 @@ def export(
     from dmcvb_gen.release.export import export as run
 
     given: dict[str, Any] = dict(merge=merge, video=video, workers=workers, storage_options=storage_options)
-    with _bar(progress, " episodes") as bar:
-        return run(str(release), to, out, _names(only), episodes, tick=bar, **given)
+    with progress_bar(progress, " episodes", scaled=False) as bar:
+        return run(str(release), to, out, as_names(only), episodes, tick=bar, **given)
 
 
 def validate(
-    release: str | Path,
+    release: Location,
     *,
     profile: str = "smoke",
+    scale: Annotated[float, Between(0, open=True)] = 1.0,
     benchmarks: Names = ("b1",),
     agents: Names = (),
     only: Names = (),
-    out: str | Path | None = None,
+    out: Local | None = None,
     checks_only: bool = False,
     train_unsound: bool = False,
     workers: Workers | None = None,
+    threads: Count | None = None,
+    device: Annotated[str, ("cpu", "cuda")] = "cpu",
+    precision: Precision = "auto",
+    compile: bool = False,
+    memory: Annotated[float, Between(0)] | None = None,
+    seed: Annotated[int, Between(0, 2**31 - 1)] = 0,
+    dino_weights: Location | None = None,
+    backgrounds: Location | None = None,
     progress: bool = True,
-    **options: Any,
-) -> Validation:
+) -> "Validation":
     """Check a release, run the paper's benchmarks on it and write a report.
 
     Args:
-      profile: "smoke" (no scores), "brief", "quick" or "paper".
-      benchmarks: "b1", "b2", "b3", "ablations".
-      agents: instead of each benchmark's own, e.g. "bc", "id+bc"; "module:name" is an agent of your own.
-      out: folder of the report, by default reports/<the release's folder>.
-      checks_only: check the structure and train nothing.
-      options: scale, seed, threads, device, precision, compile, memory, dino_weights, backgrounds: as the command's.
+      release (RELEASE): Folder of the release.
+      profile: Budget: smoke (no scores), brief, quick or paper.
+      scale: Multiply the profile's steps.
+      benchmarks: b1, b2, b3, ablations.
+      agents (A,B): Agents to train, e.g. bc,state-bc,id+bc. [default: all]
+      only (PATTERN): Use only these subsets, e.g. 'walker-walk/expert/*'.
+      out (FOLDER): Folder of the report. [default: reports/NAME]
+      checks_only: Check the structure and train nothing.
+      train_unsound: Run the benchmarks even if a check fails.
+      workers: Cells side by side. [default: 2, on one core 1]
+      threads: Threads of each worker. [default: cores / workers]
+      device: Device that trains.
+      precision: Precision of networks that see images; auto times both.
+      compile: Compile the losses with torch.compile (for CUDA and long runs).
+      memory (GB): Memory of all workers; ray: of each. [default: half]
+      seed: Random seed of the trainings.
+      dino_weights (FILE): Safetensors file with the weights of dino+bc.
+      backgrounds (FOLDER): Folder of the background videos, if it has moved.
 
     Raises:
       DmcvbError: there is no release, a name is unknown, or the release has no data for a benchmark.
     """
+    options = locals()
+    return run_validation(validation_setup(options), options)
+
+
+def validation_setup(options: Mapping[str, Any]) -> "Setup":
+    """What all cells of a validation share, from the arguments of `validate`."""
     from dmcvb_gen.benchmarks.run import default_workers
-    from dmcvb_gen.benchmarks.validate import Progress, make_setup
+    from dmcvb_gen.benchmarks.validate import make_setup
+
+    given = {name: options[name] for name in ("out", "profile", "scale", "threads", "device", "precision", "compile")}
+    given |= {name: options[name] for name in ("memory", "seed", "dino_weights", "backgrounds")}
+    workers = options["workers"] or default_workers(options["device"])
+    return make_setup(options["release"], workers=workers, training=not options["checks_only"], **given)
+
+
+def run_validation(
+    setup: "Setup", options: Mapping[str, Any], on_score: Callable[[Any, dict[str, Any]], None] = ignore
+) -> "Validation":
+    """Run what the arguments of `validate` ask for.
+
+    Args:
+      on_score: called with each cell and its result, as soon as it is there.
+    """
+    from dmcvb_gen.benchmarks.run import default_workers
+    from dmcvb_gen.benchmarks.validate import Progress
     from dmcvb_gen.benchmarks.validate import validate as run
 
-    chosen = workers or default_workers(options.get("device", "cpu"))
-    setup = make_setup(release, out=out, profile=profile, workers=chosen, training=not checks_only, **options)
-    with _bar(progress, " checks", "structure") as checks, _bar(progress and not checks_only, " steps") as steps:
-        told = Progress(checking=checks, total=steps.expect, training=steps.told)
+    with progress_bar(options["progress"], " checks", "structure", scaled=False) as bar:
+
+        def train(steps: int) -> None:
+            bar.unit = " steps"
+            bar.reset(steps)
+
         return run(
-            release,
+            options["release"],
             setup,
-            benchmarks=() if checks_only else _names(benchmarks),
-            agents=_names(agents),
-            patterns=_names(only),
-            workers=chosen,
-            train_unsound=train_unsound,
-            progress=told,
+            benchmarks=() if options["checks_only"] else as_names(options["benchmarks"]),
+            agents=as_names(options["agents"]),
+            patterns=as_names(options["only"]),
+            workers=options["workers"] or default_workers(setup.device),
+            train_unsound=options["train_unsound"],
+            progress=Progress(checking=bar, total=train, training=bar.advance, done=on_score),
         )
 
 
 # -- what they share ------------------------------------------------------------------------------
 
 
-def _names(value: Names) -> tuple[str, ...]:
-    """One name or several -> several."""
-    return (value,) if isinstance(value, str) else tuple(map(str, value))
+def _is_count(workers: Workers | None) -> bool:
+    return workers is None or isinstance(workers, int)
 
 
-def _render_config(size, views, goal, backgrounds, workers, device, bar) -> Any:
-    from dmcvb_gen.generate.paint import RenderConfig, RenderOverrides
+def _refuse(reason: str, **given: Any) -> None:
+    """Raises DmcvbError if one of the options is given."""
+    for name, value in given.items():
+        if value:
+            raise DmcvbError(f"--{name} has no effect: {reason}; remove it")
+
+
+def _videos(backgrounds: Location | None) -> str | None:
     from dmcvb_gen.generate.request import background_source
 
-    overrides = RenderOverrides(size, None if views is None else _names(views), goal)
-    videos = None if backgrounds is None else background_source(backgrounds)
-    return RenderConfig(overrides, workers, device, videos, bar)
+    return None if backgrounds is None else background_source(backgrounds)
 
 
-class _Bar:
-    """A progress callback that draws a bar, also in a notebook."""
+def _render_config(size, views, goal, backgrounds, workers, device, bar, notify) -> Any:
+    from dmcvb_gen.generate.paint import RenderConfig, RenderOverrides
 
-    def __init__(self, bar: Any):
-        self._bar = bar
-
-    def __call__(self, done: int | str = 1) -> None:
-        if isinstance(done, str):
-            self._bar.set_description(done, refresh=False)
-        self._bar.update(1 if isinstance(done, str) else done)
-
-    def expect(self, count: float) -> None:
-        self._bar.total = count
-        self._bar.refresh()
-
-    def told(self, what: str, steps: int) -> None:
-        self._bar.set_description(what, refresh=False)
-        self._bar.update(steps)
+    overrides = RenderOverrides(size, None if views is None else as_names(views), goal)
+    return RenderConfig(overrides, workers, device, _videos(backgrounds), bar, notify)
 
 
-@contextlib.contextmanager
-def _bar(shown: bool, unit: str, name: str | None = None) -> Iterator[_Bar]:
-    from tqdm.auto import tqdm
+@contextmanager
+def progress_bar(shown: bool, unit: str, name: str | None = None, scaled: bool = True) -> "Iterator[ProgressBar]":
+    """A bar on standard error; drawn if `shown`."""
+    from dmcvb_gen.progress import ProgressBar
 
-    with tqdm(disable=not shown, unit=unit, unit_scale=True, desc=name) as bar:
-        yield _Bar(bar)
+    with ProgressBar(shown, unit=unit, unit_scale=scaled, desc=name) as bar:
+        yield bar

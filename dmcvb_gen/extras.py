@@ -36,7 +36,7 @@ _PACKAGES = {
 """Module -> its package, where the names differ."""
 
 
-def cure(module: str) -> str | None:
+def install_hint(module: str) -> str | None:
     """What to do where `module` (or its parent) is not installed; None for a module that is not one of ours to name."""
     top = module.split(".")[0]
     package = _PACKAGES.get(top, top)

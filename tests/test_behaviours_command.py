@@ -32,7 +32,7 @@ def test_the_command_of_a_run_parses_back_to_its_configuration(init_from):
     given = context.params
     assert (given["task"], given["algo"], given["steps"], given["seed"]) == ("humanoid-walk", "sac", 1000, 3)
     assert (given["evaluate_every"], given["init_from"]) == (700, init_from)
-    assert parse_settings(given["pairs"], None, "sac") == settings
+    assert parse_settings(given["settings"], None, "sac") == settings
 
 
 def simulation(lengths, terminated, distance):

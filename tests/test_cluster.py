@@ -353,7 +353,7 @@ def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
         environment["SLURM_ARRAY_TASK_ID"] = str(task)
         subprocess.run(["bash", str(tmp_path / "job.sh")], check=True, env=environment)
     called = (tmp_path / "log").read_text().splitlines()
-    base = f"dmcvb-gen rollout --recipe {recipe_file} --workers 4 --out s3://bucket/x"
+    base = f"dmcvb-gen rollout --recipe {recipe_file} --out s3://bucket/x --workers 4"
     assert called[0] == f"{base} --init" and called[1].startswith("sbatch --dependency=afterok:7")
     assert called[1].endswith(f"--wrap={base} --finish")
     assert called[2:] == [*(f"{base} --part {task}/3" for task in (1, 2, 3)), f"{base} --init", f"{base} --part 1/3"]

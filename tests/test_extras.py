@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dmcvb_gen.extras import EXTRAS, SIMULATOR, cure
+from dmcvb_gen.extras import EXTRAS, SIMULATOR, install_hint
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -46,8 +46,8 @@ CORE = distributions(PROJECT["dependencies"])
 def test_every_import_is_a_dependency_or_its_absence_names_the_cure(module):
     if brought_by(module) & CORE and module not in SIMULATOR:
         return
-    advice = cure(module)
-    assert advice, f"{module} is imported, but its absence has no cure in dmcvb_gen/extras.py"
+    advice = install_hint(module)
+    assert advice, f"{module} is imported, but its absence has no hint in dmcvb_gen/extras.py"
     if extra := re.search(r"the extra \[(\w+)\]", advice):
         there = distributions(PROJECT["optional-dependencies"][extra[1]])
         assert brought_by(module) & there, f"the extra [{extra[1]}] does not bring {module}"

@@ -30,6 +30,8 @@ FLOORS = (
         "arithmetic",
         "precision",
         "compilation",
+        "progress",
+        "options",
         "own_code",
     ),  # the ground
     ("tasks",),

@@ -9,7 +9,8 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.cli import common, main
+from dmcvb_gen import progress
+from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.paint import without_pictures
@@ -55,7 +56,7 @@ def errors_of(words):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, task):
-    monkeypatch.setattr(common, "LOG_SECONDS", 0)
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0)
     for words in commands(task, tmp_path):
         told = errors_of(words)
         unknown = re.compile(r"\| 0(\.00)?/\? ")  # of a bar that was not told yet, before anything is done
@@ -74,7 +75,7 @@ def test_a_log_gets_nothing_of_a_quick_command(request, tmp_path, release):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_scores_are_told_while_other_cells_train(tmp_path, monkeypatch, task):
-    monkeypatch.setattr(common, "LOG_SECONDS", 0)
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0)
     release, report = str(tmp_path / "made"), str(tmp_path / "report")
     assert invoke(["rollout", task, "--episodes", "4", "--max-steps", "12", "--out", release]).exit_code == 0
     asked = ["--profile", "smoke", "--agents", "bc,state-bc", "--train-unsound", "--out", report]

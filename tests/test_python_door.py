@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import re
 
+import click
 import numpy as np
 import pytest
 
@@ -13,26 +15,15 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
 FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")
+FUNCTIONS += ("train_behaviour", "evaluate_behaviour")
 FAMILIES = {
     "locomotion": dict(tasks="walker-walk", distractors=["none", "dynamic"]),
     "suite": dict(tasks="cartpole-swingup", distractors="static"),
     "maze": dict(tasks="ant-maze-empty7x7", goals="visible"),
 }
 TINY = dict(episodes=2, max_steps=8, size=32, episodes_per_shard=1, progress=False)
-PRINTING = {"as_json", "dry_run", "strict", "executor", "ray_address"}
-"""Options of commands that say how something is printed, or what `workers` says in Python."""
-MANY_MACHINES = {"episode_range", "scratch", "scratch_size", "init", "part", "finishing", "slurm_script"}
-RENAMED = {
-    "no_pixels": "pixels",
-    "options": "storage_options",
-    "path": "release",
-    "painting": "paint",
-    "own": "agents",
-    **dict.fromkeys(
-        ("scale", "threads", "device", "precision", "compile", "memory", "seed", "dino_weights", "backgrounds"),
-        "options",
-    ),
-}
+COMMANDS_ALONE = {"as_json", "dry_run", "strict", "executor", "ray_address", "init", "finishing", "slurm_script", "own"}
+"""Options that say how something is printed, begin and end a release of many machines, or belong to another one."""
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -42,15 +33,38 @@ def family(request, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_every_option_of_a_command_is_an_argument_of_its_function(name):
-    command = main.get_command(None, name)
-    signature = inspect.signature(getattr(dmcvb_gen, name)).parameters
-    assert name in COMMANDS and name in dmcvb_gen.__all__
-    for parameter in command.params:
-        if parameter.name in PRINTING | (MANY_MACHINES if name == "rollout" else set()):
-            continue
-        wanted = {parameter.name, RENAMED.get(parameter.name)}
-        assert wanted & set(signature), f"{name}() does not take {parameter.name}"
+def test_a_command_has_the_options_of_its_function(name):
+    command = main.get_command(None, name.replace("_", "-"))
+    parameters = dict(inspect.signature(getattr(dmcvb_gen, name)).parameters)
+    assert command.name in COMMANDS and name in dmcvb_gen.__all__
+    options = {parameter.name: parameter for parameter in command.params if parameter.name not in COMMANDS_ALONE}
+    assert options.keys() == parameters.keys() - {"progress", "notify"}
+    words = []
+    for option in options.values():
+        assert option.required == (parameters[option.name].default is inspect.Parameter.empty)
+        assert isinstance(option, click.Argument) or option.help.strip()
+        if option.required:
+            words += ["x"] if isinstance(option, click.Argument) else [option.opts[0], "x"]
+    parsed = command.make_context(name, words).params
+    for option in options.values():
+        default = "x" if option.required else parameters[option.name].default
+        assert parsed[option.name] == default or not (parsed[option.name] or default), option.name
+
+
+def test_the_help_of_rollout_states_the_defaults_of_recipes():
+    """They are those of `Recipe` and `SubsetPattern`, which other arguments of `rollout` override."""
+    from dmcvb_gen.generate.recipe import Recipe, SubsetPattern
+    from dmcvb_gen.generate.request import EPISODES
+
+    fields = Recipe.model_fields | SubsetPattern.model_fields
+    stated = {
+        option.name: found[1]
+        for option in main.get_command(None, "rollout").params
+        if (found := re.search(r"\[default: ([^];]*)", getattr(option, "help", "") or ""))
+    }
+    for name in ("seed", "size", "backgrounds", "split", "episodes_per_goal"):
+        assert stated[name] == str(fields[name].default)
+    assert stated["renderer"] == fields["renderer"].default.backend and stated["episodes"] == str(EPISODES)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

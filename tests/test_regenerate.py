@@ -52,7 +52,7 @@ MAZE |= {"episodes": 3, "fixed_goals": 2, "episodes_per_goal": 2, "episodes_per_
 def test_the_jobs_are_those_of_the_rollout(tmp_path, pattern, trajectories):
     plan = make_plan(small_recipe(subsets=[pattern], trajectories=trajectories), tmp_path / "r")
     inputs = release_inputs(tmp_path / "r", plan.manifest.subsets)
-    jobs = make_jobs(plan.manifest, chosen_shards(plan.manifest), plan.jobs[0].site, inputs)
+    jobs = make_jobs(plan.manifest, chosen_shards(plan.manifest), plan.jobs[0].target, inputs)
     assert sorted(jobs, key=str) == sorted(plan.jobs, key=str) and jobs
 
 

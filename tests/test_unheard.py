@@ -31,7 +31,7 @@ def asked(monkeypatch):
         raise click.Abort()
 
     def ask(*arguments):
-        monkeypatch.setattr("dmcvb_gen.generate.plan.make_plan", stop)
+        monkeypatch.setattr("dmcvb_gen.generate.rollout.make_plan", stop)
         result = rollout(*arguments)
         assert result.exit_code == 1, result.output
         return {request.name: request for request in expand(recipes[-1])}

@@ -12,13 +12,13 @@ import warnings
 import click
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.extras import cure
+from dmcvb_gen.extras import install_hint
 from dmcvb_gen.version import __version__
 
 GROUPS = {
     "Make data": {
         "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of episodes."),
-        "status": ("cluster:status", "Show the progress of a release that is being made."),
+        "status": ("look:status", "Show the progress of a release that is being made."),
         "paint": ("paint:paint", "Render the images of a release stored without pixels."),
         "repaint": ("release:repaint", "Render stored episodes again: other distractors, size or renderer."),
         "regenerate": ("release:regenerate", "Generate a release again from its manifest: check, repair or copy."),
@@ -30,9 +30,9 @@ GROUPS = {
         "evaluate-behaviour": ("behaviours:evaluate_behaviour", "Measure the returns of behaviour policies."),
     },
     "Look and check": {
-        "list": ("rollout:list_command", "List tasks, levels, distractors, recipes and renderers."),
-        "info": ("rollout:info", "Show what a release holds, beside the paper's returns."),
-        "preview": ("rollout:preview", "Write a contact sheet and a video of a release."),
+        "list": ("look:list_command", "List tasks, levels, distractors, recipes and renderers."),
+        "info": ("look:info", "Show what a release holds, beside the paper's returns."),
+        "preview": ("look:preview", "Write a contact sheet and a video of a release."),
         "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
         "show-maze": ("maze:show_maze", "Draw a maze, its distances to a goal and the path there."),
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
@@ -44,7 +44,7 @@ GROUPS = {
     "Share": {
         "card": ("release:card", "Write the card of a release: README.md, croissant.json, images."),
         "publish": ("release:publish", "Upload a release: s3://, gs://, hf:// or any fsspec URL."),
-        "fetch": ("fetch:fetch", "Download a published release, or a part of it."),
+        "fetch": ("paint:fetch", "Download a published release, or a part of it."),
     },
     "Convert": {
         "convert-policy": ("behaviours:convert_policy", "Convert a policy of Stable-Baselines3 or torch (CleanRL)."),
@@ -95,7 +95,7 @@ class LazyGroup(click.Group):
                 raise click.Abort() from None
             what = str(error) if isinstance(error, DmcvbError) else None
             if isinstance(error, ModuleNotFoundError):
-                what = cure(error.name or "")
+                what = install_hint(error.name or "")
             if what is None:
                 raise
             click.echo(f"error: {what}", err=True)

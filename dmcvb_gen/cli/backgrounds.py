@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, answer, json_option
+from dmcvb_gen.progress import ProgressBar
 
 
 @click.command()
@@ -26,11 +27,10 @@ def backgrounds(videos, seed, out, sheet, as_json):
 
     from dmcvb_gen.distractors.clips import clip_sheet, make_clips
 
-    with ProgressBar(as_json, total=2 * videos, unit=" clips") as bar:
+    with ProgressBar(not as_json, total=2 * videos, unit=" clips") as bar:
         made = make_clips(videos, seed, out, bar.update)
     if sheet:
         sheet.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(clip_sheet(out)).save(sheet)
-    if as_json:
-        return print_json({split: [str(path) for path in paths] for split, paths in made.items()})
-    click.echo(f"{out}: {videos} train and {videos} val clips; use them with --backgrounds {out}")
+    facts = {split: [str(path) for path in paths] for split, paths in made.items()}
+    answer(as_json, facts, f"{out}: {videos} train and {videos} val clips; use them with --backgrounds {out}")

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import sys
-import time
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import click
-from tqdm import tqdm
 
 from dmcvb_gen.errors import DmcvbError
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
+
+WORDS = "dmcvb_gen.words"
+"""Key in a context's `meta`: the words of the command line."""
 
 
 class GroupedCommand(click.Command):
@@ -21,12 +21,16 @@ class GroupedCommand(click.Command):
 
     Args:
       option_groups: heading -> names of the options below it, as the function's parameters. Options that no heading
-        names come last, under "Other".
+        names come last.
     """
 
-    def __init__(self, *arguments: Any, option_groups: dict[str, tuple[str, ...]], **options: Any):
+    def __init__(self, *arguments: Any, option_groups: dict[str, tuple[str, ...]] | None = None, **options: Any):
         super().__init__(*arguments, **options)
-        self.option_groups = option_groups
+        self.option_groups = option_groups or {}
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta[WORDS] = tuple(args)
+        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         options = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
@@ -34,7 +38,7 @@ class GroupedCommand(click.Command):
         for heading, names in self.option_groups.items():
             with formatter.section(heading):
                 formatter.write_dl([records.pop(name) for name in names])
-        with formatter.section("Other"):
+        with formatter.section("Other" if self.option_groups else "Options"):
             formatter.write_dl(list(records.values()))
 
 
@@ -86,55 +90,24 @@ def print_table(
         console.print(Text(f"(not shown: {', '.join(hidden)}; a wider terminal or --json shows them)", "dim"))
 
 
+def answer(as_json: bool, facts: Any, *lines: Any, code: int = 0) -> None:
+    """Print facts as JSON for programs, or lines for people, and end the command.
+
+    Args:
+      code: exit code.
+    """
+    if as_json:
+        print_json(facts)
+    else:
+        for line in lines:
+            click.echo(line)
+    if code:
+        click.get_current_context().exit(code)
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; numpy numbers and paths are turned into plain ones."""
     click.echo(json.dumps(value, indent=2, default=_plain))
-
-
-LOG_SECONDS = 60.0  # between two lines of progress where nobody watches a bar
-
-
-class ProgressBar(tqdm):
-    """tqdm's bar on a terminal; in a log (a batch job's file, a pipe) a line a minute, the first after a minute.
-
-    A log keeps every state of a bar, so there it has to be rare, and ends in a newline instead of a carriage return.
-    """
-
-    def __init__(self, as_json: bool = False, **options: Any) -> None:
-        self._logged = not sys.stderr.isatty()
-        self._told = time.monotonic()
-        if self._logged:
-            line = "{l_bar} {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
-            options |= dict(file=_Lines(), delay=LOG_SECONDS, mininterval=LOG_SECONDS, miniters=1, bar_format=line)
-        super().__init__(disable=as_json, **options)
-
-    def __call__(self, done: int | str = 1) -> None:
-        """Progress callback: how much was done since the last call, or the name of the item in progress."""
-        if isinstance(done, str):
-            self.set_description(done, refresh=False)
-        self.update(1 if isinstance(done, str) else done)
-
-    def expect(self, count: float) -> None:
-        """Set the expected total, which may change later."""
-        self.total = count
-
-    def refresh(self, *args: Any, **options: Any) -> bool | None:
-        if self._logged:
-            if time.monotonic() < self._told + LOG_SECONDS:
-                return None
-            self._told = time.monotonic()
-        return super().refresh(*args, **options)
-
-
-class _Lines:
-    """A stream that turns each state of a bar into a line of standard error."""
-
-    def write(self, text: str) -> None:
-        if text.strip():
-            click.echo(text.strip(), err=True)
-
-    def flush(self) -> None:
-        sys.stderr.flush()
 
 
 def _plain(value: Any) -> Any:
@@ -161,6 +134,11 @@ def format_bytes(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     raise AssertionError("unreachable")
+
+
+def moved_files(moved: Any) -> str:
+    """What a publish or fetch moved, in words."""
+    return f"{moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now"
 
 
 def format_duration(seconds: float) -> str:

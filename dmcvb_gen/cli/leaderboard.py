@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json, print_table
+from dmcvb_gen.cli.common import OutPath, json_option, print_json, print_table
+from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
 
@@ -60,7 +61,7 @@ def leaderboard(context, folder, reports, patterns, data_command, check, names, 
             click.echo(f"Wrote {page}.")
     checks = []
     if check:
-        with ProgressBar(as_json, total=len(rows), unit=" rows", desc="evaluation") as bar:
+        with ProgressBar(not as_json, total=len(rows), unit=" rows", desc="evaluation") as bar:
             for row in rows:
                 bar(row.name)
                 checks.append(check_row(folder, row))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, json_option, print_json
+from dmcvb_gen.cli.common import OutPath, answer, json_option
 
 
 def _cell(context, parameter, value):
@@ -33,23 +33,12 @@ def show_maze(layout, start, goal, out, as_json):
     dmcvb-gen show-maze medium7x7a
     dmcvb-gen show-maze my_maze.txt --start 1,1 --goal 3,5 --out my_maze.png
     """
-    from dmcvb_gen.errors import UnknownNameError
-    from dmcvb_gen.spec import MazeName
-    from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, get_layout, load_layout, make_layout
+    from dmcvb_gen.tasks.ant_maze.layouts import find_layout
     from dmcvb_gen.tasks.ant_maze.picture import save_maze_picture
 
-    name = MazeName.parse(layout) or MazeName(layout)
-    if name.rows:
-        chosen = make_layout(name.layout, name.rows)
-    elif name.layout in LAYOUTS:
-        chosen = get_layout(name.layout)
-    elif Path(layout).suffix or Path(layout).exists():
-        chosen = load_layout(layout)
-    else:
-        raise UnknownNameError("layout", layout, LAYOUTS)
+    chosen = find_layout(layout)
     out = out or Path(f"{chosen.name}.png")
     facts = save_maze_picture(chosen, out, start, goal)
-    if as_json:
-        return print_json({"layout": chosen.name, "rows": list(chosen.rows), "picture": str(out), **facts})
-    click.echo("\n".join(chosen.rows))
-    click.echo(f"{out}: path of {facts['path_m']:.1f} m from {tuple(facts['start'])} to {tuple(facts['goal'])}")
+    path = f"{out}: path of {facts['path_m']:.1f} m from {tuple(facts['start'])} to {tuple(facts['goal'])}"
+    facts |= {"layout": chosen.name, "rows": list(chosen.rows), "picture": str(out)}
+    answer(as_json, facts, *chosen.rows, path)

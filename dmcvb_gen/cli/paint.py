@@ -1,30 +1,19 @@
-"""paint."""
+"""paint, fetch."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import click
 
-from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
-from dmcvb_gen.cli.common import OutPath, json_option, print_json
-from dmcvb_gen.cli.release import episodes_option, frames_bar, only_option, workers_option
-from dmcvb_gen.cli.render_options import override_options, overrides_of, painted_facts, show_painted, tell
+from dmcvb_gen import commands
+from dmcvb_gen.cli.common import answer, moved_files
+from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.text import pluralize
 
 
-@click.command()
-@click.argument("path", type=OutPath())
-@only_option
-@episodes_option
-@override_options
-@workers_option
-@executor_option
-@ray_option
-@click.option("--device", default="cpu", show_default=True, help="Device that renders: cpu, or cuda with warp.")
-@click.option("--backgrounds", metavar="FOLDER", help="Folder of the background videos, if the release has no copies.")
-@json_option
-@click.pass_context
-def paint(
-    context, path, only, episodes, size, views, goal, workers, executor, ray_address, device, backgrounds, as_json
-):
+@command_of(commands.paint)
+def paint(release, as_json, **options):
     """Fill in the pictures of a release that travelled without, and compare them with their known digests.
 
     What is painted already stays; run again, it goes on. With --size, --views or --goal it becomes another release,
@@ -35,16 +24,70 @@ def paint(
     dmcvb-gen rollout walker-walk --level expert --episodes 20 --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
-    from dmcvb_gen.generate.paint import RenderConfig, paint_release
-    from dmcvb_gen.generate.request import background_source
+    done = commands.paint(release, notify=_tell, **options)
+    facts = {"out": release} | _painted_facts(done)
+    answer(as_json, facts, *_painted(release, done), code=1 if done.differing else 0)
 
-    videos = background_source(backgrounds) if backgrounds else None
-    executor = make_executor(workers, executor, ray_address)
-    with frames_bar(as_json) as bar:
-        painter = RenderConfig(overrides_of(size, views, goal), executor, device, videos, bar, tell)
-        done = paint_release(path, only, episodes, painter)
-    if as_json:
-        print_json({"out": path} | painted_facts(done))
-    else:
-        show_painted(path, done)
-    context.exit(1 if done.differing else 0)
+
+@command_of(commands.fetch)
+def fetch(as_json, **options):
+    """Download a published release, or a part of it. Rerun the command to resume or to add more.
+
+    With --paint, images are rendered during the download; the exit code is 1 if they differ from the published ones.
+
+    \b
+    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
+    dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
+    """
+    moved, done = commands.download(options, notify=_tell)
+    out, episodes = options["out"], options["episodes"]
+    facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
+    lines = [f"{out}: {moved_files(moved)}", *(_whole_shards(out, episodes) if episodes else ())]
+    lines += _painted(out, done) if done else ()
+    answer(as_json, facts, *lines, code=1 if done and done.differing else 0)
+
+
+def _whole_shards(out, episodes):
+    """A line if shards brought more episodes than were asked for."""
+    from dmcvb_gen.dataset import open_release
+
+    here = {name: len(subset.episodes) for name, subset in open_release(out).subsets.items()}
+    name = max(here, key=here.get, default=None)
+    if name and here[name] > (asked := episodes[1] - episodes[0]):
+        yield f"Shards come whole: {name} has {here[name]} episodes here, and {asked} were asked for."
+
+
+def _tell(text):
+    """Say beside the output what is other here than where the release was made."""
+    click.echo(f"note: {text}", err=True)
+
+
+def _painted_facts(done):
+    """What painting gave, for programs."""
+    return dict(
+        shards=done.shards,
+        known=done.known,
+        differing=list(done.differing),
+        drift=list(done.drift),
+        complete=done.manifest.complete,
+        digest=done.manifest.digest,
+    )
+
+
+def _painted(place, done):
+    """What painting gave, in lines."""
+    painted = f"{pluralize(done.shards, 'shards')} painted; {_compared(done)}."
+    yield f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}"
+    yield from (f"  differs: {name}" for name in done.differing[:10])
+    if done.differing:
+        yield (
+            "  what differs here is noted above" if done.drift else "  versions and processor are those of the release"
+        )
+
+
+def _compared(done) -> str:
+    if not done.known:
+        return "no digests of these pictures were known"
+    if done.differing:
+        return f"{len(done.differing)} of {done.known} differ from the known digests"
+    return f"equal to the known digests ({done.known} of {done.shards})"

@@ -1,47 +1,36 @@
-"""rollout, info, preview, list."""
+"""rollout."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import os
 import shlex
-import textwrap
-from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.cluster import executor_option, make_executor, parse_bytes, parse_part, ray_option, slurm_script
+from dmcvb_gen import commands
 from dmcvb_gen.cli.common import (
-    GroupedCommand,
-    OutPath,
-    ProgressBar,
+    answer,
     format_bytes,
     format_duration,
-    json_option,
     print_json,
     print_table,
-    remote_option,
 )
-from dmcvb_gen.cli.unused_options import check_exclusive_options, given_options, is_given
-from dmcvb_gen.spec import (
-    DIFFICULTIES,
-    REWARDS,
-    SPLITS,
-)
-from dmcvb_gen.storage.remote import is_url, public
+from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.cli.slurm import script_for_slurm
+from dmcvb_gen.cli.unused_options import check_exclusive_options
+from dmcvb_gen.progress import ProgressBar
+from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import pluralize
-
-
-def _out_default(name: str) -> str:
-    return str(Path("releases") / name)
-
 
 OPTION_GROUPS = {
     "What": ("recipe", "only", "levels", "behaviour", "sample", "independent", "seed"),
     "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count", "correlated"),
     "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
-    "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "no_pixels"),
-    "Where": ("out", "options", "scratch", "scratch_size"),
+    "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "pixels"),
+    "Where": ("out", "storage_options", "scratch", "scratch_size"),
     "Workers and many machines": (
         *("workers", "executor", "ray_address", "init", "part", "finishing", "other_versions", "slurm_script"),
     ),
@@ -49,118 +38,14 @@ OPTION_GROUPS = {
 """Heading -> options of `rollout --help`."""
 
 
-@click.command(cls=GroupedCommand, option_groups=OPTION_GROUPS)
-@click.argument("tasks", nargs=-1, metavar="[TASK]...")
-@click.option("--recipe", metavar="FILE|NAME", help="Recipe: a YAML file or the name of a shipped one.")
-@click.option(
-    "--only", multiple=True, metavar="PATTERN", help="Roll out only these subsets, e.g. 'walker-walk/*/static'."
-)
-@click.option("--level", "levels", multiple=True, help="expert, medium, mixed, random. Repeatable.  [default: random]")
-@click.option(
-    "--distractor",
-    "distractors",
-    multiple=True,
-    help="none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. Repeatable.  [default: none]",
-)
-@click.option(
-    "--difficulty",
-    type=click.Choice(DIFFICULTIES),
-    default="medium",
-    show_default=True,
-    help="Strength of the distractors.",
-)
-@click.option(
-    "--intensity",
-    type=click.FloatRange(0, 1, min_open=True),
-    help="Scale of the distractors instead of a difficulty: easy is 0.1, medium 0.2, hard 0.3.",
-)
-@click.option(
-    "--vary",
-    metavar="PART,...",
-    help="Vary only these parts: camera, color, background, shake.  [default: the first three]",
-)
-@click.option("--video-count", type=click.IntRange(1), help="Background videos in use.  [default: by the difficulty]")
-@click.option(
-    "--correlated",
-    type=click.FloatRange(0, 1, min_open=True),
-    metavar="RHO",
-    help="dynamic: also show a spurious cue that correlates with the last action.",
-)
-@click.option("--goal", "goals", multiple=True, help="Mazes: visible or hidden. Repeatable.  [default: visible]")
-@click.option("--fixed-goals", type=click.IntRange(1), help="Mazes: this many fixed (start, goal) pairs (B3).")
-@click.option(
-    "--episodes-per-goal",
-    type=click.IntRange(1),
-    default=10,
-    show_default=True,
-    help="Mazes: episodes of each fixed pair.",
-)
-@click.option("--layout", "layouts", multiple=True, help="Mazes: name or text file of a layout, instead of TASK.")
-@click.option(
-    "--reward", type=click.Choice(REWARDS), help="Mazes: DMC-VB's distance to the goal, or the shortest path."
-)
-@click.option("--episodes", type=click.IntRange(1), help="Episodes per subset.  [default: 20]")
-@click.option("--steps", type=click.IntRange(1), help="Steps per subset, instead of --episodes.")
-@click.option("--max-steps", type=click.IntRange(1), help="Longest episode, in steps.  [default: 500, mazes 600]")
-@click.option("--range", "episode_range", metavar="A:B", help="Generate only the shards with episodes A to B - 1.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed of the release.")
-@click.option("--size", type=int, default=64, show_default=True, help="Width and height of the images, in pixels.")
-@click.option(
-    "--renderer", default="native", help="native, warp or opengl.  [default: native; with --device cuda: warp]"
-)
-@click.option(
-    "--samples",
-    type=click.IntRange(1, 8),
-    help="Samples per pixel: 1, 2, 4 or 8; native has 4.  [default: warp 2, others 4]",
-)
-@click.option("--device", default="cpu", show_default=True, help="Device that renders: cpu, or cuda with warp.")
-@click.option("--backgrounds", default="builtin", show_default=True, help="Background videos: builtin, or a folder.")
-@click.option(
-    "--split", type=click.Choice(SPLITS), default="train", help="Background videos and maze styles: train or val."
-)
-@click.option(
-    "--behaviour",
-    metavar="FILE|RUN|MODULE:FUNCTION",
-    help="Policy instead of the bundled one: a policy file, a training run, an SB3 zip, a torch state dict (.pt), or a "
-    "function of your own.",
-)
-@click.option("--sample", is_flag=True, help="Sample actions instead of using the policy mean.")
-@click.option("--no-pixels", is_flag=True, help="Store no images; `paint` renders them later.")
-@click.option("--independent", is_flag=True, help="Simulate separate episodes for each distractor.")
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Worker processes.")
-@executor_option
-@ray_option
-@click.option("--episodes-per-shard", type=click.IntRange(1), help="Episodes per shard.  [default: 50, mazes 10]")
-@click.option("--out", help="Folder or URL (s3://bucket/name, gs://, ...).  [default: releases/NAME]")
-@remote_option
-@click.option(
-    "--scratch", type=OutPath(), help="With a URL: local folder for unfinished shards.  [default: the system's]"
-)
-@click.option(
-    "--scratch-size",
-    metavar="BYTES",
-    callback=parse_bytes,
-    help="Maximum scratch space, e.g. 20GB.  [default: half of what is free]",
-)
+@command_of(commands.rollout, groups=OPTION_GROUPS)
 @click.option("--init", is_flag=True, help="Create the release without generating any episodes.")
-@click.option(
-    "--part", metavar="K/N", callback=parse_part, help="Run only part K of N: every N-th job, starting with the K-th."
-)
 @click.option("--finish", "finishing", is_flag=True, help="Finish the release: write its digests. Generates nothing.")
-@click.option("--other-versions", is_flag=True, help="Resume even if package versions have changed.")
 @click.option(
     "--slurm-script", type=click.IntRange(1), metavar="N", help="Print a Slurm script for an array of N tasks."
 )
-@click.option(
-    "--dry-run",
-    is_flag=True,
-    help="Show jobs, steps, bytes and time for --workers, and write nothing.",
-)
-@json_option
-@click.pass_context
-def rollout(
-    context, only, episode_range, out, workers, device, init, part, finishing, dry_run, no_pixels, as_json, **options
-):
+@click.option("--dry-run", is_flag=True, help="Show jobs, steps, bytes and time for --workers, and write nothing.")
+def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options):
     """Roll out behaviour policies into a release of episodes.
 
     Rerun the same command to resume: finished shards are kept. With --recipe, the options TASK, --level, --distractor
@@ -175,40 +60,45 @@ def rollout(
         --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
-    from dmcvb_gen.generate.estimate import raw_bytes
-    from dmcvb_gen.generate.plan import describe, finish_target, make_plan, prepare
-    from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
-    from dmcvb_gen.generate.target import Target
+    from dmcvb_gen.generate.plan import describe, finish_target
+    from dmcvb_gen.generate.rollout import prepare_rollout, request_of, rollout_plan, target_for
 
-    check_exclusive_options(context)
-    executor = make_executor(workers, options["executor"], options["ray_address"])
-    given = {name: context.params[name] for name in RECIPE_OPTIONS & given_options(context)}
-    if "vary" in given:
-        given["vary"] = [part.strip() for part in given["vary"].split(",")]
-    resuming = bool(out) and not (options["tasks"] or options["layouts"] or options["recipe"] or given)
-    chosen = None if resuming else make_request(options["tasks"], options["recipe"], device=device, **given)
-    if options["slurm_script"]:
-        if chosen:
-            describe(chosen, pixels=not no_pixels)  # or says why each task would be refused; this one needs no GPU
-        return click.echo(slurm_script(context, options["slurm_script"], workers), nl=False)
-    scratch = (options["scratch"], options["scratch_size"])
-    target = Target.at(out or _out_default(chosen.name), options["options"], *scratch, workers)
+    check_exclusive_options(click.get_current_context())
+    request, workers = request_of(options), options["workers"]
+    if slurm_script:
+        if request:
+            describe(request, pixels=options["pixels"])  # or says why each task would be refused; this needs no GPU
+        return click.echo(script_for_slurm(slurm_script, workers), nl=False)
+    target = target_for(options, request)
     if finishing:
         return _finish(target, finish_target, as_json)
-    where = device if chosen or is_given(context, "device") else None  # else where it was begun
-    plan = make_plan(chosen, target, only, where, parse_range(episode_range), part or (1, 1), not no_pixels)
-    if device != "cpu" and chosen and not options["recipe"] and "renderer" not in given:
-        click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
-    if chosen:
-        _tell_own_videos(chosen.backgrounds, chosen.split)
+    plan = rollout_plan(options, request, target)
+    if request:
+        _tell_what_is_asked(request, options)
     if dry_run:
-        return _show_plan(plan, _measured(plan, workers, as_json), workers, as_json)
-    shared = init or bool(part)
+        return _show_plan(plan, workers, as_json)
+    shared = init or bool(options["part"])
     _tell_what_is_there(plan, shared)
-    plan = prepare(plan, 0 if init or target.uploads else raw_bytes(plan), options["other_versions"], shared)
+    plan = prepare_rollout(plan, options, init)
     if init:
         return _tell_begun(plan, as_json)
-    _run(plan, executor, as_json, whole=not part)
+    _run(plan, workers, as_json, whole=not options["part"])
+
+
+def _tell_what_is_asked(request, options):
+    """Notes on another renderer than the usual one, and on the use of one's own videos."""
+    from dmcvb_gen.distractors.backgrounds import videos_by_split
+
+    device, source, split = options["device"] or "cpu", request.backgrounds, request.split
+    if device != "cpu" and not options["recipe"] and not options["renderer"]:
+        click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
+    if source != "builtin" and (counts := videos_by_split(source)):
+        other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
+        click.echo(
+            f"{counts[split]} of {sum(counts.values())} videos in {source} are used; the others are kept for {other}. "
+            "To choose them yourself, put them into folders named train and val.",
+            err=True,
+        )
 
 
 def _tell_what_is_there(plan, shared):
@@ -220,43 +110,26 @@ def _tell_what_is_there(plan, shared):
         click.echo(f"{plan.target.place} is a release already; this adds {added}.", err=True)
     if not shared and (others := rollouts_at_work(plan.target)):
         click.echo(
-            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. "
-            "To share the work, stop one and give --part 1/2 and --part 2/2.",
-            err=True,
-        )
-
-
-def _tell_own_videos(source, split):
-    from dmcvb_gen.distractors.backgrounds import videos_by_split
-
-    if source != "builtin" and (counts := videos_by_split(source)):
-        other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
-        click.echo(
-            f"{counts[split]} of {sum(counts.values())} videos in {source} are used; the others are kept for {other}. "
-            "To choose them yourself, put them into folders named train and val.",
+            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. To "
+            "share the work, stop one and give --part 1/2 and --part 2/2.",
             err=True,
         )
 
 
 def _tell_begun(plan, as_json):
-    if as_json:
-        return print_json({"out": plan.target.place, "jobs": len(plan.jobs), "already_done": plan.done})
-    click.echo(
-        f"{plan.target.place}: begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N"
-    )
+    begun = f"begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N"
+    facts = {"out": plan.target.place, "jobs": len(plan.jobs), "already_done": plan.done}
+    answer(as_json, facts, f"{plan.target.place}: {begun}")
 
 
 def _finish(target, finish_target, as_json):
     manifest = finish_target(target)
     missing = [subset.name for subset in manifest.subsets if subset.digest is None]
-    if as_json:
-        print_json({"out": target.place, "complete": manifest.complete, "incomplete": missing})
-    elif missing:
-        lacking = pluralize(len(missing), "subsets")
-        click.echo(f"{target.place}: not complete; shards are missing in {lacking}, e.g. {missing[0]}")
-    else:
-        click.echo(f"{target.place}: complete")
-    click.get_current_context().exit(0 if manifest.complete else 1)
+    state = "complete"
+    if missing:
+        state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
+    facts = {"out": target.place, "complete": manifest.complete, "incomplete": missing}
+    answer(as_json, facts, f"{target.place}: {state}", code=0 if manifest.complete else 1)
 
 
 def _run(plan, workers, as_json, whole=True):
@@ -269,55 +142,22 @@ def _run(plan, workers, as_json, whole=True):
         finished += sum(commit.episode_count for commit in result.commits)
         bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
 
-    with _interruption_message(), _progress(plan, as_json) as bar:
+    with _interruption_message(), commands.progress_bar(not as_json, " frames", plan.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     manifest, steps, place = made.manifest, made.steps, plan.target.place
-    if as_json:
-        print_json(
-            dict(
-                out=place,
-                complete=manifest.complete,
-                steps=steps,
-                seconds=round(made.seconds, 2),
-                seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()},
-                already_done=plan.done,
-                digests={subset.name: subset.digest for subset in manifest.subsets},
-            )
-        )
-        return
+    facts = dict(out=place, complete=manifest.complete, steps=steps, seconds=round(made.seconds, 2))
+    facts |= dict(seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()})
+    facts |= dict(already_done=plan.done, digests={subset.name: subset.digest for subset in manifest.subsets})
     state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
     if not whole:
         state = "finished with --finish when all parts are there"
     kept = f", {pluralize(plan.done, 'shards')} there already" if plan.done else ""
     rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
-    click.echo(f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}.")
+    done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}."
     named = shlex.quote(str(place))
     painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
-    click.echo(f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else ""))
-
-
-def parse_range(text: str | None) -> tuple[int, int] | None:
-    """ "100:150" -> (100, 150).
-
-    Raises:
-      click.UsageError: not two numbers, or an empty range.
-    """
-    if text is None:
-        return None
-    first, colon, last = text.partition(":")
-    if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
-        raise click.UsageError(f"--range {text!r} is not A:B with A < B, e.g. 100:150")
-    return int(first), int(last)
-
-
-def _progress(plan, as_json):
-    return ProgressBar(
-        as_json,
-        unit=" frames",
-        unit_scale=True,
-        desc=plan.manifest.name,
-        smoothing=0.1,
-    )
+    look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else "")
+    answer(as_json, facts, done, look)
 
 
 @contextlib.contextmanager
@@ -329,56 +169,25 @@ def _interruption_message():
         raise
 
 
-def _measured(plan, workers, as_json):
+def _show_plan(plan, workers, as_json):
     from dmcvb_gen.generate.estimate import estimate, measurements
 
-    with ProgressBar(as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
-        return estimate(plan, workers, bar.update)
-
-
-def _show_plan(plan, cost, workers, as_json):
-    import os
-
-    cores = os.cpu_count() or 1
+    cores, workers = os.cpu_count() or 1, workers if isinstance(workers, int) else 1
+    with ProgressBar(not as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
+        cost = estimate(plan, workers, bar.update)
     if as_json:
-        rates = {
-            name: dict(
-                steps_per_second=1 / rate.seconds_per_step,
-                bytes_per_step=rate.bytes_per_step,
-                steps_per_episode=rate.steps_per_episode,
-            )
-            for name, rate in cost.rates.items()
-        }
-        print_json(
-            dict(
-                jobs=cost.jobs,
-                shards_done=cost.done,
-                subsets=len(plan.manifest.subsets),
-                episodes=cost.episodes,
-                steps=cost.steps,
-                bytes=round(cost.bytes),
-                core_hours=cost.core_seconds / 3600,
-                hours=cost.seconds(workers) / 3600,
-                workers=workers,
-                rates=rates,
-            )
-        )
-        return
-    rows: dict[str, list[float]] = {}
-    for job in plan.jobs:
-        for record in job.subsets:
-            rate = cost.rates[record.name]
-            steps = len(job.episodes) * rate.steps_per_episode
-            row = rows.setdefault(record.name, [0, 0.0, 0.0, 0.0])
-            row[0] += len(job.episodes)
-            row[1] += steps
-            row[2] += steps * rate.bytes_per_step
-            row[3] += steps * rate.seconds_per_step / 3600
+        facts = dict(jobs=cost.jobs, shards_done=cost.done, subsets=len(plan.manifest.subsets), episodes=cost.episodes)
+        facts |= dict(steps=cost.steps, bytes=round(cost.bytes), core_hours=cost.core_seconds / 3600)
+        facts |= dict(hours=cost.seconds(workers) / 3600, workers=workers)
+        rates = {name: dataclasses.asdict(rate) for name, rate in cost.rates.items()}
+        for rate in rates.values():
+            rate["steps_per_second"] = 1 / rate.pop("seconds_per_step")
+        return print_json(facts | {"rates": rates})
     print_table(
         ("subset", "episodes", "steps", "bytes", "core-hours"),
         [
-            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{hours:.2f}")
-            for name, (episodes, steps, size, hours) in rows.items()
+            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{seconds / 3600:.2f}")
+            for name, (episodes, steps, size, seconds) in cost.of_subsets(plan).items()
         ],
         title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
     )
@@ -391,139 +200,4 @@ def _show_plan(plan, cost, workers, as_json):
     click.echo(
         f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
         f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64"
-    )
-
-
-@click.command()
-@click.argument("path", metavar="RELEASE|URL")
-@remote_option
-@json_option
-def info(path, options, as_json):
-    """Show the subsets, episodes, bytes and returns of a release beside the paper's.
-
-    \b
-    dmcvb-gen info releases/demo
-    """
-    from dmcvb_gen.generate.info import describe_release
-
-    facts = describe_release(path, options)
-    if as_json:
-        return print_json(facts)
-    statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
-    rows = []
-    for subset in facts["subsets"]:
-        planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
-        mark = " *" if subset["paper"] and subset["shorter"] else ""
-        rows.append(
-            (
-                subset["name"] + mark,
-                f"{subset['episodes']:,}{planned}",
-                f"{subset['steps']:,}",
-                format_bytes(subset["bytes"]),
-                f"{subset['bytes_per_step']:,.0f}",
-                *(f"{subset['returns'][key]:.1f}" for key in statistics),
-            )
-        )
-        if paper := subset["paper"]:
-            numbers = (f"{paper[key]:.1f}" for key in statistics)
-            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers))
-    print_table(
-        ("subset", "episodes", "steps", "size", "B/step", *statistics),
-        rows,
-        title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
-        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
-    )
-    click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
-    if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
-        click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
-    if facts["digest"]:
-        click.echo(f"digest {facts['digest']}")
-
-
-@click.command()
-@click.argument("path")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Show only these subsets.")
-@click.option("--out", type=OutPath(path_type=Path), help="Output folder.  [default: PATH/preview]")
-@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes per subset.")
-@click.option("--scale", type=click.IntRange(1, 8), help="Enlarge the images.  [default: 2; videos of 512 pixels]")
-@click.option(
-    "--frames", type=click.IntRange(1), default=200, show_default=True, help="Frames of the video, at 20 per second."
-)
-@click.option("--episode", type=click.IntRange(0), help="Episode of the video.  [default: the first of each subset]")
-@click.option(
-    "--video",
-    type=click.Choice(["mp4", "webp", "gif"]),
-    help="Format of the video.  [default: mp4, or webp without imageio-ffmpeg]",
-)
-@json_option
-def preview(path, only, out, as_json, **options):
-    """Write a contact sheet (PNG) and a video of a release.
-
-    \b
-    dmcvb-gen preview releases/demo
-    """
-    from dmcvb_gen.generate.preview import write_preview
-
-    files = write_preview(path, out, only=only, **options)
-    if as_json:
-        return print_json([str(file) for file in files])
-    for file in files:
-        click.echo(file)
-
-
-@click.command("list")
-@click.option("--remote", metavar="URL", help="List the releases at a URL instead.")
-@remote_option
-@json_option
-def list_command(remote, options, as_json):
-    """List tasks, levels, distractors, bundled policies, recipes and the renderers that work here."""
-    from dmcvb_gen.generate.info import describe_package
-
-    if remote:
-        return _list_remote(remote, options, as_json)
-    facts = describe_package()
-    if as_json:
-        return print_json(facts)
-    print_table(
-        ("task", "state", "action", "steps", "<views", "<bundled behaviours"),
-        [
-            (
-                task["id"],
-                str(task["state"]),
-                str(task["action"]),
-                str(task["max_steps"]),
-                ", ".join(task["views"]),
-                ", ".join(task["behaviours"]) or "-",
-            )
-            for task in facts["tasks"]
-        ],
-        title="tasks",
-        optional=(("views",),),
-    )
-    for heading, names in (
-        ("tasks of dm_control's suite", facts["suite_tasks"]),
-        ("levels", facts["levels"]),
-        ("distractors", facts["distractors"]),
-        ("difficulties", [*facts["difficulties"], "or a scale up to 1 (dynamic_0.35)"]),
-        ("maze goals", facts["maze_settings"]),
-        ("recipes", facts["recipes"]),
-        ("manifests", facts["manifests"]),
-    ):
-        click.echo(textwrap.fill(f"{heading}: {', '.join(names)}", 80, break_on_hyphens=False))
-    for name, reason in facts["renderers"].items():
-        click.echo(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
-
-
-def _list_remote(url, options, as_json) -> None:
-    from dmcvb_gen.dataset.catalog import releases_at
-
-    found = releases_at(url, options)
-    if as_json:
-        return print_json(found)
-    shown = ("url", "name", "version", "subsets", "episodes", "complete")
-    print_table(
-        ("release", "<name", "<version", "subsets", "episodes", "complete", "<digest"),
-        [(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12]) for facts in found],
-        title=public(url),
-        optional=(("subsets",), ("name",)),
     )

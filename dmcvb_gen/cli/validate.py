@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.cluster import executor_option, make_executor, ray_option
-from dmcvb_gen.cli.common import OutPath, ProgressBar, json_option, print_json
-from dmcvb_gen.cli.unused_options import given_options, refuse
+from dmcvb_gen import commands
+from dmcvb_gen.cli.common import answer, json_option, print_json
+from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.cli.unused_options import refuse
+from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
 TRAINING = (
@@ -20,44 +23,10 @@ TRAINING = (
 """Options of `validate` that say what is trained, and how."""
 
 
-@click.command()
-@click.argument("path")
-@click.option("--profile", default="smoke", show_default=True, help="Budget: smoke (no scores), brief, quick or paper.")
-@click.option("--scale", type=click.FloatRange(0, min_open=True), default=1.0, help="Multiply the profile's steps.")
-@click.option("--benchmark", "benchmarks", multiple=True, help="b1, b2, b3, ablations. Repeatable.  [default: b1]")
-@click.option("--agents", default="", metavar="A,B", help="Agents to train, e.g. bc,state-bc,id+bc.  [default: all]")
+@command_of(commands.validate)
 @click.option("--agent", "own", multiple=True, metavar="MODULE:NAME", help="Also score your own agent. Repeatable.")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Use only these subsets, e.g. 'walker-walk/expert/*'.")
-@click.option(
-    "--out", type=OutPath(path_type=Path, file_okay=False), help="Folder of the report.  [default: reports/NAME]"
-)
-@click.option("--checks-only", is_flag=True, help="Check the structure and train nothing.")
 @click.option("--strict", is_flag=True, help="Exit with 1 on warnings (data unlike the paper's).")
-@click.option("--train-unsound", is_flag=True, help="Run the benchmarks even if a check fails.")
-@click.option("--workers", type=click.IntRange(1), help="Cells side by side.  [default: 2, on one core 1]")
-@executor_option
-@ray_option
-@click.option("--threads", type=click.IntRange(1), help="Threads of each worker.  [default: cores / workers]")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True)
-@click.option(
-    "--precision",
-    type=click.Choice(["auto", "float32", "bfloat16"]),
-    default="auto",
-    show_default=True,
-    help="Precision of networks that see images; auto times both.",
-)
-@click.option("--compile", is_flag=True, help="Compile the losses with torch.compile (for CUDA and long runs).")
-@click.option(
-    "--memory", type=click.FloatRange(0), metavar="GB", help="Memory of all workers; ray: of each.  [default: half]"
-)
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
-@click.option("--dino-weights", type=click.Path(path_type=Path), help="Safetensors file with the weights of dino+bc.")
-@click.option("--backgrounds", metavar="FOLDER", help="Folder of the background videos, if it has moved.")
-@json_option
-@click.pass_context
-def validate(
-    context, path, out, profile, scale, benchmarks, agents, own, only, checks_only, strict, as_json, **options
-):
+def validate(own, strict, as_json, **options):
     """Check a release and run the paper's benchmarks on it, scores set beside the paper's.
 
     Exit code 0 when sound and complete, 1 when a check or a cell fails or episodes are missing, 2 on bad usage. The
@@ -67,44 +36,20 @@ def validate(
     dmcvb-gen validate releases/mini --profile smoke
     dmcvb-gen validate releases/mini --profile quick --benchmark b1 --agents bc,state-bc,id+bc --out reports/mini
     """
-    from dmcvb_gen.benchmarks.run import default_workers
-    from dmcvb_gen.benchmarks.validate import Progress, make_setup
-    from dmcvb_gen.benchmarks.validate import validate as run
-
-    if checks_only:
-        refuse(context, given_options(context), TRAINING, "--checks-only trains nothing")
-    workers = options.pop("workers") or default_workers(options["device"])
-    executor = make_executor(workers, options.pop("executor"), options.pop("ray_address"))
-    train_unsound = options.pop("train_unsound")
-    given = dict(out=out, profile=profile, scale=scale, workers=executor, training=not checks_only, **options)
-    setup = make_setup(path, **given)
-    if options["precision"] == "auto" and not checks_only:
+    context = click.get_current_context()
+    if options["checks_only"]:
+        refuse(context, TRAINING, "--checks-only trains nothing")
+    options["agents"] = _agents(options["agents"], own)
+    setup = commands.validation_setup(options)
+    if options["precision"] == "auto" and not options["checks_only"]:
         click.echo(f"Networks that see images compute in {setup.precision}, the faster one here.", err=True)
-    with ProgressBar(as_json, unit=" checks", desc="structure") as bar:
-        progress = Progress(
-            checking=bar,
-            total=lambda steps: (setattr(bar, "unit", " steps"), bar.reset(steps)),
-            training=lambda what, steps: (bar.set_description(what, refresh=False), bar.update(steps)),
-            done=lambda cell, facts: None if as_json else _show_score(cell, facts, setup.profile),
-        )
-        result = run(
-            path,
-            setup,
-            benchmarks=() if checks_only else benchmarks or ("b1",),
-            agents=_agents(agents, own),
-            patterns=only,
-            workers=executor,
-            train_unsound=train_unsound,
-            progress=progress,
-        )
-    if as_json:
-        print_json(json.loads(result.facts.read_text()))
-    else:
-        _show(result, setup.profile)
-    context.exit(0 if result.sound and result.complete and not (strict and result.warnings) else 1)
+    on_score = (lambda *_: None) if as_json else functools.partial(_show_score, setup.profile)
+    result = commands.run_validation(setup, options, on_score)
+    code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1
+    answer(as_json, json.loads(result.facts.read_text()), *_validated(result, setup.profile), code=code)
 
 
-def _show_score(cell, facts, profile) -> None:
+def _show_score(profile, cell, facts) -> None:
     """A cell's score, as soon as it is there."""
     from dmcvb_gen.spec import task_folder
 
@@ -121,34 +66,27 @@ def _show_score(cell, facts, profile) -> None:
         click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
 
 
-def split_agents(text: str) -> list[str]:
-    """ "bc,id+bc:k=10,sample" -> ["bc", "id+bc:k=10,sample"]: commas stand between agents and in their options."""
-    return [name for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip()]
-
-
-def _agents(names: str, own: tuple[str, ...]) -> list[str]:
+def _agents(names: tuple[str, ...] | None, own: tuple[str, ...]) -> list[str]:
     """The agents asked for; one's own alone are set beside BC from states."""
     from dmcvb_gen.agents.catalog import OWN
 
     for name in own:
         if not OWN.fullmatch(name):
             raise click.UsageError(f"--agent {name} is not MODULE:NAME; the paper's agents are chosen with --agents.")
-    return [*(split_agents(names) or (["state-bc"] if own else [])), *own]
+    return [*(names or (["state-bc"] if own else [])), *own]
 
 
-def _show(result, profile) -> None:
-    for finding in result.structure.findings[:50]:
-        click.echo(f"FAIL {finding}")
-    for cell, error in result.failed:
-        click.echo(f"FAIL {cell.id}: {error}")
-    for finding in result.warnings:
-        click.echo(f"warning: {finding}")
+def _validated(result, profile) -> Iterator[str]:
+    """What validate found, in lines."""
+    yield from (f"FAIL {finding}" for finding in result.structure.findings[:50])
+    yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
+    yield from (f"warning: {finding}" for finding in result.warnings)
     for entry in result.missing:
         if entry.subsets:
             names = ", ".join(entry.subsets)
-            click.echo(f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}")
+            yield f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}"
         if entry.left_out:
-            click.echo(f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}")
+            yield f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}"
     checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
     verdict = ["sound" if result.sound else pluralize(found, "findings")]
@@ -159,8 +97,8 @@ def _show(result, profile) -> None:
             "what is there is sound" if result.sound else verdict[0],
         ]
     note = f"; {profile.note}" if result.results else ""
-    click.echo(f"{'; '.join(verdict)} ({checked}){note}")
-    click.echo(f"Report: {result.report}")
+    yield f"{'; '.join(verdict)} ({checked}){note}"
+    yield f"Report: {result.report}"
 
 
 @click.command()
@@ -199,8 +137,8 @@ def claims(reports, as_json):
         found = [answer for answer in answers if answer.claim == name]
         if found:
             click.echo(f"\n{words}")
-        for answer in found:
-            click.echo(f"  {answer.answer:>4}  {answer.where}: {answer.numbers}")
+        for one in found:
+            click.echo(f"  {one.answer:>4}  {one.where}: {one.numbers}")
     if ranks:
         click.echo("\nAre scores ranked as in the paper? Spearman's rho [95 % interval]")
     for one in ranks:

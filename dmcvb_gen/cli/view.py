@@ -9,7 +9,8 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, ProgressBar, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import OutPath, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
 HOST = "127.0.0.1"
@@ -40,7 +41,7 @@ def view(path, only, episodes, size, max_mb, open_it, serve, port, out, options,
     from dmcvb_gen.release.viewer import view as write
 
     given = dict(only=only, episodes=episodes, size=size, max_bytes=int(max_mb * 1e6), storage_options=options)
-    with ProgressBar(as_json, unit=" episodes") as bar:
+    with ProgressBar(not as_json, unit=" episodes") as bar:
         written = write(path, out, **given, progress=bar)
     if as_json:
         print_json(vars(written))

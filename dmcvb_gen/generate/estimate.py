@@ -70,6 +70,17 @@ class Estimate:
     def seconds(self, workers: int) -> float:
         return self.core_seconds / max(min(workers, self.jobs), 1)  # a job is one worker's
 
+    def of_subsets(self, plan: Plan) -> dict[str, tuple[int, float, float, float]]:
+        """Subset -> episodes, steps, bytes and core-seconds that its jobs come to."""
+        episodes: Counter[str] = Counter()
+        for job in plan.jobs:
+            episodes.update({record.name: len(job.episodes) for record in job.subsets})
+        steps = {name: count * self.rates[name].steps_per_episode for name, count in episodes.items()}
+        return {
+            name: (episodes[name], n, n * self.rates[name].bytes_per_step, n * self.rates[name].seconds_per_step)
+            for name, n in steps.items()
+        }
+
 
 @dataclass(frozen=True)
 class _Piece:

@@ -63,14 +63,14 @@ def run_arriving(
 
     Args:
       arriving: items to do, an exception to raise, or None at the end.
-      job_of: the job of an item, None if noitem is left to do for it.
+      job_of: the job of an item, None if nothing is left to do for it.
     """
     ended, running = False, 0
     results: Iterator[tuple[Job, JobResult]] = iter(())
     while not ended or running:
         while not ended:
             try:
-                item = arriving.get(block=not running)  # there is noitem else to wait for
+                item = arriving.get(block=not running)  # there is nothing else to wait for
             except queue.Empty:
                 break
             if isinstance(item, BaseException):
@@ -136,13 +136,13 @@ def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
     if needed * side_by_side <= free:
         return
     record = largest.subsets[0]
-    cure = "use fewer --workers or a machine with more memory" if side_by_side > 1 else "use a machine with more memory"
+    advice = "fewer --workers or a machine with more memory" if side_by_side > 1 else "a machine with more memory"
     if largest.stored is None:
-        cure = "use fewer --episodes-per-shard in a new release, or " + cure.removeprefix("use ")
+        advice = f"fewer --episodes-per-shard in a new release, or {advice}"
     raise StoreError(
         f"a shard of {record.name} ({len(largest.episodes)} episodes of {record.max_steps} steps, {record.size} pixels "
         f"a side) needs {needed / 1e9:.1f} GB of memory, {side_by_side} are made at once, and {free / 1e9:.1f} GB are "
-        f"free; {cure}"
+        f"free; use {advice}"
     )
 
 

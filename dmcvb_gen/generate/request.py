@@ -14,6 +14,7 @@ from dmcvb_gen.errors import RecipeError
 from dmcvb_gen.generate.recipe import Recipe, check_heard, load_recipe, narrow, override, single_recipe
 from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
 from dmcvb_gen.spec import DIFFICULTY_SCALES, FIXED, Distractor, MazeName, difficulty_of, is_maze, task_folder
+from dmcvb_gen.text import as_names
 
 EPISODES = 20
 """Episodes of a subset if nobody says how many."""
@@ -28,6 +29,7 @@ _NOT_WITH_RECIPE = {
     "correlated": "--correlated: ask for --distractor dynamic_camera-color-background-cue0.8",
     "video_count": "--video-count: ask for --distractor dynamic_camera-color-background4",
 }
+_SEVERAL = ("levels", "distractors", "goals", "layouts", "vary")
 _STRENGTHS = ("difficulty", "intensity", "vary", "video_count", "correlated")
 """Options that say how strong distractors are, and which of their parts vary."""
 RECIPE_OPTIONS = _OVERRIDES | set(_NOT_WITH_RECIPE)
@@ -50,6 +52,7 @@ def make_request(
     Raises:
       DmcvbError: an unknown name, a value that is wrong, or an option that would have no effect.
     """
+    given = {name: as_names(value) if name in _SEVERAL else value for name, value in given.items()}
     tasks = (*tasks, *(_layout_task(layout) for layout in given.get("layouts", ())))
     allow(tasks)  # a person typed these names, so their code may run
     if not tasks and not recipe:
@@ -95,9 +98,9 @@ def renderer_of(tasks: Sequence[str], device: str = "cpu") -> str:
 
 def _changed_recipe(recipe: Recipe, tasks: Sequence[str], given: Mapping[str, Any]) -> Recipe:
     """A recipe, narrowed and overridden by the options that were given beside it; none is ignored."""
-    for name, cure in _NOT_WITH_RECIPE.items():
+    for name, instead in _NOT_WITH_RECIPE.items():
         if name in given:
-            raise RecipeError(f"--recipe takes no {cure} instead")
+            raise RecipeError(f"--recipe takes no {instead} instead")
     settings = [Distractor.parse(name).name for name in given.get("distractors", ())] + list(given.get("goals", ()))
     if tasks or given.get("levels") or settings:
         recipe = narrow(recipe, tasks, given.get("levels", ()), settings)

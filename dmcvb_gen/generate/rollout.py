@@ -1,16 +1,26 @@
-"""Run a plan: its jobs by workers, then the digests."""
+"""A rollout, from the arguments of `dmcvb_gen.rollout` to its digests: request, target, plan, run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.generate.engine import JobResult
+from dmcvb_gen.generate.estimate import raw_bytes
 from dmcvb_gen.generate.executors import run_jobs
-from dmcvb_gen.generate.plan import Plan, finish
+from dmcvb_gen.generate.plan import Plan, finish, make_plan, prepare
+from dmcvb_gen.generate.recipe import Recipe
+from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
+from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.text import as_names
+
+Options = Mapping[str, Any]
+"""Arguments of `dmcvb_gen.rollout` by name; None, False or empty if they are not given."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +38,51 @@ class RolloutResult:
     steps: int
     seconds: float
     seconds_by_part: dict[str, float]
+
+
+def request_of(options: Options) -> Recipe | None:
+    """The recipe that the options ask for; None resumes the release at `out`.
+
+    Raises:
+      DmcvbError: an unknown name, a value that is wrong, or an option that would have no effect.
+    """
+    given = {name: value for name, value in options.items() if name in RECIPE_OPTIONS and _is_given(value)}
+    tasks, recipe = as_names(options["tasks"]), options["recipe"]
+    if options["out"] and not (tasks or recipe or given):
+        return None
+    return make_request(tasks, recipe, device=options["device"] or "cpu", **given)
+
+
+def _is_given(value: Any) -> bool:
+    return value is not None and value is not False and value not in ((), [])
+
+
+def target_for(options: Options, request: Recipe | None) -> Target:
+    """Where the release is made: at `out`, by default in a folder of its name."""
+    place = options["out"] or str(Path("releases") / request.name if request else "")
+    workers = options["workers"] if isinstance(options["workers"], int) else 1
+    return Target.at(place, options["storage_options"], options["scratch"], options["scratch_size"], workers)
+
+
+def rollout_plan(options: Options, request: Recipe | None, target: Target) -> Plan:
+    """The jobs of a rollout.
+
+    Raises:
+      DmcvbError: anything that would fail later, found before any work.
+    """
+    device = options["device"] or ("cpu" if request else None)  # else where it was begun
+    only, part = as_names(options["only"]), options["part"] or (1, 1)
+    return make_plan(request, target, only, device, options["episode_range"], part, options["pixels"])
+
+
+def prepare_rollout(plan: Plan, options: Options, begin: bool = False) -> Plan:
+    """Make a plan's release ready for its jobs; see `plan.prepare`.
+
+    Args:
+      begin: other machines make the shards, so this one needs no room for them.
+    """
+    room = 0 if begin or plan.target.uploads else raw_bytes(plan)
+    return prepare(plan, room, options["other_versions"], begin or bool(options["part"]))
 
 
 def run_plan(

@@ -31,7 +31,6 @@ from dmcvb_gen.parallel.base import (
     ignore,
     limit_threads,
 )
-from dmcvb_gen.parallel.processes import ProcessPool
 
 __all__ = [
     "IN_FLIGHT",
@@ -39,7 +38,6 @@ __all__ = [
     "Future",
     "Needs",
     "Pool",
-    "ProcessPool",
     "Ray",
     "SerialPool",
     "ProgressCallback",
@@ -68,7 +66,7 @@ def open_pool(
 
     Args:
       threads: of a worker process's libraries.
-      tick, kept: see `ProcessPool`.
+      tick, kept: see `processes.ProcessPool`.
       needs: of a piece of work, where it is placed on a cluster.
       most: how many pieces of work there will be at most; no more processes are of use.
 
@@ -80,7 +78,11 @@ def open_pool(
 
         return RayPool(workers.address, needs, tick, threads)
     workers = workers if most is None else min(workers, most)
-    return SerialPool(tick) if workers <= 1 else ProcessPool(workers, threads, tick, kept)
+    if workers <= 1:
+        return SerialPool(tick)
+    from dmcvb_gen.parallel.processes import ProcessPool
+
+    return ProcessPool(workers, threads, tick, kept)
 
 
 def run_all(
@@ -100,14 +102,8 @@ def run_all(
       StoreError: a worker was killed.
     """
     items = list(items)
-    if isinstance(workers, Pool):
-        opened: AbstractContextManager[Pool] = nullcontext(workers)
-    else:
-        opened = open_pool(workers, threads=threads, tick=tick, most=len(items))
-    with opened as pool:
-        for item in items:
-            pool.submit(item, function, item)
-        yield from pool.results()
+    for number, result in _run(function, items, workers, threads, tick):
+        yield items[number], result
 
 
 def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> list:
@@ -119,10 +115,16 @@ def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, t
     Raises:
       StoreError: a worker was killed.
     """
-    numbers = run_all(_numbered, [(number, function, item) for number, item in enumerate(items)], workers, tick=tick)
-    return [result for _, result in sorted((result for _, result in numbers), key=lambda pair: pair[0])]
+    return [result for _, result in sorted(_run(function, items, workers, 1, tick), key=lambda pair: pair[0])]
 
 
-def _numbered(item: tuple[int, Callable, Any], tick: ProgressCallback) -> tuple[int, Any]:
-    number, function, work = item
-    return number, function(work, tick=tick)
+def _run(function: Callable, items: Sequence, workers: Workers | Pool, threads: int, tick: ProgressCallback):
+    """(number of an item, result), as they come."""
+    if isinstance(workers, Pool):
+        opened: AbstractContextManager[Pool] = nullcontext(workers)
+    else:
+        opened = open_pool(workers, threads=threads, tick=tick, most=len(items))
+    with opened as pool:
+        for number, item in enumerate(items):
+            pool.submit(number, function, item)
+        yield from pool.results()

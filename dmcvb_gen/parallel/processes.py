@@ -11,7 +11,7 @@ import queue
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
@@ -36,12 +36,12 @@ class ProcessPool(Pool):
     def __init__(self, workers: int, threads: int = 1, tick: ProgressCallback = ignore, kept: str = KEPT):
         context = multiprocessing.get_context("spawn")
         self._workers, self._tick, self._kept = workers, tick, kept
-        self._ticks, self._late = context.Queue(), context.Queue()
-        queues = (self._ticks, self._late)
-        self._pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(*queues, threads))
+        self._messages = context.Queue()
+        self._pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(self._messages, threads))
         self._waiting: deque = deque()
         self._running: dict[concurrent.futures.Future, tuple[int, Any]] = {}
         self._on_their_way: dict[int, Any] = {}
+        self._arrived: dict[int, tuple[Any, BaseException | None]] = {}
         self._numbers = itertools.count()
 
     def submit(self, key, function, *arguments):
@@ -49,18 +49,21 @@ class ProcessPool(Pool):
 
     def results(self):
         try:
-            self._hand_out()
-            while self._running or self._on_their_way:
+            while self._waiting or self._running or self._on_their_way:
+                self._hand_out()
                 done, _ = wait(self._running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
-                self._pass_on()
+                self._listen(block=not self._running)
                 for future in done:
                     (number, key), result = self._running.pop(future), future.result()
                     if isinstance(result, _OnItsWay):
                         self._on_their_way[number] = key
                     else:
                         yield key, result
-                yield from self._arrived()
-                self._hand_out()
+                for number in self._on_their_way.keys() & self._arrived.keys():
+                    key, (result, error) = self._on_their_way.pop(number), self._arrived.pop(number)
+                    if error is not None:
+                        raise error
+                    yield key, result
         except BrokenProcessPool:
             raise StoreError(
                 f"a worker process was killed (out of memory?); {self._kept}, with fewer --workers than "
@@ -73,56 +76,43 @@ class ProcessPool(Pool):
             number = next(self._numbers)
             self._running[self._pool.submit(_work, number, function, arguments)] = (number, key)
 
-    def _arrived(self) -> Iterator[tuple[Any, Any]]:
-        while self._on_their_way:
-            try:
-                number, result, error = self._late.get(block=not self._running, timeout=POLL_SECONDS)
-            except queue.Empty:
-                self._check_alive()
-                return
-            if number not in self._on_their_way:  # faster than the word that it is on its way
-                self._late.put((number, result, error))
-                return
-            key = self._on_their_way.pop(number)
-            if error is not None:
-                raise error
-            yield key, result
-
-    def _check_alive(self) -> None:
-        if not self._running and any(not process.is_alive() for process in (self._pool._processes or {}).values()):
-            raise BrokenProcessPool
-
-    def _pass_on(self) -> None:
+    def _listen(self, block: bool = False) -> None:
+        """Pass on what the workers tell, and take the results that were on their way; `block` waits for one a while."""
         try:
             while True:
-                self._tick(*self._ticks.get_nowait())
+                number, *facts = self._messages.get(block, POLL_SECONDS)
+                block = False
+                if number is None:
+                    self._tick(*facts)
+                else:
+                    self._arrived[number] = (facts[0], facts[1])
         except queue.Empty:
-            pass
+            if block and any(not process.is_alive() for process in (self._pool._processes or {}).values()):
+                raise BrokenProcessPool from None
 
     def close(self, at_once=False):
         if at_once:
             for process in list((self._pool._processes or {}).values()):
                 process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
-        self._pass_on()
-        self._ticks.close()
-        self._late.close()
+        self._listen()
+        self._messages.close()
 
 
 # -- in a worker ----------------------------------------------------------------------------------
 
 
-_ticks: multiprocessing.Queue
-_late: multiprocessing.Queue
+_messages: multiprocessing.Queue
+"""To the parent: (None, *what a function tells) or (number, result, error) of a result that was on its way."""
 
 
 class _OnItsWay:
     """Stands for a `Future`, which stays in its worker."""
 
 
-def _start(ticks, late, threads: int) -> None:
-    global _ticks, _late
-    _ticks, _late = ticks, late
+def _start(messages: multiprocessing.Queue, threads: int) -> None:
+    global _messages
+    _messages = messages
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     limit_threads(threads)
@@ -139,7 +129,7 @@ def _end_with_parent() -> None:
 
 
 def _tell(*facts: Any) -> None:
-    _ticks.put(facts)
+    _messages.put((None, *facts))
 
 
 def _work(number: int, function: Callable, arguments: tuple) -> Any:
@@ -152,6 +142,6 @@ def _work(number: int, function: Callable, arguments: tuple) -> Any:
 
 def _wait(number: int, later: Future) -> None:
     try:
-        _late.put((number, later.wait(), None))
+        _messages.put((number, later.wait(), None))
     except BaseException as error:
-        _late.put((number, None, error))
+        _messages.put((number, None, error))

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.extras import cure
+from dmcvb_gen.extras import install_hint
 from dmcvb_gen.loaders.release import ReleaseReader
 
 GROUP = "dmcvb_gen.exporters"
@@ -67,7 +67,7 @@ class Format:
                 importlib.import_module(module)
             except ImportError as error:
                 name = error.name or module
-                raise DmcvbError(f"export to {self.name}: {cure(name) or f'pip install {name}'}") from None
+                raise DmcvbError(f"export to {self.name}: {install_hint(name) or f'pip install {name}'}") from None
 
 
 _formats: dict[str, Format] = {}

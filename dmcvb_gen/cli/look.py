@@ -1,0 +1,191 @@
+"""list, info, status, preview."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import click
+
+from dmcvb_gen.cli.common import (
+    OutPath,
+    answer,
+    format_bytes,
+    format_duration,
+    json_option,
+    print_json,
+    print_table,
+    remote_option,
+)
+from dmcvb_gen.storage.remote import public
+
+
+@click.command()
+@click.argument("path", metavar="RELEASE|URL")
+@remote_option
+@json_option
+def info(path, options, as_json):
+    """Show the subsets, episodes, bytes and returns of a release beside the paper's.
+
+    \b
+    dmcvb-gen info releases/demo
+    """
+    from dmcvb_gen.generate.info import describe_release
+
+    facts = describe_release(path, options)
+    if as_json:
+        return print_json(facts)
+    statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
+    rows = []
+    for subset in facts["subsets"]:
+        planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
+        mark = " *" if subset["paper"] and subset["shorter"] else ""
+        rows.append(
+            (
+                subset["name"] + mark,
+                f"{subset['episodes']:,}{planned}",
+                f"{subset['steps']:,}",
+                format_bytes(subset["bytes"]),
+                f"{subset['bytes_per_step']:,.0f}",
+                *(f"{subset['returns'][key]:.1f}" for key in statistics),
+            )
+        )
+        if paper := subset["paper"]:
+            numbers = (f"{paper[key]:.1f}" for key in statistics)
+            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers))
+    print_table(
+        ("subset", "episodes", "steps", "size", "B/step", *statistics),
+        rows,
+        title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
+        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
+    )
+    click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
+    if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
+        click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
+    if facts["digest"]:
+        click.echo(f"digest {facts['digest']}")
+
+
+@click.command()
+@click.argument("path")
+@click.option("--only", multiple=True, metavar="PATTERN", help="Show only these subsets.")
+@click.option("--out", type=OutPath(path_type=Path), help="Output folder.  [default: PATH/preview]")
+@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes per subset.")
+@click.option("--scale", type=click.IntRange(1, 8), help="Enlarge the images.  [default: 2; videos of 512 pixels]")
+@click.option(
+    "--frames", type=click.IntRange(1), default=200, show_default=True, help="Frames of the video, at 20 per second."
+)
+@click.option("--episode", type=click.IntRange(0), help="Episode of the video.  [default: the first of each subset]")
+@click.option(
+    "--video",
+    type=click.Choice(["mp4", "webp", "gif"]),
+    help="Format of the video.  [default: mp4, or webp without imageio-ffmpeg]",
+)
+@json_option
+def preview(path, only, out, as_json, **options):
+    """Write a contact sheet (PNG) and a video of a release.
+
+    \b
+    dmcvb-gen preview releases/demo
+    """
+    from dmcvb_gen.generate.preview import write_preview
+
+    files = list(map(str, write_preview(path, out, only=only, **options)))
+    answer(as_json, files, *files)
+
+
+@click.command("list")
+@click.option("--remote", metavar="URL", help="List the releases at a URL instead.")
+@remote_option
+@json_option
+def list_command(remote, options, as_json):
+    """List tasks, levels, distractors, bundled policies, recipes and the renderers that work here."""
+    from dmcvb_gen.generate.info import describe_package
+
+    if remote:
+        return _list_remote(remote, options, as_json)
+    facts = describe_package()
+    if as_json:
+        return print_json(facts)
+    print_table(
+        ("task", "state", "action", "steps", "<views", "<bundled behaviours"),
+        [
+            (
+                task["id"],
+                str(task["state"]),
+                str(task["action"]),
+                str(task["max_steps"]),
+                ", ".join(task["views"]),
+                ", ".join(task["behaviours"]) or "-",
+            )
+            for task in facts["tasks"]
+        ],
+        title="tasks",
+        optional=(("views",),),
+    )
+    for heading, names in (
+        ("tasks of dm_control's suite", facts["suite_tasks"]),
+        ("levels", facts["levels"]),
+        ("distractors", facts["distractors"]),
+        ("difficulties", [*facts["difficulties"], "or a scale up to 1 (dynamic_0.35)"]),
+        ("maze goals", facts["maze_settings"]),
+        ("recipes", facts["recipes"]),
+        ("manifests", facts["manifests"]),
+    ):
+        click.echo(textwrap.fill(f"{heading}: {', '.join(names)}", 80, break_on_hyphens=False))
+    for name, reason in facts["renderers"].items():
+        click.echo(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
+
+
+def _list_remote(url, options, as_json) -> None:
+    from dmcvb_gen.dataset.catalog import releases_at
+
+    found = releases_at(url, options)
+    if as_json:
+        return print_json(found)
+    shown = ("url", "name", "version", "subsets", "episodes", "complete")
+    print_table(
+        ("release", "<name", "<version", "subsets", "episodes", "complete", "<digest"),
+        [(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12]) for facts in found],
+        title=public(url),
+        optional=(("subsets",), ("name",)),
+    )
+
+
+@click.command()
+@click.argument("place", metavar="RELEASE|URL")
+@remote_option
+@json_option
+def status(place, options, as_json):
+    """Show the progress of a release that is being made: shards done and late, steps/s, time left.
+
+    It reads the commit records, so it works from any machine.
+
+    \b
+    dmcvb-gen status s3://bucket/mine
+    """
+    from dmcvb_gen.generate.progress import progress_of
+    from dmcvb_gen.generate.target import Target
+
+    found = progress_of(Target.at(place, options))
+    if as_json:
+        return print_json(found.facts())
+    print_table(
+        ("subset", "done", "late", "open"),
+        [
+            (subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done:,}")
+            for subset in found.subsets
+        ],
+        title=f"{found.name}: {found.done:,} of {found.total:,} shards",
+    )
+    if found.steps_per_second:
+        last, left = format_duration(found.silence), format_duration(found.seconds_left)
+        rate = f"{found.steps_per_second:,.0f} steps/s"
+        click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")
+    if found.late:
+        click.echo(
+            f"{found.late} shards are late: later ones are done. They are still in progress or their worker died; "
+            "rerun the same command to make them"
+        )
+    if found.done == found.total:
+        click.echo("complete" if found.complete else "All shards are done; finish the release with --finish.")

@@ -1,0 +1,207 @@
+"""The options of a command, from the function that it calls.
+
+A function's signature has the types and the defaults, its docstring the help; nothing is written twice::
+
+    def paint(release: Local, *, episodes: Span | None = None, ...):
+        \"\"\"...
+        Args:
+          episodes (A:B): Use only the shards with episodes A to B - 1.
+
+gives `paint RELEASE --episodes A:B`. What stands in parentheses shows how a value is written, and `FORMATS` reads it. A
+parameter that takes several names can be repeated and loses its "s" (levels: --level). One that is true by default is
+switched off (pixels: --no-pixels). With `workers` come --executor and --ray-address.
+"""
+
+import functools
+import inspect
+import re
+import types
+import typing
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import click
+
+from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
+from dmcvb_gen.cli.unused_options import is_given
+from dmcvb_gen.options import LOCAL, Between
+from dmcvb_gen.parallel import Ray, Workers
+
+FLAGS = {"settings": "set", "storage_options": "option", "everything": "all", "episode_range": "range"}
+"""Parameter -> flag, if it has another name."""
+
+
+def command_of(function: Callable, *arguments: str, groups: dict[str, tuple[str, ...]] | None = None) -> Callable:
+    """Decorator: a click command with the parameters of a function.
+
+    The decorated function gets their values by name, with `as_json` and `progress`. Its docstring is the command's
+    help. Options above it are the command's alone.
+
+    Args:
+      arguments: parameters that have no flag, by default the first one.
+      groups: see `GroupedCommand`.
+    """
+
+    def decorate(show: Callable) -> click.Command:
+        @functools.wraps(show)
+        def callback(as_json: bool, **given: Any) -> Any:
+            if "executor" in given:
+                given["workers"] = _executor(given["workers"], given.pop("executor"), given.pop("ray_address"))
+            return show(as_json=as_json, progress=not as_json, **given)
+
+        own = getattr(show, "__click_params__", [])
+        callback.__click_params__ = []
+        json_option(callback)
+        callback.__click_params__ += [*own, *reversed(parameters_of(function, arguments))]
+        return click.command(show.__name__.replace("_", "-"), cls=GroupedCommand, option_groups=groups)(callback)
+
+    return decorate
+
+
+def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[click.Parameter]:
+    """The click parameters of a function, in the order of its signature."""
+    helps, signature = help_of(function), inspect.signature(function).parameters
+    found: list[click.Parameter] = []
+    for name, parameter in signature.items():
+        if name not in helps:  # progress and callbacks are no options
+            continue
+        (metavar, text), (kinds, marks) = helps[name], parts_of(parameter.annotation)
+        required = parameter.default is parameter.empty
+        several = any(typing.get_origin(kind) is Sequence for kind in kinds)
+        kind = _click_type(kinds, marks)
+        if name in (arguments or [next(iter(signature))]):
+            form = metavar if required else f"[{metavar}]" + "..." * several
+            found.append(click.Argument([name], type=kind, required=required, nargs=-1 if several else 1, metavar=form))
+            continue
+        flag, default = FLAGS.get(name, name).replace("_", "-"), parameter.default
+        given: dict[str, Any] = dict(metavar=metavar, required=required, type=kind)
+        if default is True:
+            flag, text = f"no-{flag}", text.removeprefix("False: ")
+            given = dict(is_flag=True, callback=lambda context, parameter, value: not value)
+        elif default is False:
+            given = dict(is_flag=True)
+        elif metavar in FORMATS:
+            given |= dict(callback=_read, type=str)
+        elif dict in map(typing.get_origin, kinds):
+            given, text = dict(metavar=metavar, multiple=True, callback=parse_options), _repeatable(text)
+        elif several:
+            flag, text = flag.removesuffix("s"), _repeatable(text)
+            given |= dict(multiple=True, default=default or None, show_default=bool(default))
+        elif not required and default is not None:
+            given |= dict(default=default, show_default=True)
+        found.append(click.Option([f"--{flag}", name], help=text, **given))
+        if Ray in kinds:
+            found += parameters_of(_cluster, ("",))
+    return found
+
+
+def help_of(function: Callable) -> dict[str, tuple[str | None, str]]:
+    """Parameter -> (metavar, help), from the "Args:" of its docstring."""
+    block = inspect.getdoc(function).partition("\nArgs:\n")[2].partition("\n\n")[0]
+    found = re.findall(r"^  (\w+)(?: \((.+?)\))?: (.+(?:\n   .+)*)", block, re.MULTILINE)
+    return {name: (metavar or None, re.sub(r"\s+", " ", text).replace(" [d", "  [d")) for name, metavar, text in found}
+
+
+def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:
+    """The types of a union but None, and the marks that `Annotated` sets on them."""
+    if typing.get_origin(annotation) is Annotated:
+        inner, *marks = typing.get_args(annotation)
+        kinds, more = parts_of(inner)
+        return kinds, [*marks, *more]
+    if typing.get_origin(annotation) not in (typing.Union, types.UnionType):
+        return ([] if annotation is type(None) else [annotation]), []
+    parts = [parts_of(part) for part in typing.get_args(annotation)]
+    return [kind for kinds, _ in parts for kind in kinds], [mark for _, marks in parts for mark in marks]
+
+
+def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
+    number = click.FloatRange if float in kinds else click.IntRange
+    for mark in marks:
+        if isinstance(mark, Between):
+            return number(mark.lowest, mark.highest, min_open=mark.open)
+        if isinstance(mark, tuple):
+            return click.Choice(mark)
+        if mark == LOCAL:
+            return OutPath()
+    return click.IntRange(1) if Ray in kinds else int if int in kinds else float if float in kinds else str
+
+
+def _repeatable(text: str) -> str:
+    """ "What.  [default: x]" -> "What. Repeatable.  [default: x]"."""
+    words, mark, default = text.partition("  [")
+    return f"{words} Repeatable.{mark}{default}"
+
+
+def _cluster(*, executor: Annotated[str, ("processes", "ray")] = "processes", ray_address: str | None = None):
+    """What comes with `workers`.
+
+    Args:
+      executor: Executor that runs the jobs: local processes or Ray.
+      ray_address (ADDRESS): Address of the Ray cluster. [default: RAY_ADDRESS, or a local one]
+    """
+
+
+def _executor(workers: int, executor: str, address: str | None) -> Workers:
+    """The executor that the options ask for.
+
+    Raises:
+      click.UsageError: an option has no effect with this executor.
+    """
+    if executor == "ray":
+        if is_given(click.get_current_context(), "workers"):
+            raise click.UsageError(
+                "--workers has no effect with --executor ray, which uses every core of the cluster: remove it."
+            )
+        return Ray(address)
+    if address:
+        raise click.UsageError("--ray-address has no effect without --executor ray: remove it.")
+    return workers
+
+
+# -- how values are written -----------------------------------------------------------------------
+
+
+def parse_range(flag: str, text: str) -> tuple[int, int]:
+    """ "100:150" -> (100, 150)."""
+    first, colon, last = text.partition(":")
+    if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
+        raise click.UsageError(f"{flag} {text!r} is not A:B with A < B, e.g. 100:150")
+    return int(first), int(last)
+
+
+def parse_part(flag: str, text: str) -> tuple[int, int]:
+    """ "2/8" -> (2, 8)."""
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
+        raise click.UsageError(f"{flag} {text!r} is not K/N with K from 1 to N, e.g. 2/8.")
+    return int(number), int(count)
+
+
+UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+
+
+def parse_bytes(flag: str, text: str) -> int:
+    """ "20GB" -> 20000000000."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)B?", text.strip().upper())
+    if not found or float(found[1]) <= 0:
+        raise click.UsageError(f"{flag} {text!r} is no size; give bytes, or e.g. 500MB or 20GB.")
+    return int(float(found[1]) * UNITS[found[2]])
+
+
+def split_names(flag: str, text: str) -> tuple[str, ...]:
+    """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between names and in agents' options."""
+    return tuple(name.strip() for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip())
+
+
+FORMATS: dict[str | None, Callable[[str, str], Any]] = {
+    "A:B": parse_range,
+    "K/N": parse_part,
+    "BYTES": parse_bytes,
+    "A,B": split_names,
+    "PART,...": split_names,
+}
+"""Metavar -> function that reads the value of a flag."""
+
+
+def _read(context: click.Context, parameter: click.Parameter, text: str | None) -> Any:
+    return None if text is None else FORMATS[parameter.metavar](parameter.opts[0], text)

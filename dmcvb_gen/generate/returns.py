@@ -1,0 +1,98 @@
+"""Returns of behaviour policies over fresh episodes, beside the paper's."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.options import Between, Local, Location, Names, Seed
+from dmcvb_gen.spec import is_maze
+from dmcvb_gen.text import as_names
+
+
+def evaluate_behaviour(
+    tasks: Names = (),
+    *,
+    levels: Names = (),
+    behaviour: Location | None = None,
+    episodes: Annotated[int, Between(2)] = 100,
+    seed: Seed = 1,
+    sample: bool = False,
+    pictures: Local | None = None,
+) -> list[dict[str, Any]]:
+    """Measure the returns of behaviour policies over fresh episodes, beside the paper's.
+
+    Args:
+      tasks (TASK): Tasks; by default those of the policies.
+      levels: expert, medium, mixed, random. [default: all bundled]
+      behaviour (FILE|RUN|MODULE:FUNCTION): What to evaluate instead of the bundled policies, as in rollout.
+      episodes: Fresh episodes of each policy.
+      seed: Random seed of the episodes.
+      sample: Sample actions instead of using the policy mean.
+      pictures (FOLDER): Folder for drawings of ten paths in each maze.
+
+    Returns:
+      A row for each task and level: task, level, episodes, seed, mode ("mean" or "sampled"), returns (statistics),
+      paper (the same or None); of mazes success, speed and running_speed (m/s) too.
+
+    Raises:
+      DmcvbError: an unknown name, a policy that does not fit, or pictures of tasks that are no mazes.
+    """
+    from dmcvb_gen.generate.info import return_statistics  # here, so that --help is quick
+    from dmcvb_gen.generate.request import behaviour_source
+    from dmcvb_gen.policies.bundled import bundled_levels
+    from dmcvb_gen.policies.evaluation import maze_scores, running_speed, walked_paths
+    from dmcvb_gen.policies.paper import paper_returns
+    from dmcvb_gen.policies.simulate import simulate
+    from dmcvb_gen.tasks import get_task, task_ids
+    from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
+
+    behaviour = behaviour_source(behaviour)
+    chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
+    chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
+    if pictures and not any(map(is_maze, chosen)):
+        raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(chosen)} is none; leave it out")
+    rows = []
+    for task_id in chosen:
+        task, panels = get_task(task_id), {}
+        for level in as_names(asked) or (*bundled_levels(task_id), "random"):
+            policies = _policies(task_id, level, behaviour)
+            out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
+            row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
+            row |= dict(mode="sampled" if sample else "mean", returns=return_statistics(out.returns))
+            success, speed = maze_scores(task, out)
+            if success is not None:
+                row |= dict(success=success, speed=speed, running_speed=running_speed(task, out))
+                panels[f"{level}, {success:.0%} at the goal"] = walked_paths(task, out)
+            rows.append(row | dict(paper=paper_returns(task_id, level)))
+        if pictures and panels:
+            save_paths_picture(task.layout, panels, Path(pictures) / f"{task_id}.png")  # type: ignore[attr-defined]
+    return rows
+
+
+def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+    """The tasks and levels to evaluate; those that are not asked for are what the policy says."""
+    from dmcvb_gen.own_code import is_own
+    from dmcvb_gen.policies.bundled import CONVERTED, levels_of, resolve_policies
+    from dmcvb_gen.policies.policy_file import read_header
+
+    if is_own(behaviour) or Path(behaviour).suffix in CONVERTED:
+        if len(tasks) != 1:
+            raise DmcvbError(f"give the one TASK that {behaviour} is for")
+        return tasks, levels or ["expert"]
+    levels = levels or levels_of(behaviour)
+    named = [level for level in levels if level != "random"]
+    files = [path for level in named for path in resolve_policies("", level, behaviour)]
+    return tasks or sorted({read_header(path).task for path in files}), levels
+
+
+def _policies(task_id: str, level: str, behaviour: str | None) -> list[Any]:
+    from dmcvb_gen.policies.actor import random_policy
+    from dmcvb_gen.policies.bundled import resolve_policies
+    from dmcvb_gen.policies.policy_file import load_policy
+    from dmcvb_gen.tasks import get_task
+
+    task = get_task(task_id)
+    if level == "random":
+        return [random_policy(task)]
+    return [load_policy(path, task) for path in resolve_policies(task_id, level, behaviour)]

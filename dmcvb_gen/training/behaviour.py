@@ -1,0 +1,139 @@
+"""Train a behaviour policy: from what a person gives to a finished run, its curve and, for an own maze, its picks."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed
+from dmcvb_gen.parallel import ignore
+from dmcvb_gen.spec import MazeName, task_folder
+from dmcvb_gen.text import as_names
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A run that is trained to its end.
+
+    Attributes:
+      folder: of the run. curve: picture of its evaluations.
+      steps: agent steps. seconds: of training, on the clock.
+    """
+
+    folder: Path
+    curve: Path
+    steps: int
+    seconds: float
+
+
+def train_behaviour(
+    task: str | None = None,
+    *,
+    layout: Location | None = None,
+    out: Local | None = None,
+    steps: Count | None = None,
+    seed: Seed | None = None,
+    algo: str | None = None,
+    settings: Names = (),
+    config: Location | None = None,
+    init_from: Location | None = None,
+    evaluate_every: Count | None = None,
+    precision: Precision = "auto",
+    resume: bool = False,
+    progress: bool = True,
+    notify: Callable[[str], None] = ignore,
+) -> TrainedRun:
+    """Train a behaviour policy online on states.
+
+    Args:
+      task (TASK): Task to learn.
+      layout (FILE): Text file of a maze of your own, instead of TASK: learns to walk it (guided) and selects
+        checkpoints.
+      out: Folder of the run. [default: runs/TASK]
+      steps: Agent steps (at action repeat 2). [default: the task's]
+      seed: Random seed. [default: 0]
+      algo: sac, mpo, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo. [default: sac; --layout: guided]
+      settings (KEY=VALUE): Override a setting.
+      config (FILE): A YAML file of settings.
+      init_from (RUN|FILE): Run or policy file to start from; guided: the guide.
+      evaluate_every: Agent steps between evaluations while returns are low.
+      precision: sac: precision of hidden layers; auto times both.
+      resume: Resume the run in --out with its own settings.
+
+    `notify` is called with what the person should know: the precision, a resumed run without a saved state, a stop.
+
+    Raises:
+      Stopped: by Ctrl-C; the run is saved.
+      DmcvbError: an unknown name, a setting that is wrong, or a folder that holds another run or none to resume.
+    """
+    import torch  # here, so that --help works without it
+
+    from dmcvb_gen.own_code import allow
+    from dmcvb_gen.policies.paper import paper_returns
+    from dmcvb_gen.progress import ProgressBar
+    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks.ant_maze import layout_task_id
+    from dmcvb_gen.training.defaults import parse_settings, run_config
+    from dmcvb_gen.training.runs import read_config
+    from dmcvb_gen.training.selection import plot_curve
+    from dmcvb_gen.training.training import open_run
+
+    if (task is None) == (layout is None):
+        raise DmcvbError("give a TASK, or the file of a maze with --layout")
+    task = task or layout_task_id(layout or "")
+    allow([task])  # a person typed its name, so its code may run
+    get_task(task)
+    maze = MazeName.parse(task) if layout else None
+    folder = Path(out or Path("runs") / (maze.layout if maze else task))
+    found = read_config(folder) if resume else None
+    if resume and found is None:
+        raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
+    algorithm = algo or (found.algorithm if found else "guided" if layout else "sac")
+    given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
+    changed = parse_settings(as_names(settings), config, algorithm)
+    chosen = _precision(precision, algorithm, changed, found)
+    configuration = run_config(task, algorithm, changed | chosen, found, **given)  # type: ignore[arg-type]
+    run = open_run(folder, configuration, resume)
+    if chosen and precision == "auto":
+        notify(f"Computing in {'bfloat16' if chosen['bfloat16'] else 'float32'}, the faster one on this processor.")
+    torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
+    saved, expert = run.saved(), paper_returns(task, "expert")
+    if resume and not saved:
+        notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
+    done, name = saved["step"] if saved else 0, task_folder(task)
+    total = configuration.steps
+    with ProgressBar(progress, total=total, initial=done, unit=" steps", unit_scale=True, desc=name) as bar:
+
+        def report(progress: Any) -> None:
+            bar.set_postfix_str(_standing(progress, expert), refresh=False)
+
+        run.train(report, bar.update, lambda: notify("\nStopping: the run is being saved."))
+    return TrainedRun(folder, plot_curve(folder, expert and expert["mean"]), run.step, run.seconds)
+
+
+def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:
+    """The last evaluation beside the paper's expert, and the pace."""
+    mean, pace = progress.evaluation.mean, f"{progress.updates_per_second:.0f} updates/s"
+    if not expert:
+        return f"return {mean:.1f}, {pace}"
+    share = f" ({100 * mean / expert['mean']:.0f} %)" if expert["mean"] > 0 else ""  # mazes' returns are costs
+    return f"return {mean:.1f} of the paper's {expert['mean']:.0f}{share}, {pace}"
+
+
+def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: Any) -> dict[str, bool]:
+    """The setting that --precision decides; none if a run is resumed or has one of its own."""
+    from dmcvb_gen.precision import choose_precision, dense_product
+    from dmcvb_gen.training.sac import SacSettings
+
+    if algorithm != "sac":
+        if asked != "auto":
+            raise DmcvbError(f"--precision has no effect with --algo {algorithm}: remove it")
+        return {}
+    if asked == "auto" and (found or "bfloat16" in settings):
+        return {}
+    if "bfloat16" in settings:
+        raise DmcvbError("give --precision or --set bfloat16, not both")
+    sizes = SacSettings(**settings)
+    precision = choose_precision(asked, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
+    return {"bfloat16": precision == "bfloat16"}
