@@ -31,6 +31,8 @@ FLOORS = (
         "precision",
         "compilation",
         "own_code",
+        "registry",
+        "state_file",
     ),  # the ground
     ("tasks",),
     ("storage",),

@@ -444,7 +444,7 @@ def test_a_stopped_validation_takes_its_workers_with_it(small_release, tmp_path)
 
 
 def test_commas_stand_between_agents_and_in_their_options():
-    from dmcvb_gen.cli.validate import split_agents
+    from dmcvb_gen.agents.catalog import split_agents
 
     assert split_agents("bc,id+bc:k=10,sample, id+bc:frames=1,k=5,state-bc,") == [
         "bc", "id+bc:k=10,sample", " id+bc:frames=1,k=5", "state-bc"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import click
@@ -121,14 +120,9 @@ def _show_score(cell, facts, profile) -> None:
         click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
 
 
-def split_agents(text: str) -> list[str]:
-    """ "bc,id+bc:k=10,sample" -> ["bc", "id+bc:k=10,sample"]: commas stand between agents and in their options."""
-    return [name for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip()]
-
-
 def _agents(names: str, own: tuple[str, ...]) -> list[str]:
     """The agents asked for; one's own alone are set beside BC from states."""
-    from dmcvb_gen.agents.catalog import OWN
+    from dmcvb_gen.agents.catalog import OWN, split_agents
 
     for name in own:
         if not OWN.fullmatch(name):
@@ -182,7 +176,7 @@ def claims(reports, as_json):
     from dataclasses import asdict
 
     from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
-    from dmcvb_gen.benchmarks.claims import CLAIMS, judge, pool, read_reports
+    from dmcvb_gen.benchmarks.claims import claim_words, judge, pool, read_reports
 
     results = read_reports(reports)
     answers, pooled, ranks = judge(results), pool(results), rank_agreement(shared_cells(results))
@@ -195,7 +189,7 @@ def claims(reports, as_json):
         seeds = ", ".join(f"{mean:.1f}" for mean in score.seeds)
         where = f"{place.benchmark} {place.task} {place.learns_from}, {place.setting}"
         click.echo(f"{where}, {place.agent}: {score} (seeds: {seeds}); data {score.data:.1f}")
-    for name, (words, _) in CLAIMS.items():
+    for name, words in claim_words().items():
         found = [answer for answer in answers if answer.claim == name]
         if found:
             click.echo(f"\n{words}")
