@@ -17,6 +17,7 @@ EXTRAS = {
     "lerobot": ("pyarrow",),
     "ray": ("ray",),
     "rerun": ("rerun",),
+    "dino": ("timm",),
 }
 """Extra -> the modules that it brings."""
 SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safetensors", "PIL", "gymnasium")

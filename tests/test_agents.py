@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 
@@ -9,32 +10,28 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from dmcvb_gen.agents.catalog import AGENTS, make_encoder, make_policy, make_pretrainer, parse_agent
-from dmcvb_gen.agents.dino import VisionTransformer, load_dino
-from dmcvb_gen.agents.learners import (
-    TD3BC,
-    Autoencoder,
-    Batch,
-    BehaviorCloning,
-    InverseDynamics,
-    LatentForwardDynamics,
-    ObservationProbe,
-    StatePrediction,
-    StateProbe,
-    move_towards,
-)
+from dmcvb_gen.agents.autoencoder import Autoencoder
+from dmcvb_gen.agents.bc import BehaviorCloning
+from dmcvb_gen.agents.catalog import agent_names, make_encoder, make_policy, make_pretrainer, parse_agent
+from dmcvb_gen.agents.data import Sizes
+from dmcvb_gen.agents.dino import DinoEncoder
+from dmcvb_gen.agents.forward_dynamics import LatentForwardDynamics
+from dmcvb_gen.agents.inverse_dynamics import InverseDynamics
+from dmcvb_gen.agents.learners import Batch, move_towards
 from dmcvb_gen.agents.networks import (
     MLP,
     PAPER,
     PATCHES,
     Architecture,
-    Convolutions,
     FrameDifferences,
     ObservationDecoder,
     observation_encoder,
     state_decoder,
     state_encoder,
 )
+from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
+from dmcvb_gen.agents.state_prediction import StatePrediction
+from dmcvb_gen.agents.td3_bc import TD3BC
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.profiles import PROFILES
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -42,6 +39,7 @@ from dmcvb_gen.tasks import ACTION_REPEAT
 from tests import independent_td3_bc
 
 SIZE, CHANNELS, ACTIONS, STATES = 16, 9, 6, 24
+SIZES, STATE_SIZES = Sizes(STATES, ACTIONS, CHANNELS, SIZE, 3), Sizes(STATES, ACTIONS)
 
 
 def make_batch(count=8, seed=0, k=1):
@@ -127,7 +125,7 @@ def test_weights_start_orthogonal():
 
 @pytest.mark.parametrize("sample", [False, True])
 def test_inverse_dynamics_embeds_k_only_where_it_is_sampled(sample):
-    learner = InverseDynamics(small_encoder(), ACTIONS, k_max=4, sample_k=sample)
+    learner = InverseDynamics(small_encoder(), SIZES, k=4, sample=sample)
     inputs = 64 * (3 if sample else 2)
     assert learner.f[0].in_features == inputs
     near, far = make_batch(k=1), make_batch(k=4)
@@ -139,7 +137,7 @@ def test_td3s_critics_are_bounded_as_the_papers_unless_it_is_asked_otherwise():
     """The hyperparameter table: "Actor, Critic 1 and Critic 2", "Last layer activation", "tanh"."""
     values = {}
     for bounded in (True, False):
-        learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS, bounded=bounded)
+        learner = TD3BC(None, STATE_SIZES, unbounded=not bounded)
         for critic in (learner.net.critic1, learner.net.critic2):
             torch.nn.init.constant_(last_linear(critic).bias, 150.0)
         values[bounded] = torch.stack(learner.net.values(torch.zeros(3, STATES), torch.zeros(3, ACTIONS)))
@@ -196,15 +194,15 @@ def papers_table():
 
     Left out is "Actor, Critic 1 and Critic 2: output dimension 64": an actor gives an action, a critic one value.
     """
+    paper = Sizes(STATES, ACTIONS, 9, 64, 3)
     encoder, by_state = observation_encoder(9), state_encoder(STATES)
-    identify, identify_k = (InverseDynamics(encoder, ACTIONS, k, k > 1) for k in (1, 5))
-    forward, agent = LatentForwardDynamics(encoder, ACTIONS), parse_agent("id+bc")
-    predict, decoder, by_state_decoder = StatePrediction(encoder, STATES), ObservationDecoder(9), state_decoder(STATES)
-    body = Convolutions(9)
-    td3 = TD3BC(body, body.features, ACTIONS)
+    identify, identify_k = (InverseDynamics(encoder, paper, k=k, sample=k > 1) for k in (1, 5))
+    forward, trained = LatentForwardDynamics(encoder, paper), make_pretrainer(parse_agent("id+bc"), encoder, paper)
+    predict, decoder, by_state_decoder = StatePrediction(encoder, paper), ObservationDecoder(9), state_decoder(STATES)
+    td3 = TD3BC(encoder, paper)
     settings, profile = TrainSettings(), PROFILES["paper"]
     moved_by_actor = {id(p) for group in td3.optimizers["actor"].param_groups for p in group["params"]}
-    bc, default = BehaviorCloning(encoder, ACTIONS), ("relu", "relu", "tanh")
+    bc, default = BehaviorCloning(encoder, paper), ("relu", "relu", "tanh")
     rows = {
         ("Observation encoder", "Frame stacking"): (3, parse_agent("bc").stack),
         ("Observation encoder", "CNN number of channels"): (
@@ -236,8 +234,8 @@ def papers_table():
         ("Action encoder", "Output dimension"): (64, last_linear(forward.embed_action).out_features),
         ("LFD", "Target network decay rate"): (0.99, forward.decay),
         ("ID step embedding", "Output dimension"): (64, identify_k.embed_k.out_features),
-        ("ID step embedding", "Number of ID steps"): (1, agent.k),
-        ("ID step embedding", "Sample ID steps"): (False, agent.sample_k),
+        ("ID step embedding", "Number of ID steps"): (1, trained.k_max),
+        ("ID step embedding", "Sample ID steps"): (False, trained.sample_k),
         ("TD3-BC", "Trade-off alpha"): (2.5, td3.alpha),
         ("TD3-BC", "Discount factor"): (0.99, td3.gamma),
         ("TD3-BC", "Policy noise"): (0.2, td3.noise),
@@ -306,7 +304,7 @@ def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
     for encoded in (False, True):
         torch.manual_seed(0)
         encoder = observation_encoder(data.channels, data.frames.size)
-        policy = BehaviorCloning(encoder, 2, frozen=True) if frozen == "bc" else TD3BC(encoder, 64, 2, frozen=True)
+        policy = (BehaviorCloning if frozen == "bc" else TD3BC)(encoder, data.sizes, frozen=True)
         seen = data.encoded(encoder) if encoded else data
         train(policy, seen, TrainSettings(steps=4, batch_size=8, evaluate_every=4, half=False, shift=False), seed=3)
         policies.append(policy)
@@ -319,20 +317,19 @@ def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
 
 def td3(alpha=2.5, bounded=True):
     torch.manual_seed(0)
-    body = Convolutions(CHANNELS, SIZE)
-    return TD3BC(body, body.features, ACTIONS, alpha=alpha, bounded=bounded)
+    return TD3BC(None, SIZES, alpha=alpha, unbounded=not bounded)
 
 
 MOVED = {
-    "bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS), ("encoder", "policy")),
-    "frozen bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS, frozen=True), ("policy",)),
-    "id": (lambda: InverseDynamics(small_encoder(), ACTIONS), ("encoder", "f.")),
-    "sampled id": (lambda: InverseDynamics(small_encoder(), ACTIONS, 4, True), ("encoder", "f.", "embed_k")),
-    "lfd": (lambda: LatentForwardDynamics(small_encoder(), ACTIONS), ("encoder", "embed_action", "g.", "target_")),
-    "ae": (lambda: Autoencoder(small_encoder(), CHANNELS, SIZE), ("encoder", "decoder")),
-    "state": (lambda: StatePrediction(small_encoder(), STATES), ("encoder", "h.")),
-    "observation readout": (lambda: ObservationProbe(small_encoder(), CHANNELS, SIZE), ("decoder",)),
-    "state readout": (lambda: StateProbe(small_encoder(), STATES), ("h.",)),
+    "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), ("encoder", "policy")),
+    "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), ("policy",)),
+    "id": (lambda: InverseDynamics(small_encoder(), SIZES), ("encoder", "f.")),
+    "sampled id": (lambda: InverseDynamics(small_encoder(), SIZES, k=4, sample=True), ("encoder", "f.", "embed_k")),
+    "lfd": (lambda: LatentForwardDynamics(small_encoder(), SIZES), ("encoder", "embed_action", "g.", "target_")),
+    "ae": (lambda: Autoencoder(small_encoder(), SIZES), ("encoder", "decoder")),
+    "state": (lambda: StatePrediction(small_encoder(), SIZES), ("encoder", "h.")),
+    "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), ("decoder",)),
+    "state readout": (lambda: StateProbe(small_encoder(), SIZES), ("h.",)),
     "td3-bc, critics first": (td3, ("net.critic1", "net.critic2")),
 }
 
@@ -367,7 +364,7 @@ def test_td3_bc_moves_convolutions_and_both_trunks_by_the_actors_loss_alone():
 
 def test_td3_bc_on_a_frozen_encoder_leaves_it_alone():
     encoder = small_encoder()
-    learner = TD3BC(encoder, encoder.features, ACTIONS, frozen=True)
+    learner = TD3BC(encoder, SIZES, frozen=True)
     assert learner.target.body is learner.net.body
     assert not any("body" in name for name in moved(learner, 4))
     assert "net.actor.0.weight" in moved(learner, 2)
@@ -387,7 +384,7 @@ def test_a_target_moves_a_hundredth_of_the_way():
 
 
 def test_lfds_target_is_an_average_of_the_encoders():
-    learner = LatentForwardDynamics(small_encoder(), ACTIONS)
+    learner = LatentForwardDynamics(small_encoder(), SIZES)
     first = learner.target_encoder.trunk[0].weight.clone()
     learner.update(make_batch(seed=0))
     after_one = learner.encoder.trunk[0].weight.detach().clone()
@@ -403,7 +400,7 @@ def constant(mlp, value):
 
 
 def test_td3s_target_value_by_hand():
-    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS, bounded=False)
+    learner = TD3BC(None, STATE_SIZES, unbounded=True)
     constant(learner.target.critic1, 5.0)
     constant(learner.target.critic2, 3.0)
     batch = Batch(
@@ -422,7 +419,7 @@ def test_td3s_target_value_by_hand():
 
 
 def test_td3s_policy_noise_and_the_noisy_action_are_clipped(monkeypatch):
-    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    learner = TD3BC(None, STATE_SIZES)
     constant(learner.target.actor, math.atanh(0.8))
     seen = []
     values = learner.target.values
@@ -438,7 +435,7 @@ def test_td3s_policy_noise_and_the_noisy_action_are_clipped(monkeypatch):
 def test_td3_bc_makes_the_steps_of_an_independent_one(monkeypatch):
     """On states, eight steps: the same weights as `tests.independent_td3_bc`, which knows the equations alone."""
     torch.manual_seed(0)
-    learner = TD3BC(torch.nn.Identity(), STATES, ACTIONS)
+    learner = TD3BC(None, STATE_SIZES)
     weights = {name: value.detach().clone() for name, value in learner.net.named_parameters()}
     batches = [make_batch(16, seed) for seed in range(8)]
     batches = [dataclasses.replace(b, observation=b.state, next_observation=b.state.flip(0)) for b in batches]
@@ -456,7 +453,7 @@ def test_td3_bc_makes_the_steps_of_an_independent_one(monkeypatch):
 
 def test_without_alpha_td3_bc_is_bc():
     actor_critic = td3(alpha=0.0)
-    bc = BehaviorCloning(small_encoder(1), ACTIONS)
+    bc = BehaviorCloning(small_encoder(1), SIZES)
     bc.encoder.body.load_state_dict(actor_critic.net.body.state_dict())
     bc.encoder.trunk.load_state_dict(actor_critic.net.actor_trunk.state_dict())
     bc.policy.load_state_dict(actor_critic.net.actor.state_dict())
@@ -471,18 +468,18 @@ def test_without_alpha_td3_bc_is_bc():
 # -- learning -------------------------------------------------------------------------------------
 
 OVERFIT = {
-    "bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS), 40, 0.05),
-    "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), ACTIONS), 60, 0.05),
-    "frozen bc": (lambda: BehaviorCloning(small_encoder(), ACTIONS, frozen=True), 60, 0.05),
+    "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), 40, 0.05),
+    "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), STATE_SIZES), 60, 0.05),
+    "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), 60, 0.05),
     "td3-bc": (lambda: td3(alpha=0.01), 80, 0.1),
-    "td3-bc on states": (lambda: TD3BC(torch.nn.Identity(), STATES, ACTIONS, alpha=0.01), 150, 0.1),
-    "id": (lambda: InverseDynamics(small_encoder(), ACTIONS), 40, 0.05),
-    "sampled id": (lambda: InverseDynamics(small_encoder(), ACTIONS, 4, True), 40, 0.05),
-    "lfd": (lambda: LatentForwardDynamics(small_encoder(), ACTIONS), 40, 0.3),
-    "ae": (lambda: Autoencoder(small_encoder(), CHANNELS, SIZE), 60, 0.7),
-    "state": (lambda: StatePrediction(small_encoder(), STATES), 60, 0.3),
-    "observation readout": (lambda: ObservationProbe(small_encoder(), CHANNELS, SIZE), 60, 0.7),
-    "state readout": (lambda: StateProbe(small_encoder(), STATES), 80, 0.05),
+    "td3-bc on states": (lambda: TD3BC(None, STATE_SIZES, alpha=0.01), 150, 0.1),
+    "id": (lambda: InverseDynamics(small_encoder(), SIZES), 40, 0.05),
+    "sampled id": (lambda: InverseDynamics(small_encoder(), SIZES, k=4, sample=True), 40, 0.05),
+    "lfd": (lambda: LatentForwardDynamics(small_encoder(), SIZES), 40, 0.3),
+    "ae": (lambda: Autoencoder(small_encoder(), SIZES), 60, 0.7),
+    "state": (lambda: StatePrediction(small_encoder(), SIZES), 60, 0.3),
+    "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), 60, 0.7),
+    "state readout": (lambda: StateProbe(small_encoder(), SIZES), 80, 0.05),
 }
 
 
@@ -500,7 +497,7 @@ def test_each_learner_overfits_eight_transitions(kind):
 
 
 def test_bfloat16_changes_the_precision_and_not_the_meaning():
-    learner, batch = BehaviorCloning(small_encoder(), ACTIONS), make_batch()
+    learner, batch = BehaviorCloning(small_encoder(), SIZES), make_batch()
     exact = learner.metrics(batch)["loss"]
     learner.half = True
     rough = learner.metrics(batch)["loss"]
@@ -513,7 +510,7 @@ def test_bfloat16_changes_the_precision_and_not_the_meaning():
 # -- names ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", agent_names())
 def test_every_agents_name_is_read_back(name):
     assert parse_agent(name).name == name
 
@@ -522,7 +519,8 @@ def test_names_of_the_paper_and_options_are_understood():
     assert parse_agent("null+bc") == parse_agent("bc") and parse_agent("BC(state)").sees_state
     assert parse_agent("bc").paper_name == "null+bc" and parse_agent("state-bc").paper_name == "bc(state)"
     agent = parse_agent("id+bc:frames=1,k=5,sample")
-    assert (agent.stack, agent.k, agent.sample_k, agent.paper_name) == (1, 5, True, None)
+    assert (agent.stack, agent.options, agent.paper_name) == (1, (("k", 5), ("sample", True)), None)
+    assert agent.facts()["sample_k"] is True and parse_agent("bc").facts()["k"] == 1
     assert parse_agent(agent.name) == agent
 
 
@@ -539,7 +537,7 @@ def test_an_unknown_option_is_refused_with_the_known_ones(name):
 
 
 @pytest.mark.parametrize("name, cure", [
-    ("bc:k=5", "id\\+bc:k=5"), ("lfd+bc:k=10,sample", "leave them out"), ("state-bc:k=3", "leave them out"),
+    ("bc:k=5", "option of id: remove it"), ("lfd+bc:k=10,sample", "option of id"), ("state-bc:k=3", "takes none"),
     ("state-bc:frames=1", "not stacked"), ("id+bc:sample", "k=2 or more"), ("bc:unbounded", "td3-bc"),
 ])  # fmt: skip
 def test_an_option_that_an_agent_does_not_hear_is_refused(name, cure):
@@ -550,41 +548,52 @@ def test_an_option_that_an_agent_does_not_hear_is_refused(name, cure):
 # -- DINO -----------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def vision_transformer():
+    """timm's class. A torchvision of another build than torch lacks these two operators, which nothing here calls."""
+    operators = torch.library.Library("torchvision", "FRAGMENT")
+    for name in ("nms", "qnms"):
+        with contextlib.suppress(RuntimeError):  # it is there
+            operators.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    yield pytest.importorskip("timm.models.vision_transformer").VisionTransformer
+
+
 @pytest.fixture
-def dino_file(tmp_path):
+def dino_file(vision_transformer, tmp_path):
+    """A tiny network with random weights, in a file as timm's."""
     torch.manual_seed(0)
-    weights = VisionTransformer(64, 2, 16, 128).state_dict()
-    save_file(weights | {"head.weight": torch.zeros(3, 64)}, str(tmp_path / "dino.safetensors"))
+    sizes = dict(img_size=224, patch_size=16, embed_dim=64, depth=2, num_heads=1, mlp_ratio=2, num_classes=3)
+    save_file(vision_transformer(**sizes).state_dict(), str(tmp_path / "dino.safetensors"))
     return tmp_path / "dino.safetensors"
 
 
 def test_dino_gives_every_picture_of_a_stack_its_token_and_never_learns(dino_file):
-    encoder = load_dino(dino_file, channels=9)
+    encoder = DinoEncoder.load(dino_file, channels=9)
     observation = torch.rand(2, 9, 64, 64) - 0.5
     features = encoder(observation)
     assert features.shape == (2, 3 * 64) and encoder.features == 3 * 64
-    alone = load_dino(dino_file, channels=3)(observation[:, 3:6])
+    alone = DinoEncoder.load(dino_file, channels=3)(observation[:, 3:6])
     torch.testing.assert_close(features[:, 64:128], alone, atol=1e-5, rtol=1e-5)
-    learner = BehaviorCloning(encoder, ACTIONS, frozen=True)
+    learner = BehaviorCloning(encoder, SIZES, frozen=True)
     assert not any(p.requires_grad for p in encoder.parameters())
     assert learner.act(observation).shape == (2, ACTIONS)
 
 
 def test_dino_without_weights_says_what_to_give():
     with pytest.raises(DmcvbError, match="--dino-weights"):
-        load_dino(None, channels=9)
+        DinoEncoder.load(None, channels=9)
 
 
 def test_a_file_that_is_no_dino_is_refused(tmp_path):
     save_file({"x": torch.zeros(1)}, str(tmp_path / "x.safetensors"))
     with pytest.raises(DmcvbError, match="does not hold"):
-        load_dino(tmp_path / "x.safetensors", channels=9)
+        DinoEncoder.load(tmp_path / "x.safetensors", channels=9)
     (tmp_path / "y.safetensors").write_bytes(b"not one")
     with pytest.raises(DmcvbError, match="cannot read"):
-        load_dino(tmp_path / "y.safetensors", channels=9)
+        DinoEncoder.load(tmp_path / "y.safetensors", channels=9)
 
 
-@pytest.mark.parametrize("name", [name for name in AGENTS if not name.startswith("dino")])
+@pytest.mark.parametrize("name", [name for name in agent_names() if not name.startswith("dino")])
 def test_every_agent_can_be_made_and_acts(name):
     from tests.test_agents_data import make_data
 

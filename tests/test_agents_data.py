@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from dmcvb_gen.agents import trainer
+from dmcvb_gen.agents.bc import BehaviorCloning
 from dmcvb_gen.agents.data import PAD, Source, TrainingData, batches, load_data, normalize_pixels
-from dmcvb_gen.agents.learners import BehaviorCloning
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
 from dmcvb_gen.dataset import open_release
@@ -166,7 +166,7 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
     losses = []
     for data in (held, stored):
         torch.manual_seed(0)
-        losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), 6), data, settings)[-1]["loss"])
+        losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), data.sizes), data, settings)[-1]["loss"])
     assert losses[0] == losses[1]
 
 
@@ -193,7 +193,7 @@ def test_states_alone_need_no_pictures(small_release):
 
 
 def test_batches_drawn_ahead_come_in_order_and_are_the_same():
-    data, learner = make_data(), BehaviorCloning(observation_encoder(9, SIZE), 2)
+    data, learner = make_data(), BehaviorCloning(observation_encoder(9, SIZE), make_data().sizes)
     plain, ahead = (list(batches(lambda step, _: draw(learner, data, 4, 0, step), 2, 9, workers)) for workers in (0, 2))
     assert [step for step, _ in ahead] == list(range(2, 9))
     for (_, one), (_, two) in zip(plain, ahead, strict=True):
@@ -227,7 +227,7 @@ def test_bfloat16_pictures_are_the_float32_ones_rounded_once():
 
 def state_learner(data):
     torch.manual_seed(0)
-    return BehaviorCloning(state_encoder(data.state.shape[1]), 2)
+    return BehaviorCloning(state_encoder(data.state.shape[1]), data.sizes)
 
 
 SETTINGS = TrainSettings(steps=12, batch_size=8, evaluate_every=4, points=3, half=False)
@@ -243,7 +243,7 @@ def test_the_curve_has_losses_hold_out_and_scores():
 
 def pixel_learner(data):
     torch.manual_seed(0)
-    return BehaviorCloning(observation_encoder(data.channels, SIZE), 2)
+    return BehaviorCloning(observation_encoder(data.channels, SIZE), data.sizes)
 
 
 def without_time(point):

@@ -22,11 +22,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.policy_file import load_policy, read_header
+from dmcvb_gen.state_file import STATE, pack_state, read_state
 from dmcvb_gen.training import runs
 from dmcvb_gen.training.run_log import COLUMNS, read_rows
 from dmcvb_gen.training.runs import RunConfig, Stopped
 from dmcvb_gen.training.sac import ReplayBuffer
-from dmcvb_gen.training.state_file import STATE, pack_state, read_state
 from dmcvb_gen.training.training import open_run
 
 torch.set_num_threads(1)

@@ -156,7 +156,7 @@ def test_shares_that_come_to_the_same_episodes_are_trained_once(name, episodes, 
 
 
 def test_unknown_benchmarks_and_profiles_list_the_known_ones():
-    with pytest.raises(UnknownNameError, match=", ".join(sorted(BENCHMARKS))):
+    with pytest.raises(UnknownNameError, match=", ".join(sorted(BENCHMARKS.all()))):
         plan_benchmark("b4", release_of(*WALKER))
     with pytest.raises(UnknownNameError, match="brief, paper, quick, smoke"):
         get_profile("slow")

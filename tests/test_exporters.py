@@ -167,10 +167,11 @@ def test_a_format_of_another_package_is_found_by_its_entry_point(small_release, 
                 raise ImportError("something is missing")
             register()
 
-    entries = [Entry(name, "their_exporter", registry.GROUP) for name in ("broken", "returns")]
-    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
-    monkeypatch.setattr(registry, "_formats", dict(all_formats()))
-    registry._load.cache_clear()
+    formats = registry.FORMATS
+    entries = [Entry(name, "their_exporter", formats.group) for name in ("broken", "returns")]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: entries if group == formats.group else [])
+    monkeypatch.setattr(formats, "_things", dict(all_formats()))
+    monkeypatch.setattr(formats, "_loaded", False)
     for release in (small_release, maze_release):
         command = ["export", str(release), "--to", "returns", "--out", str(tmp_path / release.parent.name)]
         result = CliRunner().invoke(main, command)

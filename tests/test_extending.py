@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
 from pathlib import Path
 
@@ -51,3 +52,26 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
     assert (subset.read("exogenous/background_video") == -1).all()  # what it does not give is the task's own
     run("card", tmp_path / "r")
     assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
+
+
+def validated(release, tmp_path, *options) -> dict:
+    run("validate", release, "--profile", "smoke", "--workers", "1", "--out", tmp_path / "report", *options)
+    return json.loads((tmp_path / "report" / "report.json").read_text())
+
+
+@pytest.mark.parametrize("family, only", [("small_release", "*/none"), ("small_mazes", "*/visible")])
+def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family, only, request, tmp_path):
+    load("agent")
+    agents = ["linear-bc", "state-linear-bc", "id+linear-bc:power=1"]
+    report = validated(request.getfixturevalue(family), tmp_path, "--agents", ",".join(agents), "--only", only)
+    assert {result["cell"]["agent_name"] for result in report["results"]} == set(agents) and not report["failed"]
+    assert all(result["curve"][-1]["loss"] > 0 for result in report["results"])
+
+
+@pytest.mark.parametrize("family", ["small_release", "small_mazes"])
+def test_a_benchmark_of_your_own_has_its_table_in_the_report(family, request, tmp_path):
+    load("benchmark")
+    report = validated(request.getfixturevalue(family), tmp_path, "--benchmark", "growth")
+    assert {result["cell"]["policy_label"].split()[-1] for result in report["results"]} >= {"random"}
+    assert {result["reference"] for result in report["results"]} == {"the same agent on all episodes"}
+    assert "Growth: scores over shares of the data" in (tmp_path / "report" / "report.md").read_text()

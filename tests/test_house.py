@@ -33,6 +33,8 @@ FLOORS = (
         "progress",
         "options",
         "own_code",
+        "registry",
+        "state_file",
     ),  # the ground
     ("tasks",),
     ("storage",),

@@ -1,46 +1,49 @@
 """Agents by name: "id+bc" in, what pre-trains its encoder and what learns its policy out.
 
-    MODULE:NAME                                           a user's own agent (`benchmarks.own`)
-    [PRETRAIN+]POLICY[:frames=N,k=N,sample,unbounded]
+    MODULE:NAME                          a user's own agent (`benchmarks.own`)
+    [PRETRAIN+]POLICY[:OPTION,...]
 
-PRETRAIN is one of id, lfd, ae, state, dino, bc (its encoder is then frozen) or null (none: the policy trains its
-encoder); POLICY is bc or td3-bc (with `unbounded`, its critics lack the paper's tanh). state-bc and state-td3-bc see
-states instead of pictures.
+POLICY and PRETRAIN are names that `learners.register_agent` knows. With PRETRAIN the encoder is pre-trained and then
+frozen ("null": none, the policy trains its encoder); state-POLICY sees states instead of pictures. The options are
+frames=N, of all agents that see pictures, and those of the two parts.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
 from dmcvb_gen.agents.data import FRAMES, Sizes
-from dmcvb_gen.agents.dino import load_dino
-from dmcvb_gen.agents.learners import (
-    TD3BC,
-    Autoencoder,
-    BehaviorCloning,
-    InverseDynamics,
-    LatentForwardDynamics,
-    Learner,
-    Policy,
-    StatePrediction,
-)
-from dmcvb_gen.agents.networks import PAPER, Architecture, Convolutions, Encoder, observation_encoder, state_encoder
+from dmcvb_gen.agents.learners import PARTS, Learner, Policy, ReadyEncoder
+from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, observation_encoder, state_encoder
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
-PRETRAIN = ("id", "lfd", "ae", "state", "dino", "bc")
-POLICIES = ("bc", "td3-bc")
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A user's own agent: "module:name"."""
-AGENTS = (
-    *POLICIES,
-    *(f"state-{policy}" for policy in POLICIES),
-    *(f"{pretrain}+{policy}" for policy in POLICIES for pretrain in PRETRAIN),
-)
-"""The names that `parse_agent` takes, options left out."""
+MOST = 64
+"""The largest number that an option takes."""
+EARLIER = {"k": 1, "sample_k": False, "unbounded": False}
+"""Options that results of earlier versions name for every agent."""
+
+
+def policies() -> tuple[str, ...]:
+    """The registered policies."""
+    return tuple(name for name, part in PARTS.all().items() if issubclass(part, Policy))
+
+
+def encoders() -> tuple[str, ...]:
+    """What may pre-train an encoder."""
+    return tuple(name for name, part in PARTS.all().items() if issubclass(part, ReadyEncoder) or part.pretrains)
+
+
+def agent_names() -> tuple[str, ...]:
+    """The names that `parse_agent` takes, options left out."""
+    own = policies()
+    return (*own, *(f"state-{name}" for name in own), *(f"{encoder}+{name}" for name in own for encoder in encoders()))
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,11 @@ class Agent:
     """An agent.
 
     Attributes:
-      policy: "bc" or "td3-bc".
-      pretrain: what makes the frozen encoder; None: trained with the policy.
+      policy: the part that acts: "bc", "td3-bc".
+      pretrain: the part that makes the frozen encoder; None: it is trained with the policy.
       sees_state: states instead of pictures.
       stack: frames an observation.
-      k, sample_k: of inverse dynamics.
-      unbounded: TD3-BC's critics end without tanh.
+      options: (name, value) of the two parts' options that are not at their defaults, in the parts' order.
       own: "module:name" of a user's agent, instead of all this.
     """
 
@@ -61,9 +63,7 @@ class Agent:
     pretrain: str | None = None
     sees_state: bool = False
     stack: int = FRAMES
-    k: int = 1
-    sample_k: bool = False
-    unbounded: bool = False
+    options: tuple[tuple[str, int | bool], ...] = ()
     own: str | None = None
 
     @property
@@ -77,10 +77,8 @@ class Agent:
     def name(self) -> str:
         if self.own:
             return self.own
-        options = [f"frames={self.stack}"] if self.stack != FRAMES and not self.sees_state else []
-        options += [f"k={self.k}"] if self.k != 1 else []
-        options += ["sample"] if self.sample_k else []
-        options += ["unbounded"] if self.unbounded else []
+        options = [f"frames={self.stack}"] if self.stack != FRAMES else []
+        options += [name if value is True else f"{name}={value}" for name, value in self.options]
         return self.base + (":" + ",".join(options) if options else "")
 
     @property
@@ -92,6 +90,27 @@ class Agent:
             return "bc(state)"
         return f"{self.pretrain or 'null'}+{self.policy}"
 
+    @property
+    def ready_encoder(self) -> type[ReadyEncoder] | None:
+        """The class of its encoder, if that comes trained from a file."""
+        part = PARTS.get(self.pretrain) if self.pretrain else None
+        return part if part is not None and issubclass(part, ReadyEncoder) else None
+
+    @property
+    def pretraining(self) -> Agent:
+        """The agent that stands for all that share its encoder."""
+        return Agent("bc", self.pretrain, stack=self.stack, options=tuple(self.options_of(self.pretrain).items()))
+
+    def options_of(self, part: str | None) -> dict[str, int | bool]:
+        """Those of its options that one of its parts takes."""
+        return {name: value for name, value in self.options if part and name in PARTS.get(part).options}
+
+    def facts(self) -> dict[str, Any]:
+        """All of it as plain values, under the names that results of earlier versions have."""
+        options = {"sample_k" if name == "sample" else name: value for name, value in self.options}
+        parts = {name: getattr(self, name) for name in ("policy", "pretrain", "sees_state", "stack", "own")}
+        return parts | EARLIER | options
+
 
 def parse_agent(name: str) -> Agent:
     """The agent of a name.
@@ -99,83 +118,90 @@ def parse_agent(name: str) -> Agent:
     Raises:
       UnknownNameError, DmcvbError: no such agent or option, or one that this agent has no use for.
     """
-    if OWN.fullmatch(name.strip()) and name.partition(":")[0].lower() not in AGENTS:
+    known = agent_names()
+    if OWN.fullmatch(name.strip()) and name.partition(":")[0].lower() not in known:
         return Agent("bc", own=name.strip())
     base, _, options = name.strip().lower().partition(":")
     base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
-    if base not in AGENTS:
-        raise UnknownNameError("agent", name, AGENTS)
-    values = {"stack": FRAMES, "k": 1, "sample_k": False, "unbounded": False}
-    for option in filter(None, options.split(",")):
-        key, _, value = option.partition("=")
-        if key == "sample" and not value:
-            values["sample_k"] = True
-        elif key == "unbounded" and not value:
-            values["unbounded"] = True
-        elif key in ("frames", "k") and value.isdigit() and 1 <= int(value) <= 64:
-            values["stack" if key == "frames" else "k"] = int(value)
-        else:
-            raise DmcvbError(
-                f"agent {name!r}: {option!r} is not an option; known: frames=1..64, k=1..64, sample, unbounded"
-            )
+    if base not in known:
+        raise UnknownNameError("agent", name, known)
     if base.startswith("state-"):
-        agent = Agent(base.removeprefix("state-"), sees_state=True, **values)
+        agent = Agent(base.removeprefix("state-"), sees_state=True)
     else:
-        pretrain, plus, policy = base.rpartition("+")
-        agent = Agent(policy, pretrain if plus else None, **values)
-    _check_heard(agent, name)
+        pretrain, _, policy = base.rpartition("+")
+        agent = Agent(policy, pretrain or None)
+    try:
+        return _with_options(agent, options)
+    except DmcvbError as error:
+        raise DmcvbError(f"agent {name!r}: {error}") from None
+
+
+def _with_options(agent: Agent, text: str) -> Agent:
+    """An agent with the options "k=5,sample".
+
+    Raises:
+      DmcvbError: one is unknown, or of another agent, or they do not go together.
+    """
+    parts = [part for part in (agent.pretrain, agent.policy) if part]
+    defaults = {} if agent.sees_state else {"frames": FRAMES}
+    for part in parts:
+        defaults |= PARTS.get(part).options
+    values: dict[str, int | bool] = {}
+    for option in filter(None, text.split(",")):
+        key, _, value = option.partition("=")
+        if key not in defaults:
+            raise DmcvbError(_not_heard(option, key, defaults))
+        if isinstance(defaults[key], bool) and not value:
+            values[key] = True
+        elif not isinstance(defaults[key], bool) and value.isdigit() and 1 <= int(value) <= MOST:
+            values[key] = int(value)
+        else:
+            raise DmcvbError(f"{option!r} is not an option; it takes {_listed(defaults)}")
+    agent = replace(agent, stack=int(values.pop("frames", FRAMES)))
+    changed = tuple((key, values[key]) for key in defaults if values.get(key, defaults[key]) != defaults[key])
+    agent = replace(agent, options=changed)
+    for part in parts:
+        if issubclass(PARTS.get(part), Learner):
+            PARTS.get(part).check_options(**agent.options_of(part))
     return agent
 
 
-def _check_heard(agent: Agent, name: str) -> None:
-    """Refuse options that would make another name of the same training."""
-    if agent.sees_state and agent.stack != FRAMES:
-        raise DmcvbError(f"agent {name!r}: states are not stacked; leave frames=... out")
-    if agent.pretrain != "id" and (agent.k != 1 or agent.sample_k):
-        raise DmcvbError(f"agent {name!r}: k and sample are of inverse dynamics (id+bc:k=5); leave them out")
-    if agent.unbounded and agent.policy != "td3-bc":
-        raise DmcvbError(f"agent {name!r}: only the critics of td3-bc can be unbounded; remove it")
-    if agent.sample_k and agent.k == 1:
-        raise DmcvbError(f"agent {name!r}: sample draws k from 1 to a largest one; give it, k=2 or more")
+def _not_heard(option: str, key: str, defaults: dict[str, int | bool]) -> str:
+    """Why an option is refused: nothing knows it, or others do."""
+    owners = [name for name, part in PARTS.all().items() if key in part.options]
+    takes = f"it takes {_listed(defaults)}" if defaults else "it takes none"
+    if key == "frames":
+        return f"states are not stacked, so {option!r} has no effect: remove it"
+    if owners:
+        return f"{option!r} is an option of {', '.join(owners)}: remove it; {takes}"
+    return f"{option!r} is not an option; {takes}"
+
+
+def _listed(defaults: dict[str, int | bool]) -> str:
+    return ", ".join(name if isinstance(value, bool) else f"{name}=1..{MOST}" for name, value in defaults.items())
 
 
 def make_encoder(
-    agent: Agent, sizes: Sizes, dino_weights: str | Path | None = None, architecture: Architecture = PAPER
+    agent: Agent, sizes: Sizes, weights: str | Path | None = None, architecture: Architecture = PAPER
 ) -> nn.Module:
-    """phi of an agent, untrained (or DINO's).
+    """phi of an agent, untrained, or of a file of weights.
 
     Raises:
-      DmcvbError: DINO's weights are asked for and not at hand.
+      DmcvbError: weights are asked for and not at hand.
     """
     if agent.sees_state:
         return state_encoder(sizes.state)
-    if agent.pretrain == "dino":
-        return load_dino(dino_weights, sizes.channels, sizes.picture)
+    if agent.ready_encoder:
+        return agent.ready_encoder.load(weights, sizes.channels, sizes.picture)
     return observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
 
 
 def make_pretrainer(agent: Agent, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER) -> Learner:
     """What pre-trains phi."""
-    actions, states = sizes.action, sizes.state
-    makers = {
-        "id": lambda: InverseDynamics(encoder, actions, agent.k, agent.sample_k),
-        "lfd": lambda: LatentForwardDynamics(encoder, actions),
-        "ae": lambda: Autoencoder(encoder, sizes.channels, sizes.picture, architecture),
-        "state": lambda: StatePrediction(encoder, states),
-        "bc": lambda: BehaviorCloning(encoder, actions),
-    }
-    return makers[agent.pretrain]()
+    return PARTS.get(agent.pretrain)(encoder, sizes, architecture, **agent.options_of(agent.pretrain))
 
 
 def make_policy(agent: Agent, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER) -> Policy:
     """What learns the policy, on the pre-trained encoder (frozen) or with one of its own."""
-    actions, frozen = sizes.action, agent.pretrain is not None
-    if agent.policy == "bc":
-        return BehaviorCloning(encoder, actions, frozen=frozen)
-    bounded = not agent.unbounded
-    if frozen:
-        return TD3BC(encoder, encoder.features, actions, frozen=True, bounded=bounded)
-    if agent.sees_state:
-        return TD3BC(nn.Identity(), sizes.state, actions, bounded=bounded)
-    body = Convolutions(sizes.channels, sizes.picture, architecture, sizes.stack)
-    return TD3BC(body, body.features, actions, bounded=bounded, latent=architecture.latent)
+    frozen = agent.pretrain is not None
+    return PARTS.get(agent.policy)(encoder, sizes, architecture, frozen=frozen, **agent.options_of(agent.policy))

@@ -6,7 +6,6 @@ and resumed draws what it would have drawn.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,14 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from dmcvb_gen.agents.data import TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
+from dmcvb_gen.state_file import pack_state, read_state_file
 
 HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
 """At least so many batches, and transitions, of the hold-out are what a test loss is the mean of; but no more batches
@@ -213,41 +211,29 @@ def forget(folder: Path) -> None:
 
 
 def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: float, means: _Means) -> None:
-    sums, counts = means.state()
-    tensors = {f"weights/{name}": value for name, value in learner.state_dict().items()}
-    for name, optimizer in learner.optimizers.items():
-        for index, state in optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer/{name}/{index}/{key}": value for key, value in state.items()}
-    tensors |= {f"means/{name}": torch.as_tensor(value) for name, value in sums.items()}
-    facts = {"step": step, "curve": curve, "seconds": seconds, "counts": counts}
-    # TD3-BC's frozen target shares its body: what is stored once must be stored as two
-    tensors = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
+    optimizers = {name: optimizer.state_dict()["state"] for name, optimizer in learner.optimizers.items()}
+    state = {"step": step, "seconds": seconds, "curve": curve, "means": means.state()}
+    content = pack_state(state | {"weights": learner.state_dict(), "optimizers": optimizers})
     remove_partial(path.parent, below=False)  # of a process that was killed
     with replacing(path) as temporary:
-        save_file(tensors, str(temporary), metadata={"facts": json.dumps(facts)})
+        temporary.write_bytes(content)
 
 
 def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float, _Means]:
+    cure = "delete it to start that training again"
+    state = read_state_file(path, cure)
     try:
-        with safe_open(str(path), "pt") as file:
-            facts = json.loads(file.metadata()["facts"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        learner.load_state_dict({n.removeprefix("weights/"): v for n, v in tensors.items() if n.startswith("weights/")})
+        learner.load_state_dict(state["weights"])
         for name, optimizer in learner.optimizers.items():
-            states: dict[int, dict[str, torch.Tensor]] = {}
-            for key, value in tensors.items():
-                if key.startswith(f"optimizer/{name}/"):
-                    index, entry = key.removeprefix(f"optimizer/{name}/").split("/")
-                    states.setdefault(int(index), {})[entry] = value
-            optimizer.load_state_dict(optimizer.state_dict() | {"state": states})
+            optimizer.load_state_dict(optimizer.state_dict() | {"state": state["optimizers"][name]})
             _lay_out(optimizer)
+        sums, counts = state["means"]
         device = next(learner.parameters()).device
-        sums = {n.removeprefix("means/"): v.to(device) for n, v in tensors.items() if n.startswith("means/")}
-        means = _Means(sums, {name: int(facts["counts"][name]) for name in sums})
-    except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        means = _Means({name: value.to(device) for name, value in sums.items()}, counts)
+        return state["step"], state["curve"], state["seconds"], means
+    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
-        raise DmcvbError(f"cannot resume from {path} ({reason}); delete it to start that training again") from None
-    return int(facts["step"]), facts["curve"], float(facts["seconds"]), means
+        raise DmcvbError(f"cannot resume from {path} ({reason}); {cure}") from None
 
 
 def _lay_out(optimizer: torch.optim.Optimizer) -> None:

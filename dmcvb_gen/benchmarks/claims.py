@@ -7,18 +7,17 @@ standard errors on; what lies nearer is left open, whatever its sign.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.benchmarks.suites import BENCHMARKS
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.spec import DISTRACTOR_KINDS
 
 ERRORS = 2.0
 """Standard errors from which on a difference counts."""
@@ -63,7 +62,7 @@ class Answer:
     """One claim at one place.
 
     Attributes:
-      claim: of `CLAIMS`. where: task, data, setting, agents.
+      claim: of `Benchmark.claims`. where: task, data, setting, agents.
       answer: "yes", "no", or "open" where the scores do not tell.
       numbers: what it rests on.
     """
@@ -147,120 +146,44 @@ def _pool(results: Sequence[Mapping[str, Any]]) -> Pooled:
     return Pooled(float(returns.mean()), float(max(within, between)), tuple(seeds.tolist()), data, like_data)
 
 
-def _judge(more: Pooled, less: Pooled) -> tuple[str, str]:
-    """Whether the first is above the second, and the difference as text."""
-    error = math.hypot(more.stderr, less.stderr)
-    difference = more.mean - less.mean
-    answer = OPEN if abs(difference) < ERRORS * error else YES if difference > 0 else NO
-    return answer, f"{difference:+.1f} +- {error:.1f}"
+def answer_of(difference: float, error: float) -> str:
+    """Whether a difference is above 0; open within two standard errors."""
+    return OPEN if abs(difference) < ERRORS * error else YES if difference > 0 else NO
 
 
-def _beside(names: Sequence[str], scores: Sequence[Pooled], difference: str) -> str:
-    listed = ", ".join(f"{name} {score}" for name, score in zip(names, scores, strict=True))
-    return f"{listed}; difference {difference}"
-
-
-def _above(claim: str, where: str, names: Sequence[str], scores: Sequence[Pooled]) -> Answer:
+def above(claim: str, where: str, names: Sequence[str], scores: Sequence[Pooled]) -> Answer:
     """Whether the first of two scores is above the second."""
-    answer, difference = _judge(*scores)
-    return Answer(claim, f"{where}, {names[0]} over {names[1]}", answer, _beside(names, scores, difference))
+    (first, second), (more, less) = names, scores
+    difference, error = more.mean - less.mean, math.hypot(more.stderr, less.stderr)
+    numbers = f"{first} {more}, {second} {less}; difference {difference:+.1f} +- {error:.1f}"
+    return Answer(claim, f"{where}, {first} over {second}", answer_of(difference, error), numbers)
 
 
-def _with(place: Place, **others: str) -> Place:
-    return Place(**{**place.__dict__, **others})
+def pretrained(claim: str) -> Callable[[Scores], Iterator[Answer]]:
+    """Whether an encoder of other data helps: policies on it above BC on the policy's data alone."""
 
-
-def _order(scores: Scores) -> Iterator[Answer]:
-    for place, score in scores.items():
-        if place.benchmark != "b1" or place.setting not in DISTRACTOR_KINDS[:-1]:
-            continue
-        later = DISTRACTOR_KINDS[DISTRACTOR_KINDS.index(place.setting) + 1 :]
-        following = next((kind for kind in later if _with(place, setting=kind) in scores), None)
-        if following:
-            pair = (score, scores[_with(place, setting=following)])
-            where = f"{place.task} {place.learns_from}, {place.agent}"
-            yield _above("order", where, (place.setting, following), pair)
-
-
-def _state(scores: Scores) -> Iterator[Answer]:
-    for place, score in scores.items():
-        if place.benchmark == "b1" and place.agent == "state-bc":
-            within = NEAR * abs(score.data) - abs(score.mean - score.data)
-            answer = OPEN if abs(within) < ERRORS * score.stderr else YES if within > 0 else NO
-            numbers = f"{score}, data {score.data:.1f}; difference {score.mean - score.data:+.1f}"
-            if not score.like_data:
-                answer, numbers = OPEN, f"{numbers}, of episodes that were cut at other lengths"
-            yield Answer("state", f"{place.task} {place.learns_from}", answer, numbers)
-
-
-def _gap(scores: Scores) -> Iterator[Answer]:
-    for place, score in scores.items():
-        if place.benchmark == "b1" and place.agent == "bc":
-            states = [s for p, s in scores.items() if p == _with(place, setting=p.setting, agent="state-bc")]
-            if states:
-                where = f"{place.task} {place.learns_from}, {place.setting}"
-                yield _above("gap", where, ("BC(state)", "BC"), (states[0], score))
-
-
-def _encoder(scores: Scores) -> Iterator[Answer]:
-    for place, score in scores.items():
-        if place.benchmark != "b1" or place.agent != "id+bc" or place.setting == DISTRACTOR_KINDS[0]:
-            continue
-        for other, beside in scores.items():
-            if other.agent.startswith("state-"):
-                continue
-            if other == _with(place, agent=other.agent) and other.agent != place.agent:
-                where = f"{place.task} {place.learns_from}, {place.setting}"
-                yield _above("id", where, (place.agent, other.agent), (score, beside))
-
-
-def _pretrained(benchmark: str, claim: str) -> Callable[[Scores], Iterator[Answer]]:
     def ask(scores: Scores) -> Iterator[Answer]:
         for place, score in scores.items():
             own, with_encoder, _ = place.learns_from.partition(" (encoder: ")
-            reference = _with(place, learns_from=own, agent="bc")
-            if place.benchmark == benchmark and with_encoder and reference in scores:
+            reference = replace(place, learns_from=own, agent="bc")
+            if with_encoder and reference in scores:
                 names, pair = (place.agent, "bc"), (score, scores[reference])
-                yield _above(claim, f"{place.task} {place.learns_from}, {place.setting}", names, pair)
+                yield above(claim, f"{place.task} {place.learns_from}, {place.setting}", names, pair)
 
     return ask
 
 
-def _share(scores: Scores) -> Iterator[Answer]:
-    groups: dict[Place, list[tuple[float, Pooled]]] = {}
-    for place, score in scores.items():
-        if place.benchmark == "ablations":
-            share, percent, level = place.learns_from.rpartition("% ")
-            key = _with(place, learns_from=level)
-            groups.setdefault(key, []).append((float(share) if percent else 100.0, score))
-    for place, shares in groups.items():
-        for (few, less), (many, more) in itertools.pairwise(sorted(shares, key=lambda entry: entry[0])):
-            where = f"{place.task} {place.learns_from}, {place.setting}, {place.agent}"
-            yield _above("share", where, (f"{many:g} %", f"{few:g} %"), (more, less))
-
-
-CLAIMS: dict[str, tuple[str, Callable[[Scores], Iterator[Answer]]]] = {
-    "order": ("Do stronger distractors cost return (none > static > dynamic)?", _order),
-    "state": ("Does BC(state) stay near its data (5 %)?", _state),
-    "gap": ("Is BC(state) above BC from pictures?", _gap),
-    "id": ("Does ID+BC beat the other agents under distractors and in mazes?", _encoder),
-    "mixed": (
-        "Does an encoder of mixed data help a policy of few episodes (B2)?",
-        _pretrained("b2", "mixed"),
-    ),
-    "goals": (
-        "Does an encoder of hidden random goals help a policy of one goal's episodes (B3)?",
-        _pretrained("b3", "goals"),
-    ),
-    "share": ("Does more data give more return?", _share),
-}
-"""Claim -> its words, and who answers it at every place that the scores allow."""
+def claim_words() -> dict[str, str]:
+    """Claim -> its words, of all benchmarks."""
+    return {name: words for one in BENCHMARKS.all().values() for name, (words, _) in one.claims.items()}
 
 
 def judge(results: Iterable[Mapping[str, Any]]) -> list[Answer]:
     """All answers that results (of `report.json`, of any number of seeds) allow; those of profile smoke allow none."""
     scores = pool(result for result in results if result["profile"]["scores"])
-    return [answer for _, answers in CLAIMS.values() for answer in answers(scores)]
-
-
-__all__ = ["CLAIMS", "Answer", "Place", "Pooled", "judge", "pool", "read_reports"]
+    answers: list[Answer] = []
+    for name, benchmark in BENCHMARKS.all().items():
+        own = {place: score for place, score in scores.items() if place.benchmark == name}
+        for _, ask in benchmark.claims.values():
+            answers += ask(own)
+    return answers

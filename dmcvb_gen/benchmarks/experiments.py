@@ -20,15 +20,15 @@ from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
 from dmcvb_gen.agents.data import Normalization, Source, TrainingData, choose_episodes, load_data
-from dmcvb_gen.agents.learners import Batch, Learner, ObservationProbe, Policy, StateProbe
+from dmcvb_gen.agents.learners import Batch, Learner, Policy
+from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, protocol, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.own import AgentData, OwnAgent
-from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.setup import Pretraining, Setup, data_of_run, fingerprint, pretraining_of, read_result
-from dmcvb_gen.benchmarks.suites import Cell, Part
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part
 from dmcvb_gen.benchmarks.trained import save_agent
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.writer import subset_digest
@@ -296,8 +296,8 @@ def _train_policy(
 
 
 def _save_trained(setup: Setup, cell: Cell, policy: Policy, data: TrainingData) -> None:
-    """Keep the policy beside its result, unless its score is noise or its encoder is DINO's, which is large."""
-    if setup.profile.scores and cell.agent.pretrain != "dino":
+    """Keep the policy beside its result, unless its score is noise or its encoder is a large file of the user's."""
+    if setup.profile.scores and not cell.agent.ready_encoder:
         path = setup.cells / f"{cell.id}.safetensors"
         save_agent(path, policy, cell.agent, data.sizes, setup.profile.network, data.normalization)
 
@@ -309,9 +309,7 @@ def _facts(
     agent, profile = cell.agent, setup.profile
     evaluations = [point for point in curve if "score" in point]
     best = max(evaluations, key=lambda point: point["score"]["mean"])
-    paper = (
-        paper_score(cell.task, cell.policy_label, cell.setting, agent.paper_name) if cell.benchmark == "b1" else None
-    )
+    paper = BENCHMARKS.get(cell.benchmark).paper_score(cell)
     return {
         "id": cell.id,
         "cell": cell.facts() | {"policy_label": cell.policy_label, "pretrain_label": cell.pretrain_label},
@@ -409,8 +407,8 @@ def inspect(
     errors: dict[str, Any] = {}
     torch.manual_seed(setup.seed)  # of the readouts' weights, also where training has just been resumed
     readouts = {
-        "observation": ObservationProbe(encoder, data.channels, data.frames.size, setup.profile.network),
-        "state": StateProbe(encoder, data.state.shape[1]),
+        "observation": ObservationProbe(encoder, data.sizes, setup.profile.network),
+        "state": StateProbe(encoder, data.sizes),
     }
     settings = train_settings(setup, setup.profile.readout_steps, frozen=True)
     data = encoded(setup, encoder, data)
@@ -463,7 +461,7 @@ def _field_errors(
     Args:
       units: (state,) what an error is measured in: the same for all cells of a task.
     """
-    errors = [learner.field_errors(batch) for batch in _hold_out_batches(learner, data, size)]
+    errors = [(learner.predict(batch) - batch.state).abs() for batch in _hold_out_batches(learner, data, size)]
     if not errors:
         return None
     scale = (data.normalization.std / units).to(data.device)

@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
 from dmcvb_gen.benchmarks.checks import Structure, known_returns
-from dmcvb_gen.benchmarks.claims import CLAIMS, judge
+from dmcvb_gen.benchmarks.claims import claim_words, judge
 from dmcvb_gen.benchmarks.figures import (
     agreement_figures,
     curve_figures,
@@ -32,14 +32,14 @@ from dmcvb_gen.benchmarks.figures import (
 )
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.setup import Setup
-from dmcvb_gen.benchmarks.suites import Cell, Missing
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Missing
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_returns, paper_task
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, VISIBLE, is_maze, task_folder
+from dmcvb_gen.spec import FIXED, task_folder
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import pluralize
 from dmcvb_gen.version import __version__
@@ -60,12 +60,6 @@ CHECKS = {
     "labels": "distractor labels fit their setting",
 }
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
-TITLES = {
-    "b1": "B1: policies on every level and distractor",
-    "b2": "B2: encoders from mixed data, policies from few expert episodes",
-    "b3": "B3: encoders from hidden random goals, policies from the episodes of one fixed goal",
-    "ablations": "Ablations",
-}
 SHOWN = 200
 """Findings on the page; the JSON file has all."""
 SHEETS = 60
@@ -150,10 +144,8 @@ def release_episodes(release: Release) -> tuple[dict[str, int], dict[str, int]]:
 
 
 def compare(cell: Cell, results: Results) -> dict[str, Any]:
-    """A score beside that of the cell's reference on the same data.
+    """A score beside that of the cell's reference (`Benchmark.reference`).
 
-    B1 refers to BC(state), B2 and ablations to BC on all of expert/none (paper, appendix "Dataset size study"; mazes:
-    expert/visible), B3 to BC on the same episodes of one goal.
     A share means something where 0 is the least that an episode can return; elsewhere (mazes: -800 is not "twenty
     times" -40) the difference stands.
 
@@ -162,34 +154,20 @@ def compare(cell: Cell, results: Results) -> dict[str, Any]:
       difference: from the reference's score; None where there is none.
       reference: what it refers to.
     """
+    benchmark = BENCHMARKS.get(cell.benchmark)
     scores = {other: result["score"]["mean"] for other, result in results if "error" not in result}
-    whole = f"BC on all of expert/{_whole_setting(cell)}"
-    reference = {"b2": whole, "ablations": whole, "b3": "BC on these episodes"}.get(cell.benchmark, "BC(state)")
-    found = [mean for other, mean in scores.items() if _is_reference(other, cell)]
+    like = [other for other in scores if (other.benchmark, other.task) == (cell.benchmark, cell.task)]
+    found = [scores[other] for other in like if benchmark.is_reference(other, cell)]
     shares = get_task(cell.task).return_range[0] >= 0
     ours = paper = difference = None
     if found:
         difference = scores[cell] - found[0]
         ours = scores[cell] / found[0] if shares and found[0] > 0 else None
-    if shares and cell.benchmark == "b1":
-        published = paper_score(cell.task, cell.policy_label, cell.setting, cell.agent.paper_name)
+    published = benchmark.paper_score(cell)
+    if shares and published:
         whole = paper_score(cell.task, cell.policy_label, cell.setting, "bc(state)")
-        paper = published[0] / whole[0] if published and whole else None
-    return {"share": ours, "paper_share": paper, "difference": difference, "reference": reference}
-
-
-def _is_reference(other: Cell, cell: Cell) -> bool:
-    if (other.benchmark, other.task) != (cell.benchmark, cell.task):
-        return False
-    if cell.benchmark in ("b2", "ablations"):
-        return (other.setting, other.agent.name, other.policy_label) == (_whole_setting(cell), "bc", "expert")
-    if cell.benchmark == "b3":
-        return other.agent.name == "bc" and other.policy == cell.policy
-    return other.agent.name == "state-bc" and other.policy_label == cell.policy_label
-
-
-def _whole_setting(cell: Cell) -> str:
-    return VISIBLE if is_maze(cell.task) else DISTRACTOR_KINDS[0]
+        paper = published[0] / whole[0] if whole else None
+    return {"share": ours, "paper_share": paper, "difference": difference, "reference": benchmark.reference(cell)}
 
 
 # -- the page -------------------------------------------------------------------------------------
@@ -332,12 +310,12 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
         key = (task_folder(cell["task"]), cell["policy_label"], cell["setting"])
         data[key] = _data_lines(result["data"])
         rows.setdefault(key, {})[cell["agent_name"]] = entry = _score(result)
-        if cell["agent"]["sees_state"] and benchmark == "b1":
+        if cell["agent"]["sees_state"]:
             by_state.setdefault(key[:2], {})[cell["agent_name"]] = entry
     for key, row in rows.items():  # states know of no distractors: one score stands beside those of every setting
-        row |= by_state.get(key[:2], {})
+        rows[key] = by_state.get(key[:2], {}) | row
     return {
-        "title": TITLES.get(benchmark, benchmark),
+        "title": BENCHMARKS.get(benchmark).title,
         "head": ("task", "policy learns from", "setting", "the data's own", *agents),
         "rows": [
             {"facts": key, "data": data[key], "scores": [row.get(agent) for agent in agents]}
@@ -351,11 +329,9 @@ def _groups(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     groups: dict[tuple, list[Mapping[str, Any]]] = {}
     for result in results:
         cell = result["cell"]
-        group, layouts = paper_task(cell["task"]), cell["policy_label"]
-        if group not in MAZE_GROUPS.values() or not result["profile"]["scores"]:
+        if paper_task(cell["task"]) not in MAZE_GROUPS.values() or not result["profile"]["scores"]:
             continue
-        if cell["benchmark"] == "b3":
-            group, layouts = task_folder(cell["task"]), layouts.partition(" goal ")[0]
+        group, layouts = BENCHMARKS.get(cell["benchmark"]).group(cell["task"], cell["policy_label"])
         encoder = f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else ""
         key = (cell["benchmark"], group, layouts, cell["setting"], cell["agent_name"] + encoder)
         groups.setdefault(key, []).append(result)
@@ -433,7 +409,8 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _answers(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    return [(CLAIMS[a.claim][0], a.where, a.answer, a.numbers) for a in judge(results)]
+    words = claim_words()
+    return [(words[a.claim], a.where, a.answer, a.numbers) for a in judge(results)]
 
 
 def _inspection(good: Results, profile: str) -> list[tuple]:

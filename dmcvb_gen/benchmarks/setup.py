@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.agents.catalog import Agent
-from dmcvb_gen.agents.dino import dino_digest
 from dmcvb_gen.benchmarks.evaluate import protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.own import OwnAgent
@@ -116,26 +115,24 @@ class Pretraining:
 
 
 def pretraining_of(cell: Cell) -> Pretraining | None:
-    """What a cell's encoder needs; None where it is trained with the policy, or is DINO's."""
-    agent = cell.agent
-    if agent.pretrain in (None, "dino"):
+    """What a cell's encoder needs; None if it is trained with the policy, or comes from a file."""
+    if cell.agent.pretrain is None or cell.agent.ready_encoder:
         return None
-    encoder_agent = dataclasses.replace(agent, policy="bc")  # the policy has no part in it
     setting = cell.pretrain_parts[0].subset.split("/")[-1]
-    return Pretraining(cell.task, setting, encoder_agent, cell.pretrain_parts)
+    return Pretraining(cell.task, setting, cell.agent.pretraining, cell.pretrain_parts)
 
 
 def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str:
     """SHA-256 of everything that decides a result, the machine aside.
 
     Raises:
-      DmcvbError: DINO's weights or background videos are needed and not there.
+      DmcvbError: an encoder's weights or background videos are needed and not there.
     """
     subsets = {part.subset for part in (work.parts if isinstance(work, Pretraining) else ())}
     subsets |= set(work.subsets if isinstance(work, Cell) else ())
     facts = {
         "version": RESULT_VERSION,
-        "work": dataclasses.asdict(work),
+        "work": dataclasses.asdict(work) | {"agent": work.agent.facts()},
         "profile": dataclasses.asdict(setup.profile),
         "seed": setup.seed,
         "data": {name: subset_digest(release[name].commits) for name in sorted(subsets)},
@@ -153,8 +150,8 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
             facts["speed"] = "straight"  # results of before measured the data's along the path
         if work.agent.own:
             facts["own"] = OwnAgent.load(work.agent.own).digest
-        if work.agent.pretrain == "dino":
-            facts["dino"] = dino_digest(setup.dino_weights)
+        if work.agent.ready_encoder:
+            facts[work.agent.pretrain] = work.agent.ready_encoder.digest(setup.dino_weights)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 

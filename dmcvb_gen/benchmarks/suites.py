@@ -1,54 +1,29 @@
-"""The benchmarks as tables: a release's subsets in, cells (agent, pre-training set, policy set) out.
+"""What a benchmark is: a release's subsets in, cells (agent, pre-training set, policy set) out.
 
-b1         every agent on every level and distractor                           (paper, section 5.1)
-b2         encoders from mixed data, policies from 20 expert episodes          (section 5.2)
-b3         encoders from hidden random goals, policies from ten episodes of one fixed goal (section 5.3)
-ablations  frames of a stack, k of inverse dynamics, share of the data         (appendix)
+Each benchmark has a file in `definitions`, and registers itself; `plan_benchmark` gives the cells of one.
 """
 
 from __future__ import annotations
 
-import itertools
+import abc
 import re
 import shlex
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from dmcvb_gen.agents.catalog import Agent, parse_agent
-from dmcvb_gen.agents.data import part_count
 from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.spec import (
-    ANT_MAZE,
-    DISTRACTOR_KINDS,
-    FIXED,
-    HIDDEN,
-    LEVELS,
-    MAZE_TRAINED_LEVELS,
-    VISIBLE,
-    is_maze,
-    subset_name,
-)
+from dmcvb_gen.policies.paper import paper_task
+from dmcvb_gen.registry import Registry
+from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, LEVELS, VISIBLE, is_maze, subset_name
 
-BENCHMARKS = ("b1", "b2", "b3", "ablations")
-POLICY_SETS = (("expert",), ("medium",), ("expert", "medium"), ("mixed",), ("random",))
-"""Levels of the data that a policy learns from, B1; mazes have the first two, and others where a release has them."""
-B1_AGENTS = ("state-bc", "bc", "td3-bc", "id+bc", "lfd+bc", "ae+bc", "state+bc")
-"""The paper's columns; DINO's needs weights, so it is asked for by name."""
-B3_LEVEL = "expert"
-B3_PAIRS = 5
+FIXED_GOALS = 5
 """Fixed (start, goal) pairs a layout, as the paper made them."""
 DEFAULT_EPISODES = 100
 """That a command asks for where the release has none to go by."""
-FEW_EPISODES = 20
-"""B2: 1 % of the paper's expert subset of 2,000 episodes."""
-B2_AGENTS = ("id+bc", "bc+bc", "lfd+bc", "ae+bc")
-B3_AGENTS = ("bc+bc", "id+bc")
-ABLATION_AGENTS = ("bc:frames=1", "bc", "bc+bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10,sample")
-"""Inverse dynamics over more steps stand beside pre-training by BC, which the paper sees them tend to."""
-SHARES = (0.01, 0.05, 0.1, 0.25, 0.5)
 
 
 @dataclass(frozen=True)
@@ -116,7 +91,7 @@ class Cell:
 
     def facts(self) -> dict[str, Any]:
         """Everything that decides the cell, as plain values."""
-        return asdict(self) | {"agent": asdict(self.agent), "agent_name": self.agent.name}
+        return asdict(self) | {"agent": self.agent.facts(), "agent_name": self.agent.name}
 
 
 @dataclass(frozen=True)
@@ -141,30 +116,7 @@ def slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", text.replace("%", "pc")).strip("-")
 
 
-def plan_benchmark(
-    name: str, release: Release, agents: Sequence[str] = (), left_out: Collection[str] = ()
-) -> tuple[list[Cell], list[Missing]]:
-    """The cells that a release has the data for, and what is missing for the others.
-
-    Args:
-      name: one of `BENCHMARKS`.
-      agents: names instead of the benchmark's own. B2 and B3 compare encoders: of these, they take those that have one
-        of their own, beside BC without.
-      left_out: subsets that are there but that the user left out of `release`.
-
-    Raises:
-      DmcvbError: no such benchmark or agent.
-    """
-    makers = {"b1": _b1, "b2": _b2, "b3": _b3, "ablations": _ablations}
-    if name not in makers:
-        raise UnknownNameError("benchmark", name, BENCHMARKS)
-    shelf = _Shelf(release)
-    chosen = [parse_agent(agent) for agent in agents]
-    cells = list(makers[name](shelf, chosen))
-    return list(dict.fromkeys(cells)), shelf.missing(name, left_out)
-
-
-class _Shelf:
+class SubsetFinder:
     """The subsets of a release by (task, level, setting); remembers what was asked for in vain."""
 
     def __init__(self, release: Release):
@@ -236,82 +188,93 @@ class _Shelf:
             return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count} {out}"
         goals = [setting for setting in settings if setting != FIXED]
         lines = [f"{rollout} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}"] if goals else []
-        lines += [f"{rollout} --fixed-goals {B3_PAIRS}"] if FIXED in settings else []
+        lines += [f"{rollout} --fixed-goals {FIXED_GOALS}"] if FIXED in settings else []
         return "; ".join(f"{line} {out}-{number}" for number, line in enumerate(lines))
 
 
-def _b1(shelf: _Shelf, agents: list[Agent]):
-    agents = agents or [parse_agent(name) for name in B1_AGENTS]
-    for task in shelf.tasks:
-        if is_maze(task):
-            settings = [VISIBLE]
-            others = [(level,) for level in shelf.levels(task, VISIBLE) if level not in MAZE_TRAINED_LEVELS]
-            sets = [*((level,) for level in MAZE_TRAINED_LEVELS), *others]
-        else:
-            settings, sets = list(dict.fromkeys([*DISTRACTOR_KINDS, *shelf.settings(task)])), list(POLICY_SETS)
-        for levels in sets:
-            state_done = False
-            for setting in settings:
-                parts = shelf.parts(task, levels, setting)
-                if not parts:
-                    continue
-                for agent in agents:
-                    if agent.sees_state and state_done:
-                        continue  # states know of no distractors: one cell serves all
-                    yield Cell("b1", task, setting, agent, parts)
-                state_done = True
+class Benchmark(abc.ABC):
+    """A benchmark: which cells a release has the data for, and what their scores are set beside.
+
+    Attributes:
+      name: that it is registered under. title: of its table in the report.
+      agents: names of the agents that it runs unless others are asked for.
+      compares_encoders: its agents are those with a pre-trained encoder; it sets BC beside them by itself.
+    """
+
+    name: str
+    title: str
+    agents: tuple[str, ...]
+    compares_encoders = False
+
+    @abc.abstractmethod
+    def cells(self, data: SubsetFinder, agents: Sequence[Agent]) -> Iterator[Cell]:
+        """The cells that the data allow; what `data` is asked for in vain is reported as missing."""
+
+    def paper_score(self, cell: Cell) -> tuple[float, float] | None:
+        """(mean, standard error) that the paper has of a cell."""
+        return None
+
+    def reference(self, cell: Cell) -> str:
+        """What a cell's score is set beside, in words; by default the paper's appendix "Dataset size study"."""
+        return f"BC on all of expert/{_whole_setting(cell)}"
+
+    def is_reference(self, other: Cell, cell: Cell) -> bool:
+        """Whether another cell of the same task is that reference."""
+        return (other.setting, other.agent.name, other.policy_label) == (_whole_setting(cell), "bc", "expert")
+
+    def group(self, task: str, policy_label: str) -> tuple[str, str]:
+        """(mazes, policy learns from) of the maze cells that the report takes the mean of."""
+        return paper_task(task), policy_label
+
+    def warnings(self, release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
+        """What makes its scores say less than they seem to."""
+        return iter(())
+
+    @property
+    def claims(self) -> Mapping[str, tuple[str, Callable]]:
+        """Claim -> its words, and a function that answers it from scores (see `claims`)."""
+        return {}
 
 
-def _b2(shelf: _Shelf, agents: list[Agent]):
-    encoders = [agent for agent in agents or map(parse_agent, B2_AGENTS) if agent.pretrain]
-    bc, reference = parse_agent("bc"), parse_agent("bc")
-    for task in [task for task in shelf.tasks if not is_maze(task)]:
-        full = shelf.parts(task, ["expert"], "none")
-        if full:
-            yield Cell("b2", task, "none", reference, full)  # scores are shares of this one
-        for setting in shelf.settings(task):
-            few = shelf.first(task, "expert", setting, FEW_EPISODES)
-            mixed = shelf.parts(task, ["mixed"], setting)
-            if not few:
-                continue
-            yield Cell("b2", task, setting, bc, few)
-            if mixed:
-                yield Cell("b2", task, setting, bc, few + mixed)
-                for agent in encoders:
-                    yield Cell("b2", task, setting, agent, few, mixed)
+def _whole_setting(cell: Cell) -> str:
+    return VISIBLE if is_maze(cell.task) else DISTRACTOR_KINDS[0]
 
 
-def _b3(shelf: _Shelf, agents: list[Agent]):
-    encoders = [agent for agent in agents or map(parse_agent, B3_AGENTS) if agent.pretrain]
-    mazes = [task for task in shelf.tasks if is_maze(task)]
-    for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
-        for level in shelf.levels(task, FIXED) or [B3_LEVEL]:
-            fixed, hidden = shelf.find(task, [level], FIXED), shelf.parts(task, [level], HIDDEN)
-            if not fixed:
-                continue
-            for pair in shelf.pairs(fixed[0]):
-                ten = (Part(fixed[0], goal_pair=pair),)
-                yield Cell("b3", task, FIXED, parse_agent("bc"), ten)
-                for agent in encoders if hidden else ():
-                    yield Cell("b3", task, FIXED, agent, ten, hidden)
+BENCHMARKS: Registry[Benchmark] = Registry("benchmark", "dmcvb_gen.benchmarks.definitions", "dmcvb_gen.benchmarks")
 
 
-def _distinct_shares(episodes: int) -> list[float]:
-    """Shares of a number of episodes, the largest of those that come to the same count."""
-    counts = {part_count(share, episodes): share for share in SHARES}
-    return [share for count, share in counts.items() if count < episodes]
+def register_benchmark(name: str) -> Callable[[type[Benchmark]], type[Benchmark]]:
+    """Class decorator that makes a benchmark known by name.
+
+    Raises:
+      DmcvbError: another class has that name already.
+    """
+
+    def register(benchmark: type[Benchmark]) -> type[Benchmark]:
+        benchmark.name = name
+        BENCHMARKS.add(name, benchmark(), code=benchmark)
+        return benchmark
+
+    return register
 
 
-def _ablations(shelf: _Shelf, agents: list[Agent]):
-    agents = agents or [parse_agent(name) for name in ABLATION_AGENTS]
-    for task in shelf.tasks:
-        for setting in [VISIBLE] if is_maze(task) else shelf.settings(task):
-            parts = shelf.parts(task, ["expert"], setting)
-            if not parts:
-                continue
-            for agent in agents:
-                yield Cell("ablations", task, setting, agent, parts)
-            pictures = [agent for agent in agents if agent.name == "bc"]
-            shares = _distinct_shares(len(shelf.release[parts[0].subset].episodes))
-            for share, agent in itertools.product(shares, pictures):
-                yield Cell("ablations", task, setting, agent, (Part(parts[0].subset, share=share),))
+def plan_benchmark(
+    name: str, release: Release, agents: Sequence[str] = (), left_out: Collection[str] = ()
+) -> tuple[list[Cell], list[Missing]]:
+    """The cells that a release has the data for, and what is missing for the others.
+
+    Args:
+      name: of a registered benchmark.
+      agents: names instead of the benchmark's own. B2 and B3 compare encoders: of these, they take those that have one
+        of their own, beside BC without.
+      left_out: subsets that are there but that the user left out of `release`.
+
+    Raises:
+      DmcvbError: no such benchmark or agent.
+    """
+    benchmark, data = BENCHMARKS.get(name), SubsetFinder(release)
+    chosen = [parse_agent(agent) for agent in agents or benchmark.agents]
+    if benchmark.compares_encoders:
+        chosen = [agent for agent in chosen if agent.pretrain]
+    cells = list(benchmark.cells(data, chosen))
+    return list(dict.fromkeys(cells)), data.missing(name, left_out)

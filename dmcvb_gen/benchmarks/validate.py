@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from dmcvb_gen.benchmarks.profiles import get_profile
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
 from dmcvb_gen.benchmarks.setup import Setup, open_data
-from dmcvb_gen.benchmarks.suites import FEW_EPISODES, Cell, Missing, plan_benchmark
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Missing, plan_benchmark
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError
@@ -160,7 +160,7 @@ def validate(
     Args:
       path: the release's folder.
       setup: profile, report folder, device.
-      benchmarks: names out of `tables.BENCHMARKS`; none: structure checks alone.
+      benchmarks: of registered benchmarks; none: structure checks alone.
       agents: instead of each benchmark's own.
       patterns: only these subsets.
       workers: subsets checked and cells trained side by side, or a Ray cluster that sees the same folders.
@@ -189,7 +189,7 @@ def validate(
     warnings = (
         *structure.warnings,
         *_learning_warnings(setup, results),
-        *_few_warnings(chosen, cells),
+        *_benchmark_warnings(chosen, cells),
         *_seen_warnings(chosen, cells, setup.backgrounds),
     )
     report, facts = write_report(
@@ -246,15 +246,9 @@ def check_writable(folder: str | Path) -> None:
         raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
 
 
-def _few_warnings(release: Release, cells: Sequence[Cell]) -> list[Issue]:
-    """B2 asks what few expert episodes give; a release that has no more of them does not tell."""
-    found = {}
-    for part in (part for cell in cells if cell.benchmark == "b2" for part in cell.policy):
-        there = len(release[part.subset].episodes)
-        if part.episodes == there:
-            text = f"b2 learns from {FEW_EPISODES} expert episodes, and {there} are all there are; roll out more"
-            found[part.subset] = Issue("learning", part.subset, text)
-    return list(found.values())
+def _benchmark_warnings(release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
+    for name in dict.fromkeys(cell.benchmark for cell in cells):
+        yield from BENCHMARKS.get(name).warnings(release, [cell for cell in cells if cell.benchmark == name])
 
 
 def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> list[Issue]:

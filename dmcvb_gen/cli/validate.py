@@ -120,7 +120,7 @@ def claims(reports, as_json):
     from dataclasses import asdict
 
     from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
-    from dmcvb_gen.benchmarks.claims import CLAIMS, judge, pool, read_reports
+    from dmcvb_gen.benchmarks.claims import claim_words, judge, pool, read_reports
 
     results = read_reports(reports)
     answers, pooled, ranks = judge(results), pool(results), rank_agreement(shared_cells(results))
@@ -133,7 +133,7 @@ def claims(reports, as_json):
         seeds = ", ".join(f"{mean:.1f}" for mean in score.seeds)
         where = f"{place.benchmark} {place.task} {place.learns_from}, {place.setting}"
         click.echo(f"{where}, {place.agent}: {score} (seeds: {seeds}); data {score.data:.1f}")
-    for name, (words, _) in CLAIMS.items():
+    for name, words in claim_words().items():
         found = [answer for answer in answers if answer.claim == name]
         if found:
             click.echo(f"\n{words}")

@@ -43,12 +43,12 @@ from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import save_policy
 from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, MazeName
+from dmcvb_gen.state_file import STATE, pack_state, read_state
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.networks import as_arrays
 from dmcvb_gen.training.pruning import prunable_checkpoints
 from dmcvb_gen.training.run_log import RunLog
 from dmcvb_gen.training.settings import check_settings
-from dmcvb_gen.training.state_file import STATE, pack_state, read_state
 
 EVALUATION_EPISODES = 20
 """Episodes of an evaluation along the way, at most; selection evaluates its picks again on 100."""

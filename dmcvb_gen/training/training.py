@@ -20,6 +20,7 @@ from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.state_file import read_state
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import Episodes, shaping_of
@@ -36,7 +37,6 @@ from dmcvb_gen.training.runs import (
 )
 from dmcvb_gen.training.sac import ReplayBuffer, ReplayLearner, Sac
 from dmcvb_gen.training.settings import check_settings
-from dmcvb_gen.training.state_file import read_state
 
 __all__ = ["Progress", "Run", "RunConfig", "SacRun", "command_of", "open_run", "read_config"]
 

@@ -13,21 +13,14 @@ A format of your own is a function with a decorator, and a line in your package'
 
 from __future__ import annotations
 
-import functools
 import importlib
-import logging
-import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.loaders.release import ReleaseReader
-
-GROUP = "dmcvb_gen.exporters"
-"""Entry points of other packages: modules that register a format when they are imported."""
-_log = logging.getLogger(__name__)
+from dmcvb_gen.registry import Registry
 
 
 def subset_folder(release: ReleaseReader, subset: str) -> str:
@@ -70,7 +63,7 @@ class Format:
                 raise DmcvbError(f"export to {self.name}: {install_hint(name) or f'pip install {name}'}") from None
 
 
-_formats: dict[str, Format] = {}
+FORMATS: Registry[Format] = Registry("format", "dmcvb_gen.release.export.formats", "dmcvb_gen.exporters")
 
 
 def register_exporter(name: str, **facts) -> Callable[[Callable], Callable]:
@@ -81,33 +74,15 @@ def register_exporter(name: str, **facts) -> Callable[[Callable], Callable]:
     """
 
     def register(write: Callable) -> Callable:
-        known = _formats.get(name)
-        if known and known.write is not write:
-            raise DmcvbError(f"two exporters are called {name}: {known.write.__module__} and {write.__module__}")
-        _formats[name] = Format(name, write, **facts)
+        FORMATS.add(name, Format(name, write, **facts), code=write)
         return write
 
     return register
 
 
-@functools.cache
-def _load() -> None:
-    """Import every module that registers a format."""
-    from dmcvb_gen.release.export import formats
-
-    for module in pkgutil.iter_modules(formats.__path__):
-        importlib.import_module(f"{formats.__name__}.{module.name}")
-    for entry in entry_points(group=GROUP):
-        try:
-            entry.load()
-        except Exception as error:  # a broken package of somebody else must not stop an export to HDF5
-            _log.warning("exporter %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
-
-
 def all_formats() -> Mapping[str, Format]:
     """Name -> format, of this package and of all installed ones."""
-    _load()
-    return _formats
+    return FORMATS.all()
 
 
 def get_format(name: str) -> Format:
@@ -116,9 +91,7 @@ def get_format(name: str) -> Format:
     Raises:
       UnknownNameError: there is none; the message lists those that there are.
     """
-    if name not in all_formats():
-        raise UnknownNameError("format", name, all_formats())
-    return _formats[name]
+    return FORMATS.get(name)
 
 
 def format_table() -> str:

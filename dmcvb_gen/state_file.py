@@ -1,7 +1,7 @@
-"""Files that runs go on from: nested tensors, numbers and texts in, a safetensors file out, and back.
+"""The files that trainings resume from, of policies and of agents: nested tensors, numbers and texts.
 
-A run's folder may come from somebody else (`--init-from`, `--resume`), so its state is read as data: tensors by number,
-and a JSON tree that says where each belongs. Nothing in such a file can run.
+A folder may come from somebody else (`--init-from`, `--resume`), so a state is read as data: tensors by number, and a
+JSON tree that says where each belongs. Nothing in such a file can run.
 """
 
 from __future__ import annotations
@@ -58,12 +58,24 @@ def read_state(folder: str | Path) -> dict[str, Any] | None:
         if old.exists():
             raise DmcvbError(f"{old} is of an older dmcvb-gen and is not read; give a policy file, or start again")
         return None
+    return read_state_file(path, "start again with another --out")
+
+
+def read_state_file(path: str | Path, otherwise: str) -> Any:
+    """What `pack_state` made the file of.
+
+    Args:
+      otherwise: what to do if it cannot be read, for the message.
+
+    Raises:
+      DmcvbError: the file is damaged, or holds something else.
+    """
     try:
         with safe_open(path, framework="pt") as file:
             return _value(json.loads((file.metadata() or {})["state"]), file)
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DmcvbError(f"{path} cannot be read ({reason}); start again with another --out") from None
+        raise DmcvbError(f"{path} cannot be read ({reason}); {otherwise}") from None
 
 
 def _value(tree: Any, file: Any) -> Any:

@@ -1,0 +1,1 @@
+"""One file per benchmark; each registers itself, as docs/extending.md shows."""

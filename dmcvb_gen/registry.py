@@ -1,0 +1,71 @@
+"""Registries: tables of named things that this package, its users and installed packages add to.
+
+A thing enters its table when its module is imported, by a decorator. A registry imports the modules of one folder of
+this package, and those that installed packages name in a group of entry points, when it is first asked.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import pkgutil
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any, Generic, TypeVar
+
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+
+Thing = TypeVar("Thing")
+_log = logging.getLogger(__name__)
+
+
+class Registry(Generic[Thing]):
+    """Name -> thing of one kind.
+
+    Args:
+      kind: what it holds, for messages: "format".
+      package: the package of ours whose modules register their things on import.
+      group: entry points of other packages, modules or objects in them, that do so too.
+    """
+
+    def __init__(self, kind: str, package: str, group: str):
+        self.kind, self.package, self.group = kind, package, group
+        self._things: dict[str, Thing] = {}
+        self._code: dict[str, Any] = {}
+        self._loaded = False
+
+    def add(self, name: str, thing: Thing, code: Any = None) -> None:
+        """Register a thing; `code` is the function or class that it was made of, if it is none itself.
+
+        Raises:
+          DmcvbError: the name is taken by other code.
+        """
+        code = code or thing
+        known = self._code.get(name, code)
+        if known is not code and (known.__module__, known.__qualname__) != (code.__module__, code.__qualname__):
+            where = f"{known.__module__} and {code.__module__}"
+            raise DmcvbError(f"two {self.kind}s are called {name}: {where}; rename one of them")
+        self._things[name], self._code[name] = thing, code
+
+    def all(self) -> Mapping[str, Thing]:
+        """All things by name, this package's first."""
+        if not self._loaded:
+            self._loaded = True
+            for module in pkgutil.iter_modules(importlib.import_module(self.package).__path__):
+                importlib.import_module(f"{self.package}.{module.name}")
+            for entry in metadata.entry_points(group=self.group):
+                try:
+                    entry.load()
+                except Exception as error:  # a broken package of somebody else must not stop all others
+                    _log.warning("%s %s (%s) cannot be loaded: %s", self.kind, entry.name, entry.value, error)
+        return self._things
+
+    def get(self, name: str) -> Thing:
+        """The thing of a name.
+
+        Raises:
+          UnknownNameError: there is none; the message lists those that there are.
+        """
+        if name not in self.all():
+            raise UnknownNameError(self.kind, name, self.all())
+        return self._things[name]
