@@ -11,5 +11,5 @@ from dmcvb_gen.generate.shipped import write_archive
 
 for release in sys.argv[1:]:
     name = load_manifest(release)[1].name
-    out = Path(__file__).parents[1] / "dmcvb_gen/generate/data/manifests" / f"{name}.zip"
+    out = Path(__file__).parents[1] / "dmcvb_gen/generate/data/manifests" / f"{name}.tar.xz"
     print(f"{out}: {write_archive(release, out):,} bytes")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 
+import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies import archives
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack
+from dmcvb_gen.policies.packing import pack_files
 
 NAME = "walker-walk/expert.safetensors"
 
@@ -47,18 +49,41 @@ def test_without_a_cache_that_can_be_written_the_temporary_folder_serves(tmp_pat
         bundled_file(NAME)
 
 
+def policy(seed, scale=1.0):
+    """A safetensors file whose weights resemble those of other seeds, and hold what floats can hold."""
+    weights = np.random.default_rng(0).normal(0, 0.1, (30, 20)).astype(np.float32)
+    weights[10:] += np.random.default_rng(seed).normal(0, 0.01, (20, 20)).astype(np.float32)
+    weights[0, :6] = [0.0, -0.0, 1e-12, -1e-12, np.finfo(np.float32).smallest_subnormal, 3.0]
+    zeros, few = np.zeros(5, np.float32), np.float32([[1e-30], [-1e30]])
+    return save({"weight": scale * weights, "zeros": zeros, "few": few, "bias": weights[1]}, {"header": "{}"})
+
+
 def test_packed_files_come_out_as_they_were(tmp_path, monkeypatch, cache):
     folder, out = tmp_path / "plain", tmp_path / "data"
-    contents = {f"{task}/expert.safetensors": os.urandom(100) for task in ("a-task", "ant-maze-x", "ant-maze-y")}
+    tasks = ("a-task", "ant-maze-x", "ant-maze-y")
+    contents = {f"{task}/expert.safetensors": policy(seed, 1.0 + seed) for seed, task in enumerate(tasks)}
     for name, content in contents.items():
         (folder / name).parent.mkdir(parents=True)
         (folder / name).write_bytes(content)
     out.mkdir()
     pack(folder, out)
-    assert sorted(path.name for path in out.iterdir()) == ["a-task.tar.xz", "ant-maze.tar.xz", "policies.json"]
+    assert sorted(path.name for path in out.iterdir()) == ["a-task.zip", "ant-maze.zip", "policies.json"]
     monkeypatch.setattr(archives, "data_folder", lambda: out)
     bundled_digests.cache_clear()
     try:
         assert {name: bundled_file(name).read_bytes() for name in contents} == contents
     finally:
         bundled_digests.cache_clear()
+
+
+def test_what_files_share_is_packed_once():
+    def size(*seeds):
+        return len(pack_files({str(place): policy(seed) for place, seed in enumerate(seeds)}))
+
+    same, alike = size(1, 1) - size(1), size(1, 2) - size(1)
+    assert same < 400 and same < alike < 0.9 * size(1)
+
+
+def test_arrays_of_other_types_are_refused():
+    with pytest.raises(ValueError, match="weight is F64"):
+        pack_files({"a": save({"weight": np.zeros(3)})})

@@ -43,7 +43,7 @@ def test_a_random_shard_of_each_has_the_released_bytes(name, tmp_path):
 
 
 def test_the_archive_of_a_release_makes_its_shards_and_finds_others(small_release, tmp_path):
-    archive = tmp_path / "small.zip"
+    archive = tmp_path / "small.tar.xz"
     assert write_archive(small_release, archive) == archive.stat().st_size
     shutil.unpack_archive(archive, tmp_path / "bare")
     assert {path.name for path in (tmp_path / "bare").iterdir()} == {MANIFEST, INDEX}
@@ -61,7 +61,7 @@ def test_an_incomplete_release_is_not_shipped(small_release, tmp_path):
     shutil.copytree(small_release, tmp_path / "r")
     (tmp_path / "r" / INDEX).unlink()
     with pytest.raises(StoreError, match="not complete"):
-        write_archive(tmp_path / "r", tmp_path / "r.zip")
+        write_archive(tmp_path / "r", tmp_path / "r.tar.xz")
 
 
 @pytest.mark.parametrize(

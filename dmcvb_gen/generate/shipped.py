@@ -7,8 +7,10 @@ release can be made anywhere, and each of its files is compared with the release
 from __future__ import annotations
 
 import contextlib
+import io
+import lzma
+import tarfile
 import tempfile
-import zipfile
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -17,13 +19,13 @@ from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.errors import StoreError, UnknownNameError
 
 _FOLDER = resources.files("dmcvb_gen.generate") / "data" / "manifests"
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every file in an archive, so that equal releases give equal archives."""
+ENDING = ".tar.xz"
 
 
 def shipped_manifests() -> tuple[str, ...]:
     """Names of the releases whose manifests are in the package."""
-    return tuple(sorted(path.name.removesuffix(".zip") for path in _FOLDER.iterdir() if path.name.endswith(".zip")))
+    names = [path.name for path in _FOLDER.iterdir()]
+    return tuple(sorted(name.removesuffix(ENDING) for name in names if name.endswith(ENDING)))
 
 
 @contextlib.contextmanager
@@ -44,9 +46,9 @@ def manifest_source(source: str | Path) -> Iterator[Path]:
         raise StoreError(f"{path} is not there; give a manifest's file or a name: {', '.join(shipped_manifests())}")
     if str(source) not in shipped_manifests():
         raise UnknownNameError("manifest", str(source), shipped_manifests())
-    with tempfile.TemporaryDirectory() as folder, resources.as_file(_FOLDER / f"{source}.zip") as archive:
-        with zipfile.ZipFile(archive) as file:
-            file.extractall(folder)
+    with tempfile.TemporaryDirectory() as folder, resources.as_file(_FOLDER / f"{source}{ENDING}") as archive:
+        with tarfile.open(archive) as file:
+            file.extractall(folder, filter="data")
         yield Path(folder)
 
 
@@ -65,7 +67,12 @@ def write_archive(release: str | Path, out: str | Path) -> int:
     root, manifest = load_manifest(release)
     if not manifest.complete or trusted_index(root, manifest) is None:
         raise StoreError(f"{root} is not complete; finish it with the command that began it")
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_LZMA) as archive:
-        for name in (MANIFEST, INDEX):
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), (root / name).read_bytes(), zipfile.ZIP_LZMA)
+    # One stream, because both hold the same digests; without times, so that equal releases give equal archives.
+    with lzma.open(out, "wb", preset=9 | lzma.PRESET_EXTREME) as packed:
+        with tarfile.open(fileobj=packed, mode="w") as archive:
+            for name in (MANIFEST, INDEX):
+                content = (root / name).read_bytes()
+                member = tarfile.TarInfo(name)
+                member.size = len(content)
+                archive.addfile(member, io.BytesIO(content))
     return Path(out).stat().st_size

@@ -1,32 +1,26 @@
 """The package's own policies: a task and a file's name in, the file unpacked into the user's cache out.
 
-`data/<group>.tar.xz` hold the files, one archive a group (a locomotion task, or all mazes, whose policies repeat one
-network); `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every use.
+`data/<group>.zip` hold the files, one archive a group (a locomotion task, or all mazes, whose policies repeat one
+network), see `packing`; `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every
+use.
 `scripts/pack_policies.py` makes archives and list.
 """
 
 from __future__ import annotations
 
 import functools
-import io
 import json
-import lzma
 import os
-import tarfile
 import tempfile
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import IO, cast
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, sha256_file
 from dmcvb_gen.spec import is_maze
 
 INDEX = "policies.json"
-LZMA_FILTERS = [
-    {"id": lzma.FILTER_LZMA2, "preset": 9, "dict_size": 1 << 25, "lc": 0, "lp": 2, "pb": 2}  # lp, pb: float32 weights
-]
 
 
 def data_folder() -> Traversable:
@@ -71,11 +65,11 @@ def _is_sound(path: Path, name: str) -> bool:
 
 def _unpack(name: str) -> Path:
     """Unpack a file and the others of its task; a few tenths of a second."""
+    from dmcvb_gen.policies.packing import unpack_files  # loads numpy
+
     task = name.split("/")[0]
-    packed = (data_folder() / f"{group_of(task)}.tar.xz").read_bytes()
-    with tarfile.open(fileobj=io.BytesIO(lzma.decompress(packed))) as archive:
-        members = [member for member in archive if member.name.startswith(f"{task}/")]
-        files = {member.name: cast(IO[bytes], archive.extractfile(member)).read() for member in members}
+    group = unpack_files((data_folder() / f"{group_of(task)}.zip").read_bytes())
+    files = {file: content for file, content in group.items() if file.startswith(f"{task}/")}
     reason: OSError | None = None
     for folder in cache_folders():
         try:
@@ -94,20 +88,22 @@ def _unpack(name: str) -> Path:
 
 
 def pack(folder: Path, out: Path) -> None:
-    """Write archives and list from the policy files <task>/<level>.safetensors of a folder."""
-    names = sorted(path.relative_to(folder).as_posix() for path in folder.glob("*/*.safetensors"))
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(group_of(name.split("/")[0]), []).append(name)
-    for group, members in groups.items():
-        raw = io.BytesIO()
-        with tarfile.open(fileobj=raw, mode="w", format=tarfile.USTAR_FORMAT) as archive:
-            for name in members:
-                content = (folder / name).read_bytes()
-                member = tarfile.TarInfo(name)
-                member.size = len(content)
-                archive.addfile(member, io.BytesIO(content))
-        packed = lzma.compress(raw.getvalue(), format=lzma.FORMAT_XZ, filters=LZMA_FILTERS)
-        (out / f"{group}.tar.xz").write_bytes(packed)
-    digests = {name: sha256_file(folder / name) for name in names}
+    """Write archives and list from the policy files <task>/<level>.safetensors of a folder.
+
+    Raises:
+      ValueError: a file has arrays that are not float32.
+    """
+    from dmcvb_gen.policies.packing import pack_files
+
+    # Checkpoints of one run in their order, its last one after them, so that each resembles the one before.
+    paths = sorted(
+        folder.glob("*/*.safetensors"), key=lambda path: (path.stem == "expert", path.stem == "medium", path)
+    )
+    groups: dict[str, dict[str, bytes]] = {}
+    for path in paths:
+        group = groups.setdefault(group_of(path.parent.name), {})
+        group[path.relative_to(folder).as_posix()] = path.read_bytes()
+    for group_name, contents in groups.items():
+        (out / f"{group_name}.zip").write_bytes(pack_files(contents))
+    digests = {path.relative_to(folder).as_posix(): sha256_file(path) for path in sorted(paths)}
     (out / INDEX).write_text(json.dumps(digests, indent=1) + "\n")

@@ -54,7 +54,7 @@ def test_the_pinned_versions_are_for_every_python_3_11():
 
 
 def test_the_wheel_is_small(wheel):
-    assert Path(wheel).stat().st_size < 15 * 2**20
+    assert Path(wheel).stat().st_size < 15_000_000
 
 
 def test_the_wheel_carries_every_data_file(wheel):
