@@ -110,8 +110,8 @@ def _tell_what_is_there(plan, shared):
         click.echo(f"{plan.target.place} is a release already; this adds {added}.", err=True)
     if not shared and (others := rollouts_at_work(plan.target)):
         click.echo(
-            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. To "
-            "share the work, stop one and give --part 1/2 and --part 2/2.",
+            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. "
+            "To share the work, stop one and give --part 1/2 and --part 2/2.",
             err=True,
         )
 
