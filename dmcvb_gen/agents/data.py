@@ -453,8 +453,9 @@ def default_memory(device: str = "cpu") -> int:
     """Bytes of pictures that are held: half of what the machine (or its accelerator) has free."""
     if device.startswith("cuda"):
         return torch.cuda.mem_get_info(device)[0] // 2
-    pages = os.sysconf("SC_AVPHYS_PAGES") if "SC_AVPHYS_PAGES" in os.sysconf_names else 2**20
-    return pages * os.sysconf("SC_PAGE_SIZE") // 2
+    if "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    return 2**31  # macOS and Windows do not tell
 
 
 def load_data(
