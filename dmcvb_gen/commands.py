@@ -110,7 +110,7 @@ def rollout(
       episodes: Episodes per subset. [default: 20]
       steps: Steps per subset, instead of --episodes.
       max_steps: Longest episode, in steps. [default: 500, mazes 600]
-      episode_range (A:B): Generate only the shards with episodes A to B - 1.
+      episode_range (RANGE): Generate only the shards with episodes A to B - 1.
       seed: Random seed of the release. [default: 0]
       size: Width and height of the images, in pixels. [default: 64]
       renderer: native, warp or opengl. [default: native; with --device cuda: warp]
@@ -118,7 +118,7 @@ def rollout(
       device: Device that renders: cpu, or cuda with warp. [default: cpu]
       backgrounds: Background videos: builtin, or a folder. [default: builtin]
       split: Background videos and maze styles: train or val. [default: train]
-      behaviour (FILE|RUN|MODULE:FUNCTION): Policy instead of the bundled one: a policy file, a training run, an SB3
+      behaviour (BEHAVIOUR): Policy instead of the bundled one: a policy file, a training run, an SB3
         zip, a torch state dict (.pt), or a function of your own.
       sample: Sample actions instead of using the policy mean.
       pixels: False: Store no images; `paint` renders them later.
@@ -166,7 +166,7 @@ def paint(
     Args:
       release: Folder of the release.
       only (PATTERN): Use only these subsets.
-      episodes (A:B): Use only the shards with episodes A to B - 1.
+      episodes (RANGE): Use only the shards with episodes A to B - 1.
       size: Width and height in pixels. [default: the manifest's]
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
       goal: Mazes: render only images with, or without, the goal. [default: both]
@@ -254,7 +254,7 @@ def regenerate(
       release (RELEASE): Folder of the release.
       manifest (NAME|FILE): A shipped manifest or a manifest's file, instead of a release.
       only (PATTERN): Use only these subsets.
-      episodes (A:B): Use only the shards with episodes A to B - 1.
+      episodes (RANGE): Use only the shards with episodes A to B - 1.
       check: Compare digests and change nothing.
       out (FOLDER): Write the shards to this folder instead.
       backgrounds (FOLDER): Folder of the background videos, if it has moved.
@@ -366,7 +366,7 @@ def fetch(
       url (URL): Where it was published.
       out (FOLDER): Local folder for the release.
       only (PATTERN): Use only these subsets.
-      episodes (A:B): Use only the shards with episodes A to B - 1.
+      episodes (RANGE): Use only the shards with episodes A to B - 1.
       paint: Render the images of each shard as it arrives.
       size: Width and height in pixels. [default: the manifest's]
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
@@ -424,7 +424,7 @@ def export(
       to: Format, for example hdf5, minari, lerobot, rlds or rerun.
       out (FOLDER): Output folder, one folder per subset.
       only (PATTERN): Use only these subsets.
-      episodes (A:B): Export only episodes A to B - 1.
+      episodes (RANGE): Export only episodes A to B - 1.
       merge: lerobot: write all subsets as the tasks of one data set.
       video: lerobot: store images as mp4 (smaller, lossy) instead of PNG.
       workers: Worker processes, one subset each.

@@ -264,18 +264,19 @@ def test_a_run_that_is_made_longer_keeps_its_replay_buffer(tmp_path):
     def fill(buffer, values):
         for value in values:
             row = np.full((1, 2), value, np.float32)
-            buffer.add(observation=row, next_observation=row, action=row[:, :1], reward=row[:, 0], terminated=[0])
+            fields = dict(observation=row, next_observation=row, action=row[:, :1], reward=row[:, 0])
+            buffer.add(**fields, terminated=[0], ended=[0])
 
-    short = ReplayBuffer(6, 2, 1, tmp_path)
+    short = ReplayBuffer(6, 2, 1, 1, tmp_path)
     fill(short, range(1, 9))
     assert short.full and sorted(short.arrays["reward"]) == [3, 4, 5, 6, 7, 8]
     short.flush()
-    longer = ReplayBuffer(10, 2, 1, tmp_path)
+    longer = ReplayBuffer(10, 2, 1, 1, tmp_path)
     longer.restore(short.position, short.full, short.size)
     assert len(longer) == 6
     fill(longer, [9, 10])
     assert len(longer) == 8 and set(longer.arrays["reward"][:8]) == set(range(3, 11))
-    assert len(ReplayBuffer(4, 2, 1, tmp_path).arrays["reward"]) == 10  # never shorter: nothing is thrown away
+    assert len(ReplayBuffer(4, 2, 1, 1, tmp_path).arrays["reward"]) == 10  # never shorter: nothing is thrown away
 
 
 def test_two_processes_do_not_train_in_one_folder(tmp_path):

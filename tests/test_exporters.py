@@ -179,7 +179,7 @@ def test_a_format_of_another_package_is_found_by_its_entry_point(small_release, 
         for subset in dmcvb_gen.open(str(release)).subsets.values():
             text = (tmp_path / release.parent.name / subset.name / "returns.txt").read_text()
             np.testing.assert_allclose([float(line) for line in text.split()], subset.returns, rtol=1e-6)
-    with pytest.raises(DmcvbError, match="two exporters are called npz"):
+    with pytest.raises(DmcvbError, match="two formats are called npz"):
         register_exporter("npz", reader="", keeps="", drops="", mark="")(lambda source, folder: None)
 
 

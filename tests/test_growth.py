@@ -24,6 +24,7 @@ from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.storage.base import Storage
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
 
 SHORT = {"levels": "random", "max_steps": 20}
@@ -288,24 +289,22 @@ def test_a_release_that_is_finished_in_between_is_never_called_damaged(tmp_path,
 
 
 def test_readers_of_the_old_version_see_it_whole_until_the_new_manifest_is_there(grown, tmp_path, monkeypatch):
-    from dmcvb_gen.release import publish as module
-
-    url, put = f"file://{tmp_path}/there", module.put_object
+    url, write = f"file://{tmp_path}/there", Storage.write
     publish(grown.parent / "before", url)
 
-    def stop(filesystem, path, data):
-        if path.endswith("manifest.json"):
+    def stop(storage, path, data):
+        if path == "manifest.json":
             raise StoreError("cut off")
-        put(filesystem, path, data)
+        write(storage, path, data)
 
-    monkeypatch.setattr(module, "put_object", stop)
+    monkeypatch.setattr(Storage, "write", stop)
     with pytest.raises(StoreError, match="cut off"):
         publish(grown, url)
     old = open_release(url)
     assert old.manifest.version == "1.0.0" and list(old.subsets) == ["walker-walk/random/none"]
     assert json.dumps(old["walker-walk/random/none"].episode(0)["reward"].tolist())
     assert list(old["walker-walk/random/none"].episodes) == [0]
-    monkeypatch.setattr(module, "put_object", put)
+    monkeypatch.setattr(Storage, "write", write)
     publish(grown, url)
     assert open_release(url).manifest.version == "1.2.0" and verify(tmp_path / "there").sound
 

@@ -76,4 +76,4 @@ def test_a_task_and_a_layout_are_one_too_many(in_folder):
     (in_folder / "hall.txt").write_text(HALL)
     for arguments in ([], ["walker-walk", "--layout", "hall.txt"]):
         done = CliRunner().invoke(main, ["train-behaviour", *arguments])
-        assert done.exit_code == 2 and "Give a TASK, or the file of a maze with --layout." in done.output
+        assert done.exit_code == 2 and "give a TASK, or the file of a maze with --layout" in done.output

@@ -24,6 +24,7 @@ from dmcvb_gen.generate.paint import paint_release, without_pictures
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.storage.base import Storage
 
 TINY = [
     "--episodes",
@@ -480,26 +481,26 @@ def test_shards_are_painted_while_others_come_and_a_cut_loses_nothing(made, publ
     from dmcvb_gen.generate import paint as painting
     from dmcvb_gen.release import fetch as fetching
 
-    painted, real = [], fetching.download
+    painted, real = [], Storage.download
     plain = executors.run_job
 
     def run_job(job, tick):
         painted.append((job.subsets[0].name, job.shard))
         return plain(job, tick=tick)
 
-    def download(filesystem, place, remote, local, record):
-        if "/c/1" in record.path and len(painted) < 1:
+    def download(storage, file, root):
+        if "/c/1" in file.path and len(painted) < 1:
             for _ in range(600):  # the rest comes only once something was painted
                 if painted or arrival_ended():
                     break
                 threading.Event().wait(0.05)
             raise StoreError("the line went dead")
-        return real(filesystem, place, remote, local, record)
+        return real(storage, file, root)
 
     def arrival_ended():
         return not any(thread.name == "fetch" for thread in threading.enumerate())
 
-    monkeypatch.setattr(fetching, "download", download)
+    monkeypatch.setattr(Storage, "download", download)
     monkeypatch.setattr(executors, "run_job", run_job)
     with pytest.raises(StoreError, match="line went dead"):
         fetching.fetch_and_paint(published, tmp_path / "r", painter=painting.RenderConfig())

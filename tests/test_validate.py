@@ -222,7 +222,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--benchmark", "b9"), "ablations"),
         ((release, "--benchmark", "b3"), "--fixed-goals"),
         ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; remove it"),
-        ((release, "--agents", "bc:k=5"), "leave them out"),
+        ((release, "--agents", "bc:k=5"), "'k=5' is an option of id: remove it"),
         ((release, "--checks-only", "--agents", "bc"), "--checks-only trains nothing; remove it"),
         ((release, "--checks-only", "--benchmark", "b2"), "--benchmark has no effect"),
         ((release, "--only", "cheetah-run/*"), NAME),

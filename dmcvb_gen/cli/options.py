@@ -5,9 +5,10 @@ A function's signature has the types and the defaults, its docstring the help; n
     def paint(release: Local, *, episodes: Span | None = None, ...):
         \"\"\"...
         Args:
-          episodes (A:B): Use only the shards with episodes A to B - 1.
+          episodes (RANGE): Use only the shards with episodes A to B - 1.
 
-gives `paint RELEASE --episodes A:B`. What stands in parentheses shows how a value is written, and `FORMATS` reads it. A
+gives `paint RELEASE --episodes A:B`. What stands in parentheses, or
+`METAVARS` has for it, shows how a value is written, and `FORMATS` reads it. A
 parameter that takes several names can be repeated and loses its "s" (levels: --level). One that is true by default is
 switched off (pixels: --no-pixels). With `workers` come --executor and --ray-address.
 """
@@ -27,6 +28,8 @@ from dmcvb_gen.cli.unused_options import is_given
 from dmcvb_gen.options import LOCAL, Between
 from dmcvb_gen.parallel import Ray, Workers
 
+METAVARS = {"RANGE": "A:B", "BEHAVIOUR": "FILE|RUN|MODULE:FUNCTION"}
+"""What stands for a metavar with a colon, which would end the name in a docstring."""
 FLAGS = {"settings": "set", "storage_options": "option", "everything": "all", "episode_range": "range"}
 """Parameter -> flag, if it has another name."""
 
@@ -99,6 +102,7 @@ def help_of(function: Callable) -> dict[str, tuple[str | None, str]]:
     """Parameter -> (metavar, help), from the "Args:" of its docstring."""
     block = inspect.getdoc(function).partition("\nArgs:\n")[2].partition("\n\n")[0]
     found = re.findall(r"^  (\w+)(?: \((.+?)\))?: (.+(?:\n   .+)*)", block, re.MULTILINE)
+    found = [(name, METAVARS.get(metavar, metavar), text) for name, metavar, text in found]
     return {name: (metavar or None, re.sub(r"\s+", " ", text).replace(" [d", "  [d")) for name, metavar, text in found}
 
 
@@ -190,7 +194,7 @@ def parse_bytes(flag: str, text: str) -> int:
 
 def split_names(flag: str, text: str) -> tuple[str, ...]:
     """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between names and in agents' options."""
-    return tuple(name.strip() for name in re.split(r",(?!\s*(?:frames=|k=|sample\b))", text) if name.strip())
+    return tuple(name.strip() for name in re.split(r",(?!\s*(?:\w+=|sample\b))", text) if name.strip())
 
 
 FORMATS: dict[str | None, Callable[[str, str], Any]] = {

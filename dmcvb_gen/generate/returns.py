@@ -25,7 +25,7 @@ def evaluate_behaviour(
     Args:
       tasks (TASK): Tasks; by default those of the policies.
       levels: expert, medium, mixed, random. [default: all bundled]
-      behaviour (FILE|RUN|MODULE:FUNCTION): What to evaluate instead of the bundled policies, as in rollout.
+      behaviour (BEHAVIOUR): What to evaluate instead of the bundled policies, as in rollout.
       episodes: Fresh episodes of each policy.
       seed: Random seed of the episodes.
       sample: Sample actions instead of using the policy mean.

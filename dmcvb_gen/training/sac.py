@@ -291,7 +291,8 @@ class ReplayBuffer(RowBuffer):
 
     def restore(self, position: int, full: bool, rows: int | None = None) -> None:
         super().restore(position, full, rows)
-        if full and not self.full:  # it has grown: where the ring was closed, rows do not follow each other any more
+        # If it has grown after it wrapped, rows do not follow each other any more where the ring was closed.
+        if full and not self.full and position:
             for end in (position, rows or self.found):
                 self.arrays["ended"][max(end - self._simulations, 0) : end] = 1
 

@@ -48,11 +48,12 @@ def test_an_example_is_short_and_learns_its_data(example, releases):
 def test_grain_shuffles_and_batches_a_source(releases):
     for name in SUBSETS:
         source = dmcvb_gen.open(releases[name])[name].source(stack=2)
+        table, rows = source.table, source.table.steps
         loader = grain.MapDataset.source(source).shuffle(seed=1).batch(4)
         seen = set()
         for batch in loader:
             for row, (episode, step) in enumerate(zip(batch["episode"], batch["step"], strict=True)):
-                place = int(np.flatnonzero((source.block.episode == episode) & (source.block.step == step))[0])
+                place = int(np.flatnonzero((table.episode[rows] == episode) & (table.step[rows] == step))[0])
                 seen.add(place)
                 for key, value in source[place].items():
                     np.testing.assert_array_equal(batch[key][row], value)
