@@ -449,4 +449,5 @@ def test_commas_stand_between_agents_and_in_their_options():
     assert split_names("--agents", "bc,id+bc:k=10,sample, id+bc:frames=1,k=5,state-bc,") == (
         "bc", "id+bc:k=10,sample", "id+bc:frames=1,k=5", "state-bc"
     )  # fmt: skip
+    assert split_names("--agents", "td3-bc:frames=1,unbounded,bc") == ("td3-bc:frames=1,unbounded", "bc")
     assert split_names("--agents", "") == ()

@@ -46,6 +46,12 @@ def agent_names() -> tuple[str, ...]:
     return (*own, *(f"state-{name}" for name in own), *(f"{encoder}+{name}" for name in own for encoder in encoders()))
 
 
+def option_names() -> tuple[str, ...]:
+    """The names of all options that agents take."""
+    names = {"frames", *(name for part in PARTS.all().values() for name in part.options)}
+    return tuple(sorted("sample" if name == "sample_k" else name for name in names))
+
+
 @dataclass(frozen=True)
 class Agent:
     """An agent.

@@ -194,7 +194,13 @@ def parse_bytes(flag: str, text: str) -> int:
 
 def split_names(flag: str, text: str) -> tuple[str, ...]:
     """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between names and in agents' options."""
-    return tuple(name.strip() for name in re.split(r",(?!\s*(?:\w+=|sample\b))", text) if name.strip())
+    options = ""
+    if ":" in text:  # agents are not loaded for less
+        from dmcvb_gen.agents.catalog import option_names
+
+        options = "|".join(option_names())
+    separator = rf",(?!\s*(?:\w+=|(?:{options})\b))" if options else ","
+    return tuple(name.strip() for name in re.split(separator, text) if name.strip())
 
 
 FORMATS: dict[str | None, Callable[[str, str], Any]] = {
