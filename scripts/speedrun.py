@@ -86,9 +86,9 @@ def main() -> None:
             reached = f"{float(found.args[0]):.0f}"
     minutes, frames = (time.process_time() - began) / 60, ACTION_REPEAT * run.step
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-    command = f"`bash scripts/speedrun.sh {shlex.join(sys.argv[1:])}`"
+    command = f"`speedrun.sh {shlex.join(sys.argv[1:])}`"
     amount = (f"{frames:,}", f"{minutes:.1f}") if reached else (f"not in {frames:,}", f"{minutes:.1f}")
-    facts = (datetime.date.today(), commit, given.task, f"{processor()}, {precision}", *amount, reached, "", command)
+    facts = (command, *amount, reached, f"{processor()}, {precision}", commit, datetime.date.today())
     print("| " + " | ".join(map(str, facts)) + " |")
 
 
