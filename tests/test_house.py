@@ -209,3 +209,10 @@ main({words!r}, standalone_mode=False)
 print("loaded:", [name for name in {heavy!r} if name in sys.modules])"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == "loaded: []", done.stdout + done.stderr
+
+
+def test_tests_lie_in_folders_named_after_packages():
+    others = {"faults", "golden", "integrations", "long", "__pycache__"}
+    folders = {path.name for path in Path(__file__).parent.iterdir() if path.is_dir()} - others
+    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    assert folders == packages

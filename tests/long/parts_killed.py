@@ -21,8 +21,8 @@ import urllib.request
 import pytest
 
 from dmcvb_gen.dataset.manifest import parse_manifest
-from tests.test_cluster import contents, recipe_file, whole  # noqa: F401  (fixtures)
-from tests.test_publish import CREDENTIALS
+from tests.generate.test_cluster import contents, recipe_file, whole  # noqa: F401  (fixtures)
+from tests.release.test_publish import CREDENTIALS
 
 SPOILED = 0.04
 """Share of the requests that the network spoils."""

@@ -1,7 +1,7 @@
 """An ant that looks for a goal in a maze: batches of episodes, the reward from a field of distances.
 
 dm_control's locomotion library is the authority: from the same physics state and actions a composer
-environment of the same maze gives the same observations and physics (tests/test_ant_maze.py).
+environment of the same maze gives the same observations and physics (tests/tasks/test_ant_maze.py).
 """
 
 from __future__ import annotations

@@ -298,7 +298,7 @@ def test_frame_differences_are_those_of_the_pictures():
 
 @pytest.mark.parametrize("frozen", ["bc", "td3-bc"])
 def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
-    from tests.test_agents_data import make_data
+    from tests.agents.test_agents_data import make_data
 
     data, policies = make_data(), []
     for encoded in (False, True):
@@ -595,7 +595,7 @@ def test_a_file_that_is_no_dino_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", [name for name in agent_names() if not name.startswith("dino")])
 def test_every_agent_can_be_made_and_acts(name):
-    from tests.test_agents_data import make_data
+    from tests.agents.test_agents_data import make_data
 
     agent, data = parse_agent(name), make_data()
     data = data.states_only() if agent.sees_state else data

@@ -1,7 +1,7 @@
 """The painter of our own against OpenGL, and against its own golden pictures.
 
 Golden pictures fail where a change of ours or of a dependency changes pixels. Look at the new ones before they
-replace the old: `python -m tests.test_native` writes them all anew.
+replace the old: `python -m tests.rendering.test_native` writes them all anew.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.native.textures import background_texels, levels, packed
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
-from tests.test_rendering import frames_of, needs_opengl, renderer_of
-from tests.test_tasks import SUITE
+from tests.rendering.test_rendering import frames_of, needs_opengl, renderer_of
+from tests.tasks.test_tasks import SUITE
 
 MAZE = "ant-maze-medium7x7a"
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[1] / "golden"
 CASES = [(task, setting) for task in LOCOMOTION_TASKS for setting in ("none", "dynamic")] + [(MAZE, "none")]
 PAINTED = [task for task in SUITE if task not in (*LOCOMOTION_TASKS, "dog-walk", "lqr-lqr_2_1")]
 """Tasks of dm_control's suite that this painter paints; a dog is a mesh with a skin, lqr's cart is seen through."""
@@ -167,7 +167,7 @@ def test_another_process_reads_what_this_one_compiled():
     renderer_of("native", task, setting).render(physics, labels)
     code = (
         "import logging; logging.basicConfig(level=logging.INFO)\n"
-        "from tests.test_rendering import frames_of, renderer_of\n"
+        "from tests.rendering.test_rendering import frames_of, renderer_of\n"
         "task, setting, physics, labels = frames_of('walker-walk', 'none', 2)\n"
         "renderer_of('native', task, setting).render(physics, labels)\n"
     )

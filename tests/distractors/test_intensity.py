@@ -18,7 +18,7 @@ from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, SHAKE, Distractor, difficulty_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.cameras import seen_materials
-from tests.test_distractors import labels, physics_of
+from tests.distractors.test_distractors import labels, physics_of
 from tests.test_whole_way import run
 
 SCALES = st.integers(1, 1000).map(lambda thousandths: thousandths / 1000)

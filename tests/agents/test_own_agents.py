@@ -19,7 +19,7 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
 
 

@@ -45,7 +45,7 @@ def start(model: str | None, environment: dict[str, str]) -> subprocess.Popen:
     command = command if model is None else [shutil.which("qemu-x86_64"), "-cpu", model, *command]
     return subprocess.Popen(
         command,
-        cwd=Path(__file__).parents[1],
+        cwd=Path(__file__).parents[2],
         env=OURS | {"OMP_NUM_THREADS": "1"} | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

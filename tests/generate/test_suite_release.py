@@ -11,7 +11,7 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.rendering import default_renderer
 from dmcvb_gen.tasks import get_task
-from tests.test_tasks import SUITE
+from tests.tasks.test_tasks import SUITE
 from tests.test_whole_way import run
 
 SIZE = 16

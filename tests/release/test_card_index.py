@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 
-TOP = Path(__file__).parents[1]
+TOP = Path(__file__).parents[2]
 
 
 def test_the_index_is_that_of_the_cards():

@@ -22,7 +22,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.spec import task_folder
 from tests.conftest import TINY_MAZE
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "docs" / "leaderboard"
 
 

@@ -27,7 +27,7 @@ def in_folder(tmp_path, monkeypatch):
 
 def documented_commands() -> list[list[str]]:
     """The commands of docs/mazes.md that make a release of ring.txt."""
-    page = (Path(__file__).parent.parent / "docs" / "mazes.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "mazes.md").read_text()
     block = next(
         code for code in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if "train-behaviour --layout" in code
     )
