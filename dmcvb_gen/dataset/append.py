@@ -1,4 +1,4 @@
-"""Releases that grow: the manifest that is there and one that is asked for in, the manifest of both out, or why not.
+"""Merge the manifest of a release with that of a new request, or say why they cannot be one release.
 
 A release takes in other subsets, and more episodes of those that it has. What is there stays as it is, byte for byte;
 the manifest keeps each recipe with the version that it made and what it added.
@@ -121,7 +121,7 @@ def next_version(version: str) -> str:
 
 
 def is_grown_from(new: Manifest, old: Manifest) -> bool:
-    """Whether a release is another one and more: all that the old one has, it has in the same form."""
+    """Return True if a release holds all that an older one has, in the same form."""
     if new.name != old.name or _parts(new.version) <= _parts(old.version):
         return False
     records = {record.name: record for record in new.subsets}

@@ -1,4 +1,4 @@
-"""What is published at a place: a URL in, the releases there out, by their manifests alone."""
+"""List the releases that are published at a URL; only their manifests are read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A digest for every file of a release, and one for them all: a folder in, `files.json` and the root digest out.
+"""Compute a digest of every file of a release (`files.json`), and one root digest of them all.
 
 `files.json` lists every file but itself and the manifest, holds the digest of the manifest's bytes, and a digest of its
 own content. The root digest is over the lines "<sha256>  <path>" of all data files in the order of their paths, the
@@ -63,26 +63,26 @@ class Index(pydantic.BaseModel):
 
     @property
     def own_digest(self) -> str:
-        """What `sha256` must be."""
+        """The digest that `sha256` must be."""
         return files.sha256_bytes(files.json_bytes(self.model_copy(update={"sha256": None})))
 
     def with_checksum(self) -> Index:
-        """With its own digest."""
+        """Return a copy that states its own digest."""
         return self.model_copy(update={"sha256": self.own_digest})
 
 
 def is_card(path: str) -> bool:
-    """Whether a file of a release belongs to its card."""
+    """Return True if a file of a release belongs to its card."""
     return path in CARD_FILES or path.startswith(f"{CARD_FOLDER}/")
 
 
 def is_replaced(path: str) -> bool:
-    """Whether a file may be another one in a release's next version: metadata of arrays that grow, and the card."""
+    """Return True if the next version of a release may replace a file: metadata of growing arrays, and the card."""
     return path.endswith("/zarr.json") or is_card(path)
 
 
 def keeps(index: Index, before: Iterable[FileRecord]) -> bool:
-    """Whether a release has all files of an older version, byte for byte, but for those that growing replaces."""
+    """Return True if a release has all files of an older version, byte for byte, except those that growing replaces."""
     now = set(index.files)
     return all(file in now or is_replaced(file.path) for file in before)
 

@@ -1,4 +1,4 @@
-"""What a release says of itself: recipe, versions, policies, backgrounds, digests; read and written as checked JSON."""
+"""The manifest of a release: recipe, versions, policies, backgrounds and digests, read and written as checked JSON."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class CommitRecord(_Model):
         return self.episodes[1] - self.episodes[0]
 
     def same_data(self, other: CommitRecord) -> bool:
-        """Whether both stand for the same bytes, wherever they were made."""
+        """Return True if both stand for the same bytes, even if they were made on different machines."""
         return self.model_copy(update={"environment": {}}) == other.model_copy(update={"environment": {}})
 
 
@@ -164,7 +164,7 @@ class SubsetRecord(_Model):
 
     @property
     def goal_mode(self) -> GoalMode | None:
-        """How a maze treats its goal; None for tasks without one."""
+        """Treatment of a maze's goal; None for tasks without one."""
         return self.spec.goal
 
     @property
@@ -182,7 +182,7 @@ class SubsetRecord(_Model):
 
 
 class VersionEntry(_Model):
-    """What a release was grown by.
+    """One growth of a release.
 
     Attributes:
       version: of the release since then.
@@ -232,7 +232,7 @@ class Manifest(_Model):
 
     @property
     def imported(self) -> bool:
-        """Whether any of its subsets was, see `SubsetRecord.imported`."""
+        """True if any of its subsets was imported, see `SubsetRecord.imported`."""
         return any(record.imported for record in self.subsets)
 
     def recipe_of(self, subset: str) -> dict[str, Any]:
@@ -401,7 +401,7 @@ def _upgraded(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _goal_pairs_of_version_1(record: dict[str, Any], patterns: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many pairs of start and goal a fixed subset has, from the recipe's pattern that asked for it."""
+    """Return the number of start and goal pairs of a fixed subset, from the recipe's pattern that asked for it."""
     for pattern in patterns:
         tasks, per_goal = pattern.get("tasks") or (), pattern.get("episodes_per_goal")
         if record.get("task") in tasks and FIXED in (pattern.get("settings") or ()) and per_goal:

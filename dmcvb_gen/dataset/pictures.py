@@ -1,4 +1,4 @@
-"""Which pictures a subset shows: its setting and views in, the names of its picture arrays in their order out.
+"""Name the picture arrays of a subset, in their order, from its setting and views.
 
 The one place that knows. A task with one view stores `pixels`; one with several stores a pair of arrays a view::
 

@@ -1,4 +1,4 @@
-"""Reading a release: a folder (or any fsspec URL) in, subsets and episodes out; what is not committed is not there."""
+"""Read a release's subsets and episodes from a folder or any fsspec URL; readers see committed shards only."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ class Subset:
             )
 
     def _chunks_fit(self, array: zarr.Array) -> bool:
-        """Whether no chunk is larger than a shard of the subset: a chunk is decoded whole, whatever is read of it."""
+        """Return True if no chunk is larger than a shard of the subset: any read of a chunk decodes all of it."""
         limits = (max(self.record.episodes_per_shard, 1), *(2 * size for size in array.shape[1:2]), *array.shape[2:])
         shapes = (array.chunks, array.shards or array.chunks)
         return all(size <= limit for shape in shapes for size, limit in zip(shape, limits, strict=True))

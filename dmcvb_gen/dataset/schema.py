@@ -1,4 +1,4 @@
-r"""The layout of a subset: task and setting in, the Zarr arrays that hold its episodes out.
+r"""Describe the Zarr arrays that hold the episodes of a subset.
 
 One Zarr v3 group a subset, arrays episode-major, one shard file an array and job::
 
@@ -69,7 +69,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class EpisodeShape:
-    """What the episodes of a task look like; all that the layout needs to know of it.
+    """Shape of a task's episodes: all that the layout needs to know of the task.
 
     Attributes:
       views: names of the pictures of a frame, in their order; ("pixels",) for one.

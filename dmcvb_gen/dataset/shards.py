@@ -74,7 +74,7 @@ def read_commit(
 
 
 def damage(root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str] = NOTHING) -> str | None:
-    """What is wrong with a shard's files, in words; None where every byte is as committed (`known`: see there)."""
+    """Say what is wrong with a shard's files; None if every byte is as committed (`known`: see there)."""
     commit = read_commit(root, record, shard, known)
     if commit is None:
         return "has no commit record"
@@ -85,7 +85,7 @@ def damage(root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str
 
 
 def wrong_bytes(root: Path, file: FileRecord) -> str | None:
-    """What is wrong with a file of a release, in words that follow its name; None where every byte is as recorded."""
+    """Say what is wrong with a file of a release, in words that follow its name; None if every byte is as recorded."""
     path = root / file.path
     try:
         if not path.is_file():

@@ -31,7 +31,7 @@ READ_BYTES = 2**26
 
 @dataclass(frozen=True)
 class Selection:
-    """What a table holds of a subset.
+    """The arrays and episodes of a subset that a table holds.
 
     Attributes:
       episodes: (episode,) int, indices of committed episodes.

@@ -1,4 +1,4 @@
-"""Background videos: a folder (or the built-in clips) in, square RGB frames out.
+"""Read square RGB frames of background videos from a folder or from the built-in clips.
 
 Folders that are understood: DMC-VB's own (`train/` and `validation/`, each with videos), a DAVIS-like one
 (a sub-folder of frames a video), loose videos and pictures. Without a split in the folder, every second
@@ -141,7 +141,7 @@ def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:
 
 
 def videos_by_split(source: str | Path) -> dict[str, int] | None:
-    """How many videos of a folder each split takes; None if its owner has split it, or it holds one video or none."""
+    """Return how many videos each split takes; None if the folder is split already, or holds fewer than two."""
     root = Path(source)
     if not root.is_dir() or any((root / name).is_dir() for names in _SPLITS.values() for name in names):
         return None
@@ -150,7 +150,7 @@ def videos_by_split(source: str | Path) -> dict[str, int] | None:
 
 
 def _listed(folder: Path) -> list[Path]:
-    """What is in a folder, hidden files apart, with numbers in names ordered by value."""
+    """List a folder without hidden files; numbers in names are ordered by value."""
 
     def key(path: Path):
         return [

@@ -1,4 +1,4 @@
-"""What a distractor is: it varies some labels of the pictures under some settings, from a random stream of its own."""
+"""Base of all distractors: each varies some labels of the pictures, from a random stream of its own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["KINDS", "SCALES", "Distractor", "DistractorPart", "Scene", "floor_al
 
 @dataclass(frozen=True)
 class Scene:
-    """What a distractor draws its labels for.
+    """The scene that a distractor draws its labels for.
 
     Attributes:
       task: the task that is shown.

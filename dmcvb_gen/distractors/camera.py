@@ -26,7 +26,7 @@ RADIUS_RANGE = (0.5, 1.5)  # times s: how much nearer and farther than r0, as a 
 
 @dataclass(frozen=True)
 class CameraRange:
-    """Where the camera may be: radius (m), polar angle from +z in [0, pi/2], azimuth in [-pi, 0], roll (radians)."""
+    """Range of the camera: radius (m), polar angle from +z in [0, pi/2], azimuth in [-pi, 0], roll (radians)."""
 
     low: np.ndarray
     high: np.ndarray

@@ -1,4 +1,4 @@
-"""Clips of objects that fall and collide: a seed in, short videos like Kubric's MOVi-D out.
+"""Make clips of objects that fall and collide, like Kubric's MOVi-D, from a seed.
 
 Each clip is a MuJoCo simulation of its own: 13 to 23 objects of many shapes with procedural textures, some
 lying in a heap, some thrown into it one after the other, filmed by a fixed camera for 24 frames of 256 x 256.
@@ -141,7 +141,7 @@ def _light(rng: np.random.Generator, sun: bool) -> str:
 
 
 def _throw(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Where a thrown object starts, and the velocity that takes it into the heap within the film."""
+    """Return where a thrown object starts, and the velocity that takes it into the heap within the film."""
     flight = rng.uniform(0.15, 0.85) * FRAMES / FRAMES_PER_SECOND
     side, far = rng.uniform(0, 2 * np.pi), rng.uniform(1.8, 3.5)
     start = np.array([far * np.cos(side), far * np.sin(side), rng.uniform(0.8, 3.5)])

@@ -1,4 +1,4 @@
-"""Procedural pictures for the clips: a random stream in, a natural-looking square texture out."""
+"""Make natural-looking square textures for the clips from a random stream."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a plan will cost; `rates` by subset."""
+    """Cost of a plan; `rates` by subset."""
 
     jobs: int
     done: int
@@ -84,7 +84,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class _Piece:
-    """What is measured of one task: a job and a number of episodes of each trajectory, and subsets to be painted."""
+    """One task's measurements: a job and a number of episodes of each trajectory, and subsets to paint."""
 
     trajectories: tuple[tuple[Job, int], ...]
     paintings: tuple[tuple[Job, SubsetRecord], ...]
@@ -102,7 +102,7 @@ class _Measured:
 
 
 def _trajectory(record: SubsetRecord) -> tuple:
-    """What decides how its episodes go."""
+    """Return what decides a subset's trajectories."""
     return (record.task, record.level, record.deterministic, record.max_steps)
 
 
@@ -200,7 +200,7 @@ def _mean_lengths(plan: Plan, lengths: dict[tuple, list[int]]) -> dict[tuple, fl
 
 
 def measurements(plan: Plan) -> int:
-    """How many an estimate takes: one a trajectory and one a kind of pictures."""
+    """Count the measurements of an estimate: one for each trajectory and one for each kind of pictures."""
     records = [record for job in plan.jobs for record in job.subsets]
     return len({_trajectory(record) for record in records}) + len({_painting_key(record) for record in records})
 
@@ -255,7 +255,7 @@ def _extrapolate(plan: Plan, rates: dict[str, Rate]) -> Estimate:
 
 
 def _painting_key(record: SubsetRecord) -> tuple:
-    """What decides the cost of a frame; the same for all mazes."""
+    """Return what decides the cost of a frame; it is the same for all mazes."""
     if record.goal_mode is not None:
         return (ANT_MAZE, record.level, "", "")
     setting = record.distractor

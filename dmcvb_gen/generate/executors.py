@@ -88,7 +88,7 @@ def run_arriving(
 
 
 class _Expected:
-    """How many frames jobs render in all: of full episodes at first, then in proportion to the finished ones."""
+    """Expected frames of all jobs: of full episodes at first, then in proportion to the finished ones."""
 
     def __init__(self, jobs: Sequence[Job]):
         self._open: Counter = Counter()
@@ -147,7 +147,7 @@ def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
 
 
 def needs_of(jobs: Sequence[Job]) -> Needs:
-    """What the largest job takes at most."""
+    """Return the most memory and scratch space that any job takes."""
     cuda = any(job.device != "cpu" for job in jobs)
     return Needs(memory=max(map(_memory, jobs), default=0), gpus=GPU_SHARE if cuda else 0)
 

@@ -1,4 +1,4 @@
-"""What is in a release and in the package, as plain values."""
+"""Describe a release and the package as plain values."""
 
 from __future__ import annotations
 

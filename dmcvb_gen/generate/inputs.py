@@ -81,7 +81,7 @@ def _digest(path: Path) -> str | None:
 
 
 def background_source(root: Path, record: SubsetRecord, moved: str | None = None) -> str:
-    """Where a subset's videos are, checked against the manifest's digest.
+    """Find a subset's videos and compare them with the manifest's digest.
 
     Args:
       moved: where they are now, instead of where the manifest says.
@@ -104,7 +104,7 @@ def background_source(root: Path, record: SubsetRecord, moved: str | None = None
 
 
 def video_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:
-    """Where a subset's videos are: "builtin" or a folder; nothing is opened.
+    """Return "builtin" or the folder of a subset's videos; nothing is opened.
 
     Args:
       root: the release's folder, which has copies of videos that the package does not bring.

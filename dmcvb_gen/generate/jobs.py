@@ -63,7 +63,7 @@ class Job:
 
     @property
     def in_place(self) -> bool:
-        """Whether pictures are added to a shard that is there."""
+        """True if pictures are added to an existing shard."""
         return self.stored is not None and self.stored.in_place
 
     @property

@@ -93,7 +93,7 @@ class RenderOverrides:
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How pictures are rendered.
+    """Settings by which pictures are rendered.
 
     Attributes:
       overrides: pictures other than the manifest's.
@@ -297,7 +297,7 @@ def _has_others(record: SubsetRecord) -> StoreError:
 def render_differences(
     manifest: Manifest, records: Iterable[SubsetRecord], backgrounds: Mapping[str, str], device: str = "cpu"
 ) -> tuple[str, ...]:
-    """What may make other pixels here than where a release was made, in words: versions, processor, renderer.
+    """List what may change pixels here compared with the release's origin: versions, processor, renderer.
 
     Args:
       records: of the subsets to paint.

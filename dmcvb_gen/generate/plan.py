@@ -203,7 +203,7 @@ def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[
 
 
 def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> SubsetRecord:
-    """What the manifest says of a subset, but for what its painter says of itself."""
+    """Return a subset's entry in the manifest, without the facts of its renderer."""
     task = get_task(request.task)
     per_goal = request.episodes_per_goal
     goals = per_goal and request.episodes // per_goal
@@ -472,7 +472,7 @@ def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord
 
 
 def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any]:
-    """What a subset's Zarr group says of itself to someone who has nothing else."""
+    """Return the attributes of a subset's Zarr group, for readers that have nothing else."""
     task = get_task(record.task)
     version, generator = manifest.origin(record.name)
     return {
@@ -496,7 +496,7 @@ def finish(plan: Plan) -> Manifest:
 
 
 def _is_done(manifest: Manifest, plan: Plan) -> bool:
-    """Whether a release has its digests and nothing was to be made: then they stay as they are."""
+    """Return True if a release has its digests and nothing had to be made, so that they stay as they are."""
     return manifest.complete and manifest.digest is not None and not plan.jobs
 
 

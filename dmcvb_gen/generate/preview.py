@@ -83,7 +83,7 @@ def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale
 
 
 def _fitting(name: str, width: int) -> str:
-    """As many of a subset's names, from the last on, as a caption of so many pixels has room for."""
+    """Return the last parts of a subset's name that fit into a caption of that width in pixels."""
     parts = name.split("/")
     endings = ["/".join(parts[first:]) for first in range(len(parts))]
     return next((text for text in endings if ImageFont.load_default().getlength(text) <= width), parts[-1])

@@ -31,7 +31,7 @@ class SubsetProgress:
 
 @dataclass(frozen=True)
 class ReleaseProgress:
-    """How much of a release is done.
+    """Progress of a release.
 
     Attributes:
       done, total: shards.
@@ -56,12 +56,12 @@ class ReleaseProgress:
     total = property(lambda self: sum(subset.total for subset in self.subsets))
 
     def facts(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return the progress as plain values."""
         return dataclasses.asdict(self) | {"done": self.done, "late": self.late, "total": self.total}
 
 
 def progress_of(target: Target) -> ReleaseProgress:
-    """How much of the release at a target is done.
+    """Return the progress of the release at a target.
 
     Raises:
       StoreError: there is none.

@@ -1,4 +1,4 @@
-"""A recipe: checked YAML in, the list of subsets that it asks for out.
+"""Parse a recipe and list its subsets.
 
 ::
 
@@ -93,7 +93,7 @@ class SubsetPattern(_Model):
 
 
 class Recipe(_Model):
-    """What a release is made from.
+    """A recipe: everything that a release is made from.
 
     Attributes:
       seed: of every random stream.

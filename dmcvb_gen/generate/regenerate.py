@@ -57,7 +57,7 @@ from dmcvb_gen.tasks import get_task
 
 @dataclass(frozen=True)
 class ArrayDifference:
-    """How far one array of a shard is from the released one: largest and mean absolute difference."""
+    """Largest and mean absolute difference between an array of a shard and the released one."""
 
     array: str
     largest: float
@@ -124,12 +124,12 @@ class Outcome:
 
     @property
     def sound(self) -> bool:
-        """Whether every shard is now, or was already, what the manifest promises."""
+        """True if every shard is now, or was already, what the manifest promises."""
         return all(shard.equal is not False and (shard.was is None or shard.repaired) for shard in self.shards)
 
 
 def environment_diff(manifest: Manifest) -> dict[str, tuple[str, str]]:
-    """How this machine differs from all environments that made the release: name -> (there, here)."""
+    """Compare this machine with all environments that made the release: name -> (there, here)."""
     here = environment()
     return {
         name: (" or ".join(sorted({old.get(name, "unknown") for old in manifest.environments})) or "unknown", value)
@@ -328,7 +328,7 @@ class Regeneration:
 
 
 def _agree(promised: CommitRecord, made: CommitRecord) -> bool:
-    """Whether a shard has the bytes that it should have; pictures that only one of both knows do not count."""
+    """Return True if a shard has its promised bytes; pictures that only one of the two records are ignored."""
     files = [{file.path: file for file in (*commit.pictures, *commit.files)} for commit in (promised, made)]
     start = len(subset_path(made.subset)) + 1
     alone = {path[start:].split("/c/")[0] for path in files[0].keys() ^ files[1].keys()}
@@ -387,7 +387,7 @@ class _Digests:
         return None if commit and self._wrong_pictures(record, commit) else commit
 
     def equal(self, record: SubsetRecord, commit: CommitRecord) -> bool | None:
-        """Whether a shard that was made again has the promised bytes; None if nothing promises any.
+        """True if a regenerated shard has the promised bytes; None if the manifest promises none.
 
         Without its record, the index decides; it lists no pictures of a light release.
         """
@@ -398,7 +398,7 @@ class _Digests:
         return all(file.sha256 == self._digests[file.path] for file in made) if made else None
 
     def subset_equal(self, record: SubsetRecord, made: Mapping[ShardKey, CommitRecord]) -> bool | None:
-        """Whether the shards here, with those made again, give the subset's digest; None if others are missing."""
+        """True if the shards here and the regenerated ones give the subset's digest; None if others are missing."""
         commits = {}
         for shard in range(shard_count(record)):
             commit = self.promised(record, shard) or made.get((record.name, shard))
@@ -408,7 +408,7 @@ class _Digests:
         return subset_digest(commits) == record.digest
 
     def damage(self, record: SubsetRecord, shard: int) -> str | None:
-        """What is wrong with a shard, in words; None if every byte is as committed and its pictures can be read."""
+        """Say what is wrong with a shard; None if every byte is as committed and its pictures can be read."""
         wrong = damage(self.root, record, shard, self._digests)
         commit = None if wrong else read_commit(self.root, record, shard)
         return wrong or (self._wrong_pictures(record, commit) if commit else None)
@@ -432,7 +432,7 @@ class _Digests:
         return None
 
     def sound(self, path: str) -> bool:
-        """Whether a file (a path in the release) can be used."""
+        """Return True if a file (a path in the release) can be used."""
         try:
             data = (self.root / path).read_bytes()
             parse_json(data)

@@ -75,7 +75,7 @@ class RendererCache:
         self._made: dict[tuple, tuple[Renderer, Any]] = {}
 
     def get(self, record: SubsetRecord, backgrounds: str, device: str) -> tuple[Renderer, Any]:
-        """As `renderer_for`."""
+        """Return the renderer that `renderer_for` would make, from the cache if it is there."""
         setting = record.distractor
         key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
         key += (backgrounds, record.split, device)
@@ -135,7 +135,7 @@ def distractor_state_of(
 
 
 def frame_count(record: SubsetRecord, steps: int, episodes: int) -> int:
-    """How many frames the progress callback is told for some episodes of a subset: one a step and stored view."""
+    """Count the frames of some episodes of a subset for the progress callback: one for each step and stored view."""
     return (steps + episodes) * (len(record.views) if record.pixels else 1)
 
 

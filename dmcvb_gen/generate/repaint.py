@@ -80,7 +80,7 @@ class Repainted:
 
     @property
     def keeps_labels(self) -> bool:
-        """Whether the distractor, the videos and the styles are those of the source."""
+        """True if the distractor, the videos and the styles are those of the source."""
         old, new = self.source.record, self.record
         videos = [(record.backgrounds or {}).get("digest") for record in (old, new)]
         styles = [record.split if record.goal_mode is not None else "" for record in (old, new)]
@@ -198,7 +198,7 @@ def _pair(release: Release, subset: Subset, request: Repainting) -> Repainted:
 
 
 def _old_backgrounds(release: Release, old: SubsetRecord) -> str:
-    """Where the videos of a release are: the subset's own, or those of its recipe."""
+    """Find the videos of a release: the subset's own, or those of its recipe."""
     recipe = {"source": release.manifest.recipe_of(old.name).get("backgrounds", BUILTIN)}
     return video_source(release.path, old.model_copy(update={"backgrounds": old.backgrounds or recipe}))
 

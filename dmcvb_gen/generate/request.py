@@ -1,4 +1,4 @@
-"""What a rollout is asked for, by a person: names and numbers in, a recipe out.
+"""Turn the options of a rollout into a recipe.
 
 `dmcvb-gen rollout` and `dmcvb_gen.rollout` ask here. No option is silently ignored: those that would change nothing are
 refused.

@@ -58,7 +58,7 @@ def _is_given(value: Any) -> bool:
 
 
 def target_for(options: Options, request: Recipe | None) -> Target:
-    """Where the release is made: at `out`, by default in a folder of its name."""
+    """Return where the release is made: `out`, or by default a folder of its name."""
     place = options["out"] or str(Path("releases") / request.name if request else "")
     workers = options["workers"] if isinstance(options["workers"], int) else 1
     return Target.at(place, options["storage_options"], options["scratch"], options["scratch_size"], workers)

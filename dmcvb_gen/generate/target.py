@@ -1,4 +1,4 @@
-"""Where a rollout writes: a storage, and the folder on this machine in which shards are made.
+"""The target of a rollout: a storage, and the local folder in which shards are made.
 
 A shard is made in a staging folder of the worker's own and committed whole: its files, then its commit record. So two
 workers that make the same shard (a retry beside a slow one) never write into each other's files, and end in the same
@@ -108,7 +108,7 @@ class Target:
 
     @property
     def uploads(self) -> bool:
-        """Whether committing takes so long that the next shard is better made meanwhile."""
+        """True if committing is so slow that the next shard should be made meanwhile."""
         return self.folder is None
 
     def manifest(self) -> Manifest | None:
@@ -261,7 +261,7 @@ class StagingFolder:
         return self.folder
 
     def inputs(self, record: SubsetRecord) -> Inputs:
-        """What a subset is made from, found in the release."""
+        """Find the inputs of a subset in the release."""
         if record.name not in self._inputs:
             self._inputs[record.name] = self._target.inputs(record, self.folder)
         return self._inputs[record.name]

@@ -142,7 +142,7 @@ def left_unchecked(root: str | Path) -> int:
 
 
 def _is_of_the_whole(release: Release) -> bool:
-    """Whether only a part of the release was fetched, with the card of the whole."""
+    """Return True if only a part of the release was fetched, with the card of the whole."""
     try:
         text = (release.path / README).read_text(errors="replace")
     except OSError:
@@ -170,7 +170,7 @@ def _check_changelog(release: Release) -> list[str]:
 
 
 def _shows(path: Path, pixels: np.ndarray) -> bool:
-    """Whether a file is the picture of these pixels; compare sizes before decoding."""
+    """Return True if a file is the picture of these pixels; sizes are compared before decoding."""
     try:
         with Image.open(path) as picture:
             return picture.size == pixels.shape[1::-1] and np.array_equal(np.asarray(picture), pixels)

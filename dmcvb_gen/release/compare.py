@@ -1,4 +1,4 @@
-"""How the data of two releases differ: returns, lengths, successes and state numbers of the subsets that both have."""
+"""Compare returns, lengths, successes and state numbers of the subsets that two releases have in common."""
 
 from __future__ import annotations
 

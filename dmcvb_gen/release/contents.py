@@ -1,4 +1,4 @@
-"""Are the contents of a subset what they should be? A subset in, findings out: values, physics, pixels.
+"""Check the contents of a subset: values, physics and pixels.
 
 Every finding names subset, episode and step. Values are checked everywhere; a sample of steps is simulated again and a
 sample of frames painted again.

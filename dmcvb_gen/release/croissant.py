@@ -63,7 +63,7 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class Publication:
-    """Where and when a release is published.
+    """Place and date of a release's publication.
 
     Attributes:
       url: its page; None if it is not known.
@@ -150,7 +150,7 @@ def _responsible(manifest: Manifest, limits: Sequence[str]) -> dict[str, Any]:
 
 
 def _collection(manifest: Manifest) -> dict[str, Any]:
-    """How the data were collected, and which raw data are kept."""
+    """Describe how the data were collected, and which raw data are kept."""
     tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
     if manifest.imported:
         return {

@@ -1,4 +1,4 @@
-"""Two releases in, what is different in them out: subsets, episodes, digests, and what they were made with."""
+"""Compare two releases: subsets, episodes, digests, and what they were made with."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Difference:
 
 
 def diff(one: str | Path, other: str | Path, options: dict | None = None) -> list[Difference]:
-    """What differs between two releases, by manifests and commit records alone; empty where nothing does.
+    """List what differs between two releases, by manifests and commit records alone.
 
     Args:
       one, other: folders or URLs.

@@ -1,4 +1,4 @@
-"""What DMC-VB's published data call things: our views, state fields and subsets in, its features and folders out."""
+"""Names of our views, state fields and subsets in DMC-VB's published data."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 
 @dataclass(frozen=True)
 class Moved:
-    """What a publish or fetch did: files and bytes of the release's part, and how many of the files were moved now."""
+    """Result of a publish or fetch: files and bytes of the release's part, and how many files were moved now."""
 
     files: int
     bytes: int
@@ -183,7 +183,7 @@ class Source:
 
     @property
     def public_name(self) -> str:
-        """What others are told that the release came from: the URL; of a folder of this machine, what lay in it."""
+        """Return the public name of a release's source: the URL; for a local folder only its last part."""
         return f"{self.manifest.name} {self.manifest.version}" if self.storage.folder else self.place
 
     @functools.cached_property
@@ -191,7 +191,7 @@ class Source:
         return {file.path: file for file in self.index.files}
 
     def listed(self, path: str) -> FileRecord:
-        """What the index says of a file."""
+        """Return the index's entry of a file."""
         if path not in self._by_path:
             raise StoreError(f"{self.place}/{INDEX} does not list {path}; publish the release again")
         return self._by_path[path]
@@ -277,7 +277,7 @@ class Download:
 
     @property
     def unpainted_commits(self) -> list[CommitRecord]:
-        """Of the shards that come without pictures."""
+        """Return the commit records of the shards that come without pictures."""
         return [commit for key, (_, commit) in self.commits.items() if not commit.painted and key not in self._kept]
 
     @property
@@ -420,7 +420,7 @@ def taken_up(out: Path, source: Source) -> Manifest | None:
 
 
 def _is_older_version(out: Path, old: Manifest, source: Source) -> bool:
-    """Whether a folder holds a version, or a part of one, that the published release has grown from."""
+    """Return True if a folder holds a version, or a part of one, that the published release has grown from."""
     if old.recipe != source.manifest.recipe or not is_grown_from(source.manifest, old):
         return False
     index = read_index(out)
@@ -428,7 +428,7 @@ def _is_older_version(out: Path, old: Manifest, source: Source) -> bool:
 
 
 def _same_release(old: Manifest, source: Source) -> bool:
-    """Whether a manifest is the published one's, or that of a part of it, or of what was painted from it."""
+    """Return True if a manifest is the published one, or belongs to a part of it or to a painted copy."""
     new = source.manifest
     if {record.name for record in old.subsets} != {record.name for record in new.subsets}:
         return False
@@ -440,7 +440,7 @@ def _same_release(old: Manifest, source: Source) -> bool:
 
 
 def _is_strange(out: Path, manifest: Manifest) -> bool:
-    """Whether a folder holds what is no part of an interrupted fetch, or is none."""
+    """Return True if a folder holds files that no interrupted fetch leaves."""
     ours = {record.name.split("/")[0] for record in manifest.subsets} | {
         "policies",
         "commits",

@@ -64,7 +64,7 @@ def imported_specs(record: SubsetRecord) -> tuple[ArraySpec, ...]:
 
 
 class Place(NamedTuple):
-    """Where an episode lies: the number of its folder, its file, and its bytes there."""
+    """Location of an episode: the number of its folder, its file, and its bytes there."""
 
     folder: int
     file: Path

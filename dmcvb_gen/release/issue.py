@@ -1,4 +1,4 @@
-"""What a check found: which check, where, and what is wrong."""
+"""One issue that a check found: the check, the place, and what is wrong."""
 
 from __future__ import annotations
 

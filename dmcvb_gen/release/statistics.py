@@ -40,7 +40,7 @@ class StateStatistics:
 
 @dataclass(frozen=True)
 class LevelStatistics:
-    """How the policies of a level move.
+    """Motion statistics of the policies of a level.
 
     Attributes:
       speed: mean horizontal speed of the root, m/s; None if the task has no root that moves.
@@ -140,7 +140,7 @@ def _speed(task: Task, subset: Subset) -> float | None:
 
 
 def _moved(subset: Subset, name: str, columns: np.ndarray) -> list[np.ndarray]:
-    """How far columns of an array move in each step, episode by episode: (length, column)."""
+    """Return how far columns of an array move in each step, episode by episode: (length, column)."""
     return [np.diff(rows[:, columns], axis=0) for rows in _episodes(subset, name) if len(rows) > 1]
 
 
@@ -149,7 +149,7 @@ def _mean_length(vectors: list[np.ndarray]) -> float:
 
 
 def _root_columns(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray] | None:
-    """Where the root's horizontal motion lies in qpos and in qvel: x and y of a free joint, or the slide along x.
+    """Find the root's horizontal motion in qpos and qvel: x and y of a free joint, or the slide along x.
 
     None if the model has neither (a finger, an arm that is fixed to its base).
     """

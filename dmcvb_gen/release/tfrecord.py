@@ -1,4 +1,4 @@
-"""TFRecord files of tf.train.Example messages, without TensorFlow: features in, bytes out, and back."""
+"""Read and write TFRecord files of tf.train.Example messages without TensorFlow."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def record(data: bytes) -> bytes:
 
 
 def offsets(file: Path) -> Iterator[tuple[int, int]]:
-    """Where each record's data begin in a file, and how long they are.
+    """Return the offset and length of each record's data in a file.
 
     Raises:
       StoreError: the file is damaged or cut short.

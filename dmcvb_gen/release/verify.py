@@ -1,4 +1,4 @@
-"""Is a release what it says? A folder in, findings out: bytes, shapes, values, physics, pixels, returns.
+"""Check that a release is what it says: bytes, shapes, values, physics, pixels and returns.
 
 Every finding names subset, episode and step. Digests and values are checked everywhere; a sample of steps is
 simulated again and a sample of frames painted again.
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Verification:
-    """What was looked at, and what was found wrong.
+    """Result of a verification: what was checked, and the issues.
 
     Attributes:
       checked: how many subsets, episodes and steps.
@@ -61,12 +61,12 @@ class Verification:
 
     @property
     def sound(self) -> bool:
-        """Whether everything that is here is as it was made."""
+        """True if everything that is here is as it was made."""
         return not self.findings
 
     @property
     def complete(self) -> bool:
-        """Whether everything that belongs to the release is here."""
+        """True if everything that belongs to the release is here."""
         return self.finished and not self.incomplete
 
 
@@ -159,7 +159,7 @@ class _Shards:
 
 @dataclass(frozen=True)
 class _Checked:
-    """What the bytes of some shards gave: findings, the files that were looked at, the records that can be read."""
+    """Result of checking some shards' bytes: issues, files that were checked, and readable records."""
 
     findings: tuple[Issue, ...]
     files: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Is a published release what it says? A URL in, findings out; nothing is kept here.
+"""Check that a published release is what it says; nothing is stored on this machine.
 
 Manifest, index and commit records are read and held against one another; files are read and compared with their
 digests, a sample of them or all; of the rest, that they are there at their size.
@@ -106,7 +106,7 @@ def _missing(source: Source, damaged: Collection[str]) -> list[Issue]:
 
 
 def _disagreements(subset: Subset, listed: Mapping[str, FileRecord]) -> list[Issue]:
-    """What the commit records of a subset say otherwise than the index or the manifest.
+    """List where the commit records of a subset disagree with the index or the manifest.
 
     Args:
       listed: of the index, by path; shards that it does not know yet were made since.

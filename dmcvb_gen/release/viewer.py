@@ -155,7 +155,7 @@ def _command(release: Release, path: str, subset: SubsetReader, index: int) -> s
 
 
 def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
-    """What the page shows of an episode: facts, views with their raw frames, and groups of curves."""
+    """Collect what the page shows of an episode: facts, views with their raw frames, and groups of curves."""
     pictures = shown(subset)
     labels = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]

@@ -1,4 +1,4 @@
-"""Where releases lie: local folders, object stores, the Hugging Face Hub. `open_storage` is the way in."""
+"""Storage of releases: local folders, object stores and the Hugging Face Hub. Begin with `open_storage`."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class Storage(abc.ABC):
 
     @property
     def lists_sizes(self) -> bool:
-        """Whether `list` finds every file, with its size."""
+        """True if `list` finds every file, with its size."""
         return True
 
     @property
@@ -107,7 +107,7 @@ class Storage(abc.ABC):
         """Copy a local file to a path."""
 
     def _same(self, file: Digested, local: Path) -> bool:
-        """Whether a stored file of the right size has the bytes of a local one; reads it unless the storage knows."""
+        """Return True if a stored file of the right size has a local file's bytes; read it unless the storage knows."""
         return self._sha256(file) == file.sha256
 
     def _fetch(self, file: Digested, partial: Path, root: Path) -> None:
@@ -358,7 +358,7 @@ def retry(place: str, path: str, attempt: Callable[[], Result], doing: str) -> R
 
 
 def _may_pass(error: BaseException) -> bool:
-    """Whether trying again may help."""
+    """Return True if trying again may help."""
     if isinstance(error, StoreError) or not isinstance(error, Exception) or is_refusal(error):
         return False
     return not (isinstance(error, OSError) and error.errno in NO_ROOM)

@@ -29,7 +29,7 @@ _URL = re.compile(r"hf://datasets/([\w.-]+/[\w.-]+)(?:@([\w.-]+))?(?:/([\w./-]*)
 
 
 def on_the_hub(url: str) -> bool:
-    """Whether a URL is one of the Hugging Face Hub."""
+    """Return True if a URL is one of the Hugging Face Hub."""
     return url.startswith("hf://")
 
 
@@ -47,7 +47,7 @@ def parse_hub_url(url: str) -> tuple[str, str, str | None]:
 
 
 def newest_of(url: str) -> tuple[dict[str, str], str]:
-    """Where a URL is published to: the repository as the Hub's client wants it, and the folder in it.
+    """Return the repository of a URL, as the Hub's client names it, and the folder in it.
 
     Raises:
       StoreError: it names a revision.
@@ -73,7 +73,7 @@ def new_api() -> Any:
 
 @contextlib.contextmanager
 def client_errors(url: str) -> Iterator[None]:
-    """What the Hub's client raises (many kinds) as one line with a cure."""
+    """Turn the many errors of the Hub's client into one line that names the cure."""
     try:
         yield
     except StoreError:
@@ -170,7 +170,7 @@ class HubStorage(ObjectStorage):
             new_api().create_tag(**where, tag=name, tag_message=message, revision=self._head[0], exist_ok=True)
 
     def _contents(self, paths: Sequence[str]) -> dict[str, set[str]]:
-        """What the Hub calls the contents of those files that are there."""
+        """Return the Hub's names of the contents of those files that exist."""
         where, folder = newest_of(self.url)
         found = {}
         with client_errors(self.place):
@@ -195,12 +195,12 @@ class HubStorage(ObjectStorage):
 
 
 def _stage(root: Path) -> Path:
-    """Where the Hub's client keeps what was cut, so that it resumes."""
+    """Folder in which the Hub's client keeps interrupted downloads, so that it can resume them."""
     return root / f".hub{PARTIAL}"
 
 
 def _names(path: Path) -> set[str]:
-    """What the Hub may call a file's content: its SHA-256 (large files), or git's blob id."""
+    """Return the names that the Hub may have for a file's content: its SHA-256 (large files), or git's blob id."""
     data = path.read_bytes()
     blob = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
     return {hashlib.sha256(data).hexdigest(), blob}

@@ -1,4 +1,4 @@
-"""Places of data: a folder or URL in, its file system out; what storage raises in, one line with a cure out.
+"""Find the file system of a folder or URL, and turn its errors into one line that names the cure.
 
 `storage_errors` is the one place that turns errors of disks, networks, credentials, missing packages and damaged
 bytes into a `StoreError`; it never shows a secret. Whatever touches storage runs inside it::
@@ -38,7 +38,7 @@ BUCKET_PROTOCOLS = ("s3", "gs", "gcs", "az", "abfs", "hf")
 
 
 def is_url(path: str) -> bool:
-    """Whether a path is a URL rather than a folder ("file:..." counts as a URL)."""
+    """Return True if a path is a URL rather than a folder ("file:..." counts as a URL)."""
     return "://" in path or path.startswith("file:")
 
 
@@ -108,7 +108,7 @@ def reason(error: BaseException) -> str:
 
 
 def is_refusal(error: BaseException) -> bool:
-    """Whether an error is about who is asking, so that trying again is of no use."""
+    """Return True if an error is about permissions, so that trying again does not help."""
     words = f"{type(error).__name__} {error}"
     return isinstance(error, PermissionError) or any(word in words for word in REFUSALS)
 
@@ -122,7 +122,7 @@ def refused(place: str, error: BaseException) -> StoreError:
 
 
 def _explained(error: BaseException, place: str, doing: str) -> str:
-    """What went wrong at a place, and the cure."""
+    """Explain what went wrong at a location, and name the cure."""
     remote, writing = is_url(place), doing != "read"
     if isinstance(error, ImportError):
         name = error.name or reason(error)

@@ -36,7 +36,7 @@ class _Work:
 
     @property
     def done(self) -> bool:
-        """Whether an earlier call wrote this very export. Raises StoreError where something else is."""
+        """Return True if an earlier call wrote this very export. Raises StoreError if something else is there."""
         if not self.folder.exists():
             return False
         with contextlib.suppress(OSError, ValueError):
@@ -106,7 +106,7 @@ def export(
 
 
 def _stamp(manifest: Manifest, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
-    """What an export was made from: release (the root digest, where it is finished), format, options and episodes."""
+    """Return what an export was made from: release (its root digest, if it is finished), format, options, episodes."""
     digests = {record.name: record.digest for record in manifest.subsets}
     content = [[name, digests[name], list(episodes)] for name, episodes in subsets]
     return dict(release=manifest.name, digest=manifest.digest, format=to, options=options, subsets=content)

@@ -1,4 +1,4 @@
-"""What exporters read: the chosen episodes of a subset, one at a time."""
+"""Read the chosen episodes of a subset, one at a time, for exporters."""
 
 from __future__ import annotations
 

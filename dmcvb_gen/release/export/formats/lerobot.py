@@ -120,7 +120,7 @@ def _task_text(source: Source) -> str:
 
 
 class _Layout:
-    """What the data set's columns are.
+    """Columns of the data set.
 
     Attributes:
       tasks: their texts; `task_index` counts them. robot: what they have in common.
@@ -198,7 +198,7 @@ class _Layout:
         }
 
     def schema(self) -> pa.Schema:
-        """Of the data tables, with what Hugging Face's `datasets` wants to know."""
+        """Return the schema of the data tables, with the metadata that Hugging Face's `datasets` wants."""
         import pyarrow as pa
 
         fields: list[pa.Field] = []

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def folder_name(release: ReleaseReader, subset: str) -> str:
-    """Where a subset's data set lies below the root of minari's data sets; its id, too."""
+    """Return the id of a subset's data set, which is also its folder below the root of minari's data sets."""
     task, level, setting = subset.replace("_", "-").replace(".", "-").split("/")
     return f"{NAMESPACE}/{task}/{level}-{setting}-v0"
 
@@ -124,7 +124,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
 
 
 def _own_videos(source: Source) -> str | None:
-    """Where the release keeps its own videos; None if it shows the built-in ones or none."""
+    """Return the folder of the release's own videos; None if it shows the built-in ones or none."""
     from dmcvb_gen.generate.inputs import BUILTIN
 
     videos = (source.subset.record.backgrounds or {}).get("source", BUILTIN)
