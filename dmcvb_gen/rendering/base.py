@@ -1,4 +1,4 @@
-"""The one interface of the renderers: physics states and distractor labels in, pictures out."""
+"""Interface of all renderers, which turn physics states and distractor labels into pictures."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Renderer(abc.ABC):
 
     @classmethod
     def check_task(cls, task: Task) -> None:
-        """Raises RenderingError if this renderer does not paint a task; most paint every one."""
+        """Raise RenderingError if this renderer does not paint a task; most paint every one."""
         return
 
     @abc.abstractmethod
@@ -104,7 +104,7 @@ class Renderer(abc.ABC):
 
 
 def check_size(size: int) -> None:
-    """Raises RenderingError for a size that no renderer takes."""
+    """Raise RenderingError for a size that no renderer takes."""
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise RenderingError(
             f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)"
@@ -112,7 +112,7 @@ def check_size(size: int) -> None:
 
 
 def check_frames(task: Task, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None) -> list[int]:
-    """Indices of the asked views; raises where frames and labels do not belong together."""
+    """Return the indices of the requested views; raise if frames and labels do not belong together."""
     if physics.ndim != 2 or physics.shape[1] != task.physics_size or len(physics) != len(exogenous):
         raise ValueError(f"physics {physics.shape} and {len(exogenous)} labels are not frames of {task.id}")
     for view in views or ():

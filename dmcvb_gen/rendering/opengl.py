@@ -1,4 +1,4 @@
-"""The reference renderer: MuJoCo's own OpenGL through EGL; frames in, pictures as dm_control's out.
+"""The reference renderer: MuJoCo's own OpenGL through EGL, whose pictures are dm_control's.
 
 Against the usual wrapper it takes what costs no pixel: an off-screen buffer of the picture's own size,
 one render an agent step, kinematics without a physics step.
@@ -51,7 +51,7 @@ def unavailable() -> str | None:
 
 
 class OpenglRenderer(Renderer):
-    """See the module and `Renderer`."""
+    """Renderer by MuJoCo's OpenGL."""
 
     name = "opengl"
 

@@ -1,4 +1,4 @@
-"""The default renderer: MuJoCo Warp's batch ray tracer on CPU or CUDA; frames in, pictures out.
+"""The renderer 'warp': MuJoCo Warp's batch ray tracer on CPU or CUDA.
 
 One world of the ray tracer is one frame. Kinematics is computed by MuJoCo in float64 and copied in, so
 no Warp physics runs. What OpenGL does and the tracer does not is made up for here: distant floor textures
@@ -59,7 +59,7 @@ def _warp():
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Nothing on standard error, where warp's library says that it finds no CUDA driver; a CPU needs none."""
+    """Silence standard error, on which warp's library says that it finds no CUDA driver; a CPU needs none."""
     try:
         sys.stderr.flush()
         kept = os.dup(2)
@@ -77,7 +77,7 @@ def _quiet() -> Iterator[None]:
 
 
 class WarpRenderer(Renderer):
-    """See the module and `Renderer`."""
+    """Renderer by MuJoCo Warp's ray tracer."""
 
     name = "warp"
 
@@ -257,7 +257,7 @@ class WarpRenderer(Renderer):
             yield slice(first, min(first + few, count)), few
 
     def _launch(self, physics, exogenous, view, hide_goal, worlds, labels=False):
-        """Up to `worlds` frames of one view: pictures, and depth and segmentation if asked for."""
+        """Render up to `worlds` frames of one view: pictures, and depth and segmentation if requested."""
         mjw, wp, mjm, count = _mjw(), _warp(), self._mujoco_model, len(physics)
         camera = camera_ids(self.task)[view]
         context = self._context(camera, labels, worlds)

@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 @functools.cache
 def _entry(factory: Callable):
-    """What `factory(version)` gives, the version being the digest of all of this package's source."""
+    """Return `factory(version)`; the version is the digest of all of this package's source."""
     source = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     return factory(int.from_bytes(hashlib.sha256(source).digest()[:6], "little") | 1)
 

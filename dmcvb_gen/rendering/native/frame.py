@@ -1,4 +1,4 @@
-"""One frame's poses in, its picture out: what each sample shows first, then one shading a pixel and surface."""
+"""Paint a frame from its poses: find what each sample shows, then shade once for each pixel and surface."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ ALL, NO_GOAL, NOTHING_MOVING = 0, 1, 2
 
 
 class Frames(NamedTuple):
-    """What differs from frame to frame, a leading frame axis; positions in the world, meters."""
+    """Data that differ from frame to frame, with a leading frame axis; positions in the world, meters."""
 
     center: np.ndarray  # (frame, geom, 3)
     turn: np.ndarray  # (frame, geom, 3, 3), columns are the geom's axes
@@ -93,7 +93,7 @@ class Frames(NamedTuple):
 
 
 class Still(NamedTuple):
-    """What stays the same from frame to frame."""
+    """Data that are the same in all frames."""
 
     looks: np.ndarray  # (look, geom, column) the first columns of `rec`
     constants: np.ndarray  # the first entries of `k`
@@ -153,13 +153,13 @@ def room_for(pixels):
 
 @leaf
 def lists_at(room, geoms, which, g):
-    """Where in `jobs` the list of geom g (`geoms`: the sky) is: of what is in front (`which` 0) or behind (1)."""
+    """Return the index in `jobs` of the list of geom g (`geoms`: the sky), in front (`which` 0) or behind (1)."""
     return (3 + which * (geoms + 1) + g) * room
 
 
 @leaf
 def length_at(room, geoms, which, g):
-    """Where in `jobs` the length of that list is."""
+    """Return the index in `jobs` of the length of that list."""
     return (3 + 2 * (geoms + 1)) * room + which * (geoms + 1) + g
 
 
@@ -266,7 +266,7 @@ def swap_with_image(rec, g):
 
 @part
 def in_a_box(boxes, eye, f):
-    """Whether the eye is inside one of the solid boxes."""
+    """Return True if the eye is inside one of the solid boxes."""
     for b in range(boxes.shape[0]):
         inside = True
         for axis in range(3):
@@ -281,7 +281,7 @@ def in_a_box(boxes, eye, f):
 
 @leaf
 def drawn(rec, g, which):
-    """Whether geom g is drawn (ALL, NO_GOAL, NOTHING_MOVING)."""
+    """Return True if geom g is drawn (ALL, NO_GOAL, NOTHING_MOVING)."""
     return which == ALL or (rec[g, GOAL] == 0.0 and (which == NO_GOAL or rec[g, MOVING] == 0.0))
 
 
@@ -340,7 +340,7 @@ def draw_mirrored_planes(inverse, number, rays, k, rec):
 
 @part
 def veils(rec, inside):
-    """Whether there may be planes to see through.
+    """Return True if there may be transparent planes.
 
     Args:
       inside: the eye is inside a box.
@@ -355,7 +355,7 @@ def veils(rec, inside):
 
 @part
 def clear(inverse, number, k, pixels):
-    """Nothing in the samples in CLIP."""
+    """Empty the samples in CLIP."""
     distinct()
     first, past = 4 * int(k[CLIP]), 4 * int(k[CLIP + 1])
     for row in range(int(k[CLIP + 2]), int(k[CLIP + 3])):
@@ -367,7 +367,7 @@ def clear(inverse, number, k, pixels):
 
 @part
 def copy_depths(inverse, behind, k, pixels):
-    """`behind` as deep as `inverse` in CLIP."""
+    """Make `behind` as deep as `inverse` in CLIP."""
     distinct()
     first, past = 4 * int(k[CLIP]), 4 * int(k[CLIP + 1])
     for row in range(int(k[CLIP + 2]), int(k[CLIP + 3])):
@@ -410,7 +410,7 @@ def draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled):
 
 @leaf
 def share_of(number, behind_number, first, sample):
-    """How many of a pixel's samples show what one of them does; 0 if one before it does."""
+    """Count the samples of a pixel that show the same as one of them; 0 if an earlier sample shows it too."""
     count = 1
     geom, behind = get(number, sample), get(behind_number, sample)
     for t in range(first, first + 4):
@@ -487,7 +487,7 @@ def write_pixels(jobs, color, room, count, out):
 
 @part
 def take_base(s, n, jobs, color, room, first):
-    """What lies under n jobs into the base colors."""
+    """Copy the colors under n jobs into the base colors."""
     distinct()
     for i in range(n):
         job = get(jobs, first + i)
@@ -561,7 +561,7 @@ def keep_heaven(s, k, texels, width, jobs, color, pixels, geoms):
 
 @part
 def take_heaven(jobs, color, room, pixels, first, total):
-    """As `shade_heaven`, from what `keep_heaven` has kept."""
+    """Do as `shade_heaven`, with the colors that `keep_heaven` has stored."""
     for i in range(first, first + total):
         job = get(jobs, i)
         pixel = 3 * room + get(jobs, job) * pixels + get(jobs, room + job)
@@ -651,7 +651,7 @@ def set_constants(k, constants):
 
 @part
 def copy_picture(source, target):
-    """(row, column, 3) to another."""
+    """Copy a picture (row, column, 3) to another."""
     for row in range(source.shape[0]):
         for column in range(source.shape[1]):
             for c in range(3):
@@ -660,7 +660,7 @@ def copy_picture(source, target):
 
 @part
 def same(array, f):
-    """Whether array[f] is equal to array[f - 1], both (row, column)."""
+    """Return True if array[f] is equal to array[f - 1], both (row, column)."""
     for row in range(array.shape[1]):
         for column in range(array.shape[2]):
             if array[f, row, column] != array[f - 1, row, column]:
@@ -670,7 +670,7 @@ def same(array, f):
 
 @part
 def same_sky(axes, sky, f):
-    """Whether frame f shows the sky as the frame before it does."""
+    """Return True if frame f shows the same sky as the frame before it."""
     return 0 < f < sky.size and sky[f] == sky[f - 1] and same(axes, f)
 
 
@@ -690,7 +690,7 @@ def light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, which):
 
 @stage
 def pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels):
-    """Everything of frame f into the camera's frame."""
+    """Transform everything of frame f into the camera's frame."""
     pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
     pose_camera(k, axes, sky, f)
     clip(k, i8(0), pixels, i8(0), pixels)

@@ -1,4 +1,4 @@
-"""Numbers of up to CHUNK places side by side in, vector code out: how the painter's loops touch memory.
+"""Access to rows of up to CHUNK numbers, written so that the compiler turns the painter's loops into vector code.
 
 What is computed for many places of a picture lies in `s` (ROWS * CHUNK,) float32, a row a quantity, and the loops run
 over the places of a row. numba's own indexing wraps around and says nothing about arrays that overlap, and either

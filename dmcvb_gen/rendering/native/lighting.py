@@ -1,4 +1,4 @@
-"""Points and normals in, light out: OpenGL's fixed pipeline with MuJoCo's headlight and one lamp with its shadows.
+"""Light at points with normals, as OpenGL's fixed pipeline has it: MuJoCo's headlight, one lamp, its shadows.
 
 A light's color at a point is `material * (ambient + diffuse * N.L) + specular * (N.H)^exponent`, the lamp's times
 `cos(angle off its axis)^exponent` inside its cone. As in OpenGL, the lit plane is lit at the vertices that MuJoCo
@@ -94,7 +94,7 @@ def least_square(exponent):
 
 @part
 def head_light(s, n, k, eye, exponent):
-    """Points and normals in; HEAD, and HEAD_SHINE before it is raised, out; `eye` is where its direction is in k."""
+    """Compute HEAD, and HEAD_SHINE before it is raised, at points with normals; k has the eye's direction at `eye`."""
     distinct()
     ex, ey, ez, least = f4(k[eye]), f4(k[eye + 1]), f4(k[eye + 2]), least_square(exponent)
     for i in range(n):
@@ -108,7 +108,7 @@ def head_light(s, n, k, eye, exponent):
 
 @part
 def lamp_light(s, n, k, lamp, exponent):
-    """Points and normals in; CONE_FACTOR (yet to be raised), LAMP_DIFFUSE, LAMP_SHINE (likewise), LIGHT out.
+    """Compute LAMP_DIFFUSE and LIGHT at points with normals, and CONE_FACTOR and LAMP_SHINE before they are raised.
 
     Args:
       lamp: where its place and direction are in k.
@@ -215,7 +215,7 @@ def ways_from_lamp(s, n, k):
 
 @leaf
 def ball_blocks(dx, dy, dz, ox, oy, oz, square_of_radius):
-    """Whether the way from the origin to d meets a ball around o before its end."""
+    """Return True if the way from the origin to d meets a ball around o before its end."""
     square = dx * dx + dy * dy + dz * dz
     along = dx * ox + dy * oy + dz * oz
     rest = along * along - square * (ox * ox + oy * oy + oz * oz - square_of_radius)
@@ -224,7 +224,7 @@ def ball_blocks(dx, dy, dz, ox, oy, oz, square_of_radius):
 
 @part
 def cast_shadow(s, n, k, rec, g):
-    """Ways from the lamp in; LIGHT is 0 where capsule or ball g is in the way."""
+    """Set LIGHT to 0 where capsule or ball g is in the way from the lamp."""
     distinct()
     dx, dy, dz = rec[g, PLACE] - k[LAMP], rec[g, PLACE + 1] - k[LAMP + 1], rec[g, PLACE + 2] - k[LAMP + 2]
     ex, ey, ez = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
@@ -253,7 +253,7 @@ def cast_shadow(s, n, k, rec, g):
 
 @part
 def cast_solid_shadow(s, n, k, rec, g):
-    """As `cast_shadow`, of a cylinder, box or ellipsoid."""
+    """Do as `cast_shadow` for a cylinder, box or ellipsoid."""
     distinct()
     kind, x, y, z = int(rec[g, KIND]), k[LAMP], k[LAMP + 1], k[LAMP + 2]
     ox, oy = f4(own_origin(rec, g, PLACE, TURN, 0, x, y, z)), f4(own_origin(rec, g, PLACE, TURN, 1, x, y, z))
@@ -272,7 +272,7 @@ def cast_solid_shadow(s, n, k, rec, g):
 
 @stage
 def cast_shadows(s, n, k, rec, itself):
-    """Points in; LIGHT is 0 where a body other than `itself` is between them and the lamp."""
+    """Set LIGHT to 0 at points that a body other than `itself` hides from the lamp."""
     left, right, low, high = ways_from_lamp(s, n, k)
     if left > right:
         return
@@ -296,7 +296,7 @@ def cast_shadows(s, n, k, rec, itself):
 
 @part
 def cone_slope(cosine, down):
-    """How far from the point below the lamp its cone reaches, for each meter of height.
+    """Return the radius of the lamp's cone for each meter of height.
 
     Args:
       cosine: of the cone's half angle; `down` of the angle between the lamp's direction and the way down.
@@ -330,7 +330,7 @@ def lit_window(k, rec, plane, g):
 
 @part
 def store_vertices(s, n, k, rec, plane, g, first, high, lines, several, which):
-    """Light at some vertices of the lit plane in, the lamp's color there (red, green, blue of each) out.
+    """Store the lamp's color (red, green, blue) at some vertices of the lit plane.
 
     Args:
       first: of these vertices in the window, which is `high` vertices high; `lines`: of the grid's second axis.
@@ -388,7 +388,7 @@ def light_vertices(s, k, rec, plane, g, several, which):
 
 @part
 def raise_lights(s, n, k, exponent):
-    """Raise what `head_light` and `lamp_light` have left to be raised."""
+    """Raise to their powers the values that `head_light` and `lamp_light` have not raised."""
     raise_row(s, n, i8(HEAD_SHINE), exponent)
     if k[CONE] > 0.0:
         raise_row(s, n, i8(LAMP_SHINE), exponent)

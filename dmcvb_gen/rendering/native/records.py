@@ -1,4 +1,4 @@
-"""Where every number lies in the few arrays that compiled code works on.
+"""Columns of every number in the few arrays that compiled code works on.
 
 A function compiled by numba pays for each array that it is handed, so all numbers of a geom are one row of `rec`
 (geom, WIDTH) float64, and all that belong to a frame as a whole are `k` (LENGTH,) float64. Positions and directions

@@ -1,4 +1,4 @@
-"""The renderer 'native': physics states and labels in, pictures out; batches, looks, skies around `frame`."""
+"""The renderer 'native': batches, visual looks and skies around the painter of `frame`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OUT_OF_SIGHT = -1e6
 
 
 class NativeRenderer(Renderer):
-    """See the package and `Renderer`. One thread at a time may use a renderer; several renderers work side by side."""
+    """Renderer in compiled Python. One thread at a time may use a renderer; several renderers work side by side."""
 
     name = "native"
 

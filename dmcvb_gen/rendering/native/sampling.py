@@ -1,4 +1,4 @@
-"""Texture coordinates in, colors out: mip levels and weights as OpenGL on a CPU (Mesa's llvmpipe) chooses them.
+"""Colors of textures at coordinates, with mip levels and weights as OpenGL on a CPU (Mesa's llvmpipe) has them.
 
 Everything works on rows of `lanes`. Texels and weights are whole numbers below 2^24, which float32 holds exactly.
 """
@@ -47,7 +47,7 @@ def fill(s, n, row, value):
 
 @part
 def choose_levels(s, n, last):
-    """FOOTPRINT in; LEVEL, its share MIX and no color out. Gives whether any place mixes two levels.
+    """Compute LEVEL and its share MIX from FOOTPRINT, and clear the color. Return True if any place mixes two levels.
 
     The logarithm is linear between powers of two, and a level is taken alone within a quarter of it: llvmpipe's
     "brilinear" choice.
@@ -117,7 +117,7 @@ def add_repeating(s, n, texels, at, last, further, weight, slope):
 
 @stage
 def sample_repeating(s, n, texels, width, texture):
-    """S, T, FOOTPRINT in; color of a repeating texture out.
+    """Sample a repeating texture at S, T with FOOTPRINT.
 
     Args:
       texels: the table of textures, and the textures; `width` of the table's rows.
@@ -132,7 +132,7 @@ def sample_repeating(s, n, texels, width, texture):
 
 @leaf
 def turn_to_face(along_z, along_x, sign, x, y, z):
-    """Two coordinates and the length towards a face of a cube map (OpenGL's table) of a direction, or a change of it.
+    """Return a direction's (or its change's) two coordinates and length towards a face of a cube map (OpenGL's table).
 
     Args:
       along_z, along_x: the pair of faces, neither for y; `sign`: 1 or -1, which of the two.
@@ -146,7 +146,7 @@ def turn_to_face(along_z, along_x, sign, x, y, z):
 
 @part
 def face_cube(s, n, half):
-    """Direction and its changes in; FACE, coordinates S, T in [0, 1] and FOOTPRINT out.
+    """Compute FACE, coordinates S, T in [0, 1] and FOOTPRINT from a direction and its changes.
 
     Args:
       half: half the texels a side of the finest level.
@@ -175,7 +175,7 @@ def face_cube(s, n, half):
 
 @part
 def add_clamped(s, n, texels, at, many, last, further, weight, slope):
-    """As `add_repeating`, of a cube map: coordinates end at a face's edge.
+    """Do as `add_repeating` for a cube map, whose coordinates end at a face's edge.
 
     Args:
       many: 1 if the faces differ, else 0.
@@ -201,7 +201,7 @@ def add_clamped(s, n, texels, at, many, last, further, weight, slope):
 
 @part
 def sample_cube(s, n, texels, width, texture):
-    """Direction and its changes to the right and upwards in; color of a cube map out. See `sample_repeating`."""
+    """Sample a cube map in a direction with its changes to the right and upwards. See `sample_repeating`."""
     at = texture * width
     last, many = i4(texels[at + LEVELS] - 1), i4(1 if texels[at + FACES] > 1 else 0)
     face_cube(s, n, f4(0.5) * f4(texels[at + FIRST + 1]))

@@ -1,4 +1,4 @@
-"""A task's model in, arrays of what a picture can show out: geoms, lights, materials by look."""
+"""Turn a task's model into arrays of what a picture can show: geoms, lights, materials of each look."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MAX_GRID = 200
 
 @dataclass(frozen=True)
 class Look:
-    """What the geoms of a scene (and sites, and tendons) are covered with, one visual look.
+    """Materials of a scene's geoms, sites and tendons under one visual look.
 
     Attributes:
       material: (geom,) int64, the material that gives the geom's color; -1: its own color.
@@ -51,7 +51,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Scene:
-    """What never changes from frame to frame: geoms in the model's order, then sites, then pieces of tendons.
+    """Constant part of a scene: geoms in the model's order, then sites, then pieces of tendons.
 
     Attributes:
       geoms: (geom,) int64, the model's geoms that can be seen; -1 for sites and pieces of tendons.
@@ -305,7 +305,7 @@ def _cone(model: mujoco.MjModel, lamp: int) -> np.ndarray:
 
 
 def _vertices(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where MuJoCo puts the vertices of a plane: OpenGL computes light there and blends between them.
+    """Return MuJoCo's vertices of a plane: OpenGL computes light there and blends between them.
 
     Args:
       size: (3,) of the plane.

@@ -1,4 +1,4 @@
-"""A surface and some pixels in, its colors there out: the headlight's pass and the lamp's, drawn after it in OpenGL.
+"""Colors of a surface in some pixels: the headlight's pass, then the lamp's, as OpenGL draws them.
 
 Works on rows of `lanes`: `aim` fills the rays, `shade_body` or `shade_plane` everything else, and `cover_*` lays the
 color over what BASE_RED and the others hold.
@@ -121,7 +121,7 @@ def aim(s, n, jobs, room, first, pixels, step):
 
 @part
 def meet_plane(s, n, rec, g, step, wide, high):
-    """Rays in; points, places U and V, texture coordinates S and T, and FOOTPRINT on plane g out.
+    """Find where rays meet plane g: points, places U and V, texture coordinates S and T, and FOOTPRINT.
 
     Args:
       wide, high: texels of its texture.
@@ -157,7 +157,7 @@ def meet_plane(s, n, rec, g, step, wide, high):
 
 @stage
 def shade_plane(s, n, k, rec, texels, width, plane, g, mirrored, tint):
-    """Rays in; texture, headlight and lamp (LAMP_RED and the others, LIGHT) on plane g, or on its mirror image, out."""
+    """Compute texture, headlight and lamp (LAMP_RED etc., LIGHT) on plane g, or its mirror image, along rays."""
     texture = int(rec[g, TEXTURE])
     at = max(texture, 0) * width + FIRST
     meet_plane(s, n, rec, g, k[STEP], texels[at + 1], texels[at + 2])
@@ -277,7 +277,7 @@ def meet_body(s, n, rec, g, place, axis):
 
 @part
 def meet_solid(s, n, rec, g, place, turn):
-    """As `meet_body`, of a cylinder, box or ellipsoid.
+    """Do as `meet_body` for a cylinder, box or ellipsoid.
 
     Args:
       place, turn: the columns of `rec` where its center and its axes are.
@@ -314,7 +314,7 @@ def meet_solid(s, n, rec, g, place, turn):
 
 @part
 def meet(s, n, rec, g, mirrored):
-    """As `meet_body`, of any body or its mirror image."""
+    """Do as `meet_body` for any body or its mirror image."""
     if rec[g, KIND] == SPHERE or rec[g, KIND] == CAPSULE:
         meet_body(s, n, rec, g, i8(MIRRORED_PLACE if mirrored else PLACE), i8(MIRRORED_AXIS if mirrored else AXIS))
     else:
@@ -345,7 +345,7 @@ def own_directions(s, n, rec, g, first, less):
 
 @stage
 def cover_ball(s, n, k, rec, texels, width, g):
-    """Rays in; color of the cube map around ball g out."""
+    """Sample the cube map around ball g along rays."""
     step = f4(k[STEP])
     turn_rays(s, n, i8(QUAD_X), i8(QUAD_Y), f4(0), f4(0))
     meet(s, n, rec, g, False)
@@ -364,7 +364,7 @@ def cover_ball(s, n, k, rec, texels, width, g):
 
 @stage
 def shade_body(s, n, k, rec, texels, width, g, mirrored):
-    """Rays in; texture, headlight and lamp on body g, or on its mirror image, out."""
+    """Compute texture, headlight and lamp on body g, or on its mirror image, along rays."""
     exponent = int(rec[g, EXPONENT])
     turn_rays(s, n, i8(X), i8(Y), f4(0), f4(0))
     if rec[g, TEXTURE] >= 0.0:
@@ -425,7 +425,7 @@ def cover_body(s, n, k, rec, g, tint):
 
 @part
 def shade_sky(s, n, k, texels, width):
-    """Rays in; base colors of the sky out: a cube of pictures around the eye, turned by 90 degrees around x."""
+    """Compute base colors of the sky along rays: a cube of pictures around the eye, turned by 90 degrees around x."""
     texture, step = int(k[SKY]), k[STEP]
     if texture < 0:
         for c in range(3):

@@ -1,4 +1,4 @@
-"""A background's picture in, the mip levels of a sky out, as packed texels (see `textures`).
+"""Turn a background's picture into the mip levels of a sky, as packed texels (see `textures`).
 
 The same bits as Pillow's bilinear `resize` and `reduce`, several times as fast: a video's every frame is a sky.
 """

@@ -1,4 +1,4 @@
-"""Pictures in, mip levels as one flat buffer of texels out; a texel is an int32, red in its lowest byte.
+"""Mip levels of pictures as one flat buffer of texels; a texel is an int32 with red in its lowest byte.
 
 The levels are those that Mesa's `glGenerateMipmap` makes: each side halved and rounded down, each texel the
 bilinear sample of the level before. Textures in sRGB are kept in linear light, as OpenGL samples them.
@@ -34,7 +34,7 @@ def level_sizes(width: int, height: int) -> list[tuple[int, int]]:
 
 
 def _taps(old: int, new: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For each of `new` texels along a side: the two old ones it lies between, and the second one's weight."""
+    """Return, for each of `new` texels along a side, the two old ones around it and the weight of the second."""
     center = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(center).astype(int)
     return np.clip(first, 0, old - 1), np.clip(first + 1, 0, old - 1), (center - first).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Geoms in the camera's frame in, the nearest geom of every sample out.
+"""Find the nearest geom of every sample from geoms in the camera's frame.
 
 Each pixel has four samples, side by side in memory, where OpenGL on a CPU has them. The ray of a sample is
 d = (x, y, -1) in the camera's frame (x right, y up), and what is kept of a hit is the inverse of its depth: larger
@@ -190,7 +190,7 @@ def own_origin(rec, g, place, turn, axis, x, y, z):
 
 @leaf
 def half_length(rec, g, axis):
-    """Of a solid along one of its axes, meters; a cylinder's sizes are its radius and its half length."""
+    """Half length of a solid along one of its axes, meters; a cylinder's sizes are its radius and its half length."""
     if rec[g, KIND] == CYLINDER:
         return rec[g, SIZE + 1] if axis == 2 else rec[g, SIZE]
     return rec[g, SIZE + axis]
@@ -198,7 +198,7 @@ def half_length(rec, g, axis):
 
 @leaf
 def slab(origin, direction):
-    """Where a line enters and leaves the slab from -1 to 1 of a coordinate."""
+    """Return where a line enters and leaves the slab from -1 to 1 of a coordinate."""
     tiny = np.float32(1e-9)
     over = np.float32(1) / (direction if abs(direction) > tiny else tiny)
     one, two = (np.float32(-1) - origin) * over, (np.float32(1) - origin) * over
@@ -207,7 +207,7 @@ def slab(origin, direction):
 
 @leaf
 def through_solid(kind, ox, oy, oz, dx, dy, dz):
-    """Where a line enters and leaves a solid: both distances over the length of d, and the face that it enters by.
+    """Return where a line enters and leaves a solid: both distances over d's length, and the face that it enters by.
 
     Faces: 0 the round one, 1 to 3 the flat ones across the axes. A line that passes by leaves before it enters.
     """
