@@ -6,6 +6,7 @@ python scripts/make_gallery.py --hero    (a minute; only the first picture of RE
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import subprocess
 import sys
@@ -136,11 +137,14 @@ def _hero_frame(columns: list[tuple[str, list[tuple[str, list, list]]]], frame: 
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hero", action="store_true", help="make only the first picture of README.md")
+    given = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         hero(work)
-        if "--hero" in sys.argv:
+        if given.hero:
             return
         (work / "gallery.yaml").write_text(yaml.safe_dump(RECIPE))
         command("rollout", "--recipe", work / "gallery.yaml", "--out", work / "all")

@@ -1,10 +1,11 @@
-"""Makes small releases of a walker and a maze, exports them, and keeps the stored values beside: for the heavy tests.
+"""Make small releases of a walker and a maze, export them, and keep the stored values beside, for the heavy tests.
 
 python scripts/make_integration_exports.py FOLDER lerobot tfds zarr2
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -23,7 +24,11 @@ FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer"
 
 
 def main() -> None:
-    work, chosen = Path(sys.argv[1]), sys.argv[2:]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("formats", nargs="+", choices=list(FORMATS))
+    given = parser.parse_args()
+    work, chosen = given.folder, given.formats
     walker = {"tasks": "walker-walk", "levels": "random", "settings": ["static"], "episodes": 2}
     maze = {"tasks": TINY_MAZE, "levels": "random", "settings": ["visible", "hidden"], "episodes": 2}
     wanted = []

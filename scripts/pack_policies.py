@@ -1,4 +1,4 @@
-"""Packs the policies that the package brings: files FOLDER/<task>/<level>.safetensors in, archives and their list out.
+"""Pack the policy files FOLDER/<task>/<level>.safetensors into the archives that the package brings.
 
 python scripts/pack_policies.py --unpack /tmp/policies     # today's files, to change or add some
 python scripts/pack_policies.py /tmp/policies
