@@ -167,6 +167,15 @@ def copy_file(source: str | Path, target: str | Path) -> None:
             file.write(piece)
 
 
+def link_or_copy(source: str | Path, target: str | Path) -> None:
+    """Make `target`, which is not there yet, a hard link to a file, or a copy if the file systems cannot link."""
+    Path(target).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:  # another disk, or none that links
+        copy_file(source, target)
+
+
 @contextlib.contextmanager
 def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
     """A fresh folder in `parent` for files that will be moved to where they belong; it is gone when the block ends.

@@ -59,7 +59,10 @@ def info(path, options, as_json):
         title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
         optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
     )
-    click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}; made by {facts['generator']}")
+    size = format_bytes(facts["bytes"])
+    if facts["disk_bytes"] not in (None, facts["bytes"]):
+        size += f" ({format_bytes(facts['disk_bytes'])} on disk: equal files are links)"
+    click.echo(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}")
     if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
         click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
     if facts["digest"]:

@@ -175,9 +175,12 @@ def _show_plan(plan, workers, as_json):
     cores, workers = os.cpu_count() or 1, workers if isinstance(workers, int) else 1
     with ProgressBar(not as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
         cost = estimate(plan, workers, bar.update)
+    disk = cost.disk_bytes if plan.target.folder else cost.bytes  # buckets have no links
     if as_json:
         facts = dict(jobs=cost.jobs, shards_done=cost.done, subsets=len(plan.manifest.subsets), episodes=cost.episodes)
-        facts |= dict(steps=cost.steps, bytes=round(cost.bytes), core_hours=cost.core_seconds / 3600)
+        facts |= dict(
+            steps=cost.steps, bytes=round(cost.bytes), disk_bytes=round(disk), core_hours=cost.core_seconds / 3600
+        )
         facts |= dict(hours=cost.seconds(workers) / 3600, workers=workers)
         rates = {name: dataclasses.asdict(rate) for name, rate in cost.rates.items()}
         for rate in rates.values():
@@ -193,9 +196,9 @@ def _show_plan(plan, workers, as_json):
     )
     spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
     click.echo(f"release: {plan.target.place}")
+    size = format_bytes(cost.bytes) + (f" ({format_bytes(disk)} on disk)" if disk < 0.99 * cost.bytes else "")
     click.echo(
-        f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; "
-        f"{cost.steps:,} steps, {format_bytes(cost.bytes)}"
+        f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; {cost.steps:,} steps, {size}"
     )
     click.echo(
         f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "

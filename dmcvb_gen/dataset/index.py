@@ -30,6 +30,7 @@ from dmcvb_gen.dataset.manifest import (
     commit_path,
     subset_path,
 )
+from dmcvb_gen.dataset.sharing import link_equal_files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.remote import is_url, storage_errors
 
@@ -180,12 +181,13 @@ def _record(root: Path, name: str) -> FileRecord:
 
 
 def write_release(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> Manifest:
-    """Give a release its digests: write `files.json`, then the manifest with the root digest.
+    """Give a release its digests: write `files.json`, then the manifest with the root digest. Equal files become links.
 
     Raises:
       StoreError: a file is missing, or the folder cannot be written.
     """
     with storage_errors(root, "write to"):
+        link_equal_files(root, manifest, commits)
         listed = data_files(root, manifest, commits)
         manifest = manifest.model_copy(update={"digest": root_digest(listed, manifest)})
         everything = sorted([*listed, *card_files(root)], key=lambda file: file.path)

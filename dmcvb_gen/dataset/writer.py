@@ -211,6 +211,7 @@ def write_shard(
     arrays: Iterable[tuple[str, np.ndarray]],
     lengths: np.ndarray,
     environment: Mapping[str, str] | None = None,
+    written: WrittenArrays | None = None,
 ) -> CommitRecord:
     """Write the arrays of one shard and commit it.
 
@@ -219,6 +220,7 @@ def write_shard(
         may make the big ones as they are asked for.
       lengths: (episode of the shard,) transitions of each episode.
       environment: what made them, by default this machine's with pictures painted on the CPU.
+      written: arrays of the same shard of sibling subsets; equal ones become links to them.
 
     Raises:
       StoreError: the disk is full or cannot be written; what was committed stays.
@@ -230,7 +232,7 @@ def write_shard(
         if there:  # another process has made it since this one planned to
             return there
         record.unlink(missing_ok=True)
-        files = _write_arrays(root, subset, shard, arrays)
+        files = _write_arrays(root, subset, shard, arrays, written or WrittenArrays())
         commit = CommitRecord(
             subset=subset.name,
             shard=shard,
@@ -267,7 +269,7 @@ def write_pictures(
       StoreError: the disk is full or cannot be written; what was committed stays.
     """
     try:
-        added = _write_arrays(root, subset, commit.shard, arrays)
+        added = _write_arrays(root, subset, commit.shard, arrays, WrittenArrays())
         files = {file.path: file for file in (*commit.files, *added)}  # two may have painted it at the same time
         painted = commit.model_copy(
             update={
@@ -290,10 +292,48 @@ def _cannot_write(root: Path, subset: SubsetRecord, shard: int, error: OSError) 
     )
 
 
+class WrittenArrays:
+    """Files of a shard's arrays, for sibling subsets that store the same values.
+
+    Args:
+      folders: where these files may be by now: the staging folder, or the release that they were moved to.
+    """
+
+    def __init__(self, *folders: Path):
+        self._folders = folders
+        self._files: dict[str, tuple[np.ndarray, dict, FileRecord]] = {}
+
+    def add(self, name: str, values: np.ndarray, array: zarr.Array, file: FileRecord) -> None:
+        """Remember the file of an array."""
+        self._files[name] = (values, _encoding(array), file)
+
+    def link(self, name: str, values: np.ndarray, array: zarr.Array, target: Path) -> FileRecord | None:
+        """Make `target` a link to the file that holds the very same values in the same encoding.
+
+        Returns:
+          That file's record; None if there is none, or links do not work here.
+        """
+        there = self._files.get(name)
+        if there is None or there[0] is not values or there[1] != _encoding(array):
+            return None
+        for folder in self._folders:
+            with contextlib.suppress(OSError):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.link(folder / there[2].path, target)
+                return there[2]
+        return None
+
+
+def _encoding(array: zarr.Array) -> dict:
+    """What decides the bytes of a shard beside its values."""
+    metadata = array.metadata.to_dict()
+    return {name: value for name, value in metadata.items() if name not in ("shape", "attributes")}
+
+
 def _write_arrays(
-    root: Path, subset: SubsetRecord, shard: int, arrays: Iterable[tuple[str, np.ndarray]]
+    root: Path, subset: SubsetRecord, shard: int, arrays: Iterable[tuple[str, np.ndarray]], written: WrittenArrays
 ) -> list[FileRecord]:
-    """Write a shard's part of arrays, each flushed to the disk."""
+    """Write a shard's part of arrays, each flushed to the disk, or link those that are in `written`."""
     first, last = shard_episodes(subset, shard)
     group_path = root / subset_path(subset.name)
     group = zarr.open_group(str(group_path), mode="r+", use_consolidated=False)
@@ -304,12 +344,16 @@ def _write_arrays(
         for stale in file.parent.glob(f"{file.name}.*.partial"):
             stale.unlink(missing_ok=True)  # left by a killed writer
         file.unlink(missing_ok=True)
+        relative = file.relative_to(root).as_posix()
+        if equal := written.link(name, values, array, file):
+            files.append(equal.model_copy(update={"path": relative}))
+            continue
         array[first:last] = values
         if file.exists():  # an array of nothing but fill values has no file
             with file.open("rb") as handle:
                 os.fsync(handle.fileno())
-            relative = file.relative_to(root).as_posix()
             files.append(FileRecord(path=relative, bytes=file.stat().st_size, sha256=sha256_file(file)))
+            written.add(name, values, array, files[-1])
         elif np.any(values):
             raise StoreError(
                 f"{file} vanished while it was written: another process writes the same release; let one of the "

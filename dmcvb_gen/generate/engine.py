@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,7 +24,7 @@ import numpy as np
 from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, commit_path, environment
 from dmcvb_gen.dataset.pictures import stored_pictures
 from dmcvb_gen.dataset.shards import damage
-from dmcvb_gen.dataset.writer import write_pictures, write_shard
+from dmcvb_gen.dataset.writer import WrittenArrays, write_pictures, write_shard
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import Inputs
@@ -93,11 +93,11 @@ def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobR
     """
     episodes = stored_episodes(job) if job.stored else simulated_episodes(job, threads)
     seconds = dict(episodes.seconds) | {"rendering": 0.0, "storage": 0.0}
-    sent = []
+    sent, written = [], WrittenArrays(job.target.folder or staging_folder_of(job.target).folder)
     for record in job.subsets:
         started, rendering = time.perf_counter(), Stopwatch()
         arrays = rendering.time(shard_arrays(job, record, episodes, tick))
-        sent.append(_write_and_commit(job, record, arrays, episodes.length))
+        sent.append(_write_and_commit(job, record, arrays, episodes.length, written))
         seconds["rendering"] += rendering.seconds
         seconds["storage"] += time.perf_counter() - started - rendering.seconds
 
@@ -211,8 +211,17 @@ def shard_arrays(
         yield from paint_labels(task, renderer, physics, labels, length, rows, label, record.hidden_goal)
 
 
-def _write_and_commit(job: Job, record: SubsetRecord, arrays: Iterator[tuple[str, np.ndarray]], lengths: np.ndarray):
+def _write_and_commit(
+    job: Job,
+    record: SubsetRecord,
+    arrays: Iterator[tuple[str, np.ndarray]],
+    lengths: np.ndarray,
+    written: WrittenArrays,
+) -> tuple[CommitRecord, Callable[[], None]]:
     """Write a shard and commit it: its commit record, and a function that waits until it is in the release.
+
+    Args:
+      written: arrays of the job's subsets so far, to which equal ones are linked.
 
     Raises:
       StoreError: it cannot be written, or another machine has committed this shard with other bytes.
@@ -223,7 +232,7 @@ def _write_and_commit(job: Job, record: SubsetRecord, arrays: Iterator[tuple[str
         added = write_pictures(Path(subset.root), record, subset.commits[job.shard], arrays, made_by)
         return added, lambda: None
     folder = staging_folder_of(job.target).prepare(record)
-    commit = write_shard(folder, record, job.shard, arrays, lengths, made_by)
+    commit = write_shard(folder, record, job.shard, arrays, lengths, made_by, written)
     (folder / commit_path(record.name, job.shard)).unlink()  # it is committed last
     return commit, job.target.commit_shard(folder, commit)
 

@@ -47,23 +47,26 @@ class Rate:
     Attributes:
       seconds_per_step: of one core, for simulating, painting and storing one setting.
       bytes_per_step: stored.
+      shared_bytes_per_step: the part of them that is equal in all subsets of a job, which links store once.
       steps_per_episode: mean length.
     """
 
     seconds_per_step: float
     bytes_per_step: float
+    shared_bytes_per_step: float
     steps_per_episode: float
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Cost of a plan; `rates` by subset."""
+    """Cost of a plan; `rates` by subset, `disk_bytes` what the bytes take if equal files are links."""
 
     jobs: int
     done: int
     episodes: int
     steps: int
     bytes: float
+    disk_bytes: float
     core_seconds: float
     rates: dict[str, Rate]
 
@@ -93,12 +96,12 @@ class _Piece:
 
 @dataclass(frozen=True)
 class _Measured:
-    """Lengths of whole episodes and what a step costs without pictures, by trajectory; seconds and bytes of a painted
-    step by `_painting_key`."""
+    """Lengths of whole episodes and what a step costs without pictures, by trajectory; seconds, bytes and shared bytes
+    of a painted step by `_painting_key`."""
 
     lengths: dict[tuple, list[int]]
     seconds: dict[tuple, float]
-    paintings: dict[tuple, tuple[float, float]]
+    paintings: dict[tuple, tuple[float, float, float]]
 
 
 def _trajectory(record: SubsetRecord) -> tuple:
@@ -120,8 +123,8 @@ def _simulate(job: Job, count: int, threads: int) -> tuple[Episodes, float]:
     return simulated_episodes(job, min(threads, count), episodes=range(count)), seconds  # what is timed had one thread
 
 
-def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, float]:
-    """Seconds and bytes a step of painting and storing one setting."""
+def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, float, float]:
+    """Seconds, bytes and shared bytes a step of painting and storing one setting."""
     task, chunk = get_task(record.task), min(PIXEL_CHUNK_STEPS, record.max_steps + 1)
     _, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
     labels = distractor_state_of(
@@ -144,10 +147,14 @@ def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, flo
         for name, value in shard_arrays(job, record, timed):
             find_array(group, name)[0][:] = value
         seconds = time.perf_counter() - started
-        files = [path for path in Path(folder).rglob("*") if path.is_file() and path.name != "zarr.json"]
-        size = sum(path.stat().st_size for path in files)
+        size = _stored_bytes(Path(folder))
+        shared = sum(_stored_bytes(Path(folder) / find_array(group, name)[1]) for name in values)
     frames = len(runs) * chunk
-    return seconds / frames, size / frames
+    return seconds / frames, size / frames, shared / frames
+
+
+def _stored_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and path.name != "zarr.json")
 
 
 def _runs(rows: np.ndarray, chunk: int) -> list[tuple[int, int]]:
@@ -220,7 +227,7 @@ def estimate(plan: Plan, workers: int = 1, progress: ProgressCallback = ignore) 
     workers = min(workers, cores)
     lengths: dict[tuple, list[int]] = {}
     seconds: dict[tuple, float] = {}
-    paintings: dict[tuple, tuple[float, float]] = {}
+    paintings: dict[tuple, tuple[float, float, float]] = {}
     for part in in_order(_measure, _pieces(plan, cores // workers), workers, progress):
         lengths |= part.lengths
         seconds |= part.seconds
@@ -229,9 +236,9 @@ def estimate(plan: Plan, workers: int = 1, progress: ProgressCallback = ignore) 
     rates: dict[str, Rate] = {}
     for job in plan.jobs:
         for record in job.subsets:
-            painting, size = paintings[_painting_key(record)]
+            painting, size, equal = paintings[_painting_key(record)]
             shared = seconds[_trajectory(record)] / len(job.subsets)
-            rates.setdefault(record.name, Rate(painting + shared, size, means[_trajectory(record)]))
+            rates.setdefault(record.name, Rate(painting + shared, size, equal, means[_trajectory(record)]))
     return _extrapolate(plan, rates)
 
 
@@ -244,14 +251,15 @@ def _with_inputs(plan: Plan) -> Plan:
 
 
 def _extrapolate(plan: Plan, rates: dict[str, Rate]) -> Estimate:
-    steps = size = seconds = 0.0
+    steps = size = linked = seconds = 0.0
     for job in plan.jobs:
-        for record in job.subsets:
+        for number, record in enumerate(job.subsets):
             rate = rates[record.name]
             count = len(job.episodes) * rate.steps_per_episode
             steps, size = steps + count, size + count * rate.bytes_per_step
+            linked += count * rate.shared_bytes_per_step * (number > 0)
             seconds += count * rate.seconds_per_step
-    return Estimate(len(plan.jobs), plan.done, plan.episodes, round(steps), size, seconds, rates)
+    return Estimate(len(plan.jobs), plan.done, plan.episodes, round(steps), size, size - linked, seconds, rates)
 
 
 def _painting_key(record: SubsetRecord) -> tuple:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds, is_maze
+from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.version import __version__
+
+if TYPE_CHECKING:
+    from dmcvb_gen.dataset import Release
 
 PAPER_STEPS = {False: 500, True: 600}
 """Agent steps at the time limit of the paper's data: locomotion, mazes."""
@@ -32,6 +37,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
       StoreError: there is no release at `path`.
     """
     from dmcvb_gen.dataset import open_release  # loads zarr, which `list` needs not
+    from dmcvb_gen.dataset.sharing import disk_bytes
 
     release = open_release(path, storage_options)
     subsets = []
@@ -61,8 +67,15 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
         digest=release.manifest.digest,
         steps=sum(subset["steps"] for subset in subsets),
         bytes=sum(subset["bytes"] for subset in subsets),
+        disk_bytes=None if is_url(str(path)) else disk_bytes(release.path, _files(release)),
         subsets=subsets,
     )
+
+
+def _files(release: Release) -> Iterator[str]:
+    """Paths of all committed shard files."""
+    for subset in release.subsets.values():
+        yield from (file.path for commit in subset.commits.values() for file in commit.files)
 
 
 def describe_package() -> dict[str, Any]:

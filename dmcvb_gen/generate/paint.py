@@ -10,7 +10,6 @@ its manifest has the new facts, another name, and the old manifest's digest in i
 
 from __future__ import annotations
 
-import os
 import queue
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +32,7 @@ from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.dataset.shards import ShardKey, chosen_shards, read_commit
 from dmcvb_gen.dataset.writer import add_arrays, finish_release, finish_together, write_lock
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.files import copy_file, sha256_file, write_json
+from dmcvb_gen.files import copy_file, link_or_copy, sha256_file, write_json
 from dmcvb_gen.generate.executors import run_arriving
 from dmcvb_gen.generate.inputs import Inputs, background_source
 from dmcvb_gen.generate.jobs import Job, Stored
@@ -386,7 +385,7 @@ def without_pictures(root: str | Path, out: str | Path) -> Manifest:
         for folder in ("policies", "backgrounds"):
             for path in (release.path / folder).rglob("*"):
                 if path.is_file():
-                    _link(path, out / path.relative_to(release.path))
+                    link_or_copy(path, out / path.relative_to(release.path))
     bare = tuple(replace_pixels(record) for record in release.manifest.subsets)
     manifest = release.manifest.model_copy(update={"subsets": bare, "digest": None})
     for record in bare:
@@ -413,14 +412,6 @@ def _strip(root: Path, subset: Subset, out: Path) -> None:
         left = [file for file in commit.files if file.path.removeprefix(start).split("/c/")[0] in folders]
         kept = [file for file in commit.files if file not in left]
         for file in kept:
-            _link(root / file.path, out / file.path)
+            link_or_copy(root / file.path, out / file.path)
         facts = {"files": tuple(kept), "painted": False, "pictures": tuple(left) or commit.pictures}
         write_json(out / commit_path(subset.name, shard), commit.model_copy(update=facts))
-
-
-def _link(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:  # another disk, or none that links
-        copy_file(source, target)

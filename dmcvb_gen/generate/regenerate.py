@@ -21,6 +21,7 @@ from dmcvb_gen.dataset.pictures import SHOWN, stored_pictures
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.dataset.shards import ShardKey, chosen_shards, damage, read_commit
+from dmcvb_gen.dataset.sharing import link_equal_files
 from dmcvb_gen.dataset.writer import (
     CREATED,
     commit_path,
@@ -229,7 +230,9 @@ class Regeneration:
             before = _input_files(root)
             copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
             restored += sorted(_input_files(root) - before)
-            restore_index(root, manifest, {record.name: read_commits(root, record) for record in manifest.subsets})
+            commits = {record.name: read_commits(root, record) for record in manifest.subsets}
+            link_equal_files(root, manifest, commits)
+            restore_index(root, manifest, commits)
         return Outcome(tuple(outcomes), environment_diff(manifest), restored=tuple(restored))
 
     def _folder(self) -> tuple[Path, Manifest]:

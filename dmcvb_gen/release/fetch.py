@@ -46,6 +46,7 @@ from dmcvb_gen.dataset.manifest import (
     subset_path,
 )
 from dmcvb_gen.dataset.shards import ShardKey, chosen_shards
+from dmcvb_gen.dataset.sharing import link_equal_files, link_known
 from dmcvb_gen.dataset.writer import LOCK, finish_release, mark_created, read_commits, write_lock
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
@@ -236,6 +237,10 @@ class Download:
         self.commits = _fetch_commits(source, listed, shards, workers)
         self._metadata = source.metadata(shards.values())
         self._kept: dict[ShardKey, CommitRecord] = {}
+        self._equal: dict[str, list[str]] = collections.defaultdict(list)
+        for _, commit in self.commits.values():
+            for file in commit.files:
+                self._equal[file.sha256].append(file.path)
 
     @classmethod
     @contextlib.contextmanager
@@ -340,6 +345,8 @@ class Download:
             key, file = item
             if self.stop.is_set():
                 raise StoreError("stopped; what was moved stays, run the same command again")
+            if link_known(self.out, file, (path for path in self._equal[file.sha256] if path != file.path)):
+                return key, True, file.bytes
             return key, self.source.storage.download(file, self.out), file.bytes
 
         def done(result: tuple[ShardKey | None, bool, int]) -> None:
@@ -364,6 +371,7 @@ class Download:
         whole = all(len(commits[record.name]) == shard_count(record) for record in source.manifest.subsets)
         as_there = all(c.painted == r.pixels for r in source.manifest.subsets for c in commits[r.name].values())
         if whole and as_there and [*map(_bare, manifest.subsets)] == [*map(_bare, source.manifest.subsets)]:
+            link_equal_files(out, source.manifest, commits)
             files.write_bytes(out / INDEX, source.index_text)
             files.write_bytes(out / MANIFEST, source.manifest_text)
             return source.manifest

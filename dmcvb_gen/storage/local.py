@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from dmcvb_gen import files
 from dmcvb_gen.storage.base import Result, Storage, StoredFile
 from dmcvb_gen.storage.remote import public, storage_errors
+
+_LINKING = threading.Lock()
+"""Held while a file with several names is sent."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,8 @@ class LocalStorage(Storage):
 
     folder: Path
     url: str = ""
+    _sent: dict[tuple, str] = field(default_factory=dict, compare=False, repr=False)
+    """Local files with several names that were sent -> their path here; their other names become links."""
 
     @property
     def place(self) -> str:
@@ -72,4 +78,17 @@ class LocalStorage(Storage):
         return (self.folder / path).stat().st_size
 
     def _send(self, local: Path, path: str) -> None:
-        files.copy_file(local, self.folder / path)
+        node = local.stat()
+        if node.st_nlink == 1:
+            return files.copy_file(local, self.folder / path)
+        key = (node.st_dev, node.st_ino, node.st_size, node.st_mtime_ns)
+        with _LINKING:  # of two names that are sent at once, the second becomes a link
+            twin = self._sent.get(key)
+            if twin not in (None, path):
+                with contextlib.suppress(OSError), files.replacing(self.folder / path) as temporary:
+                    temporary.unlink()
+                    os.link(self.folder / twin, temporary)
+                    return None
+            files.copy_file(local, self.folder / path)
+            self._sent[key] = path
+        return None
