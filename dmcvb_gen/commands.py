@@ -216,7 +216,7 @@ def repaint(
       samples: Samples per pixel: 1, 2, 4 or 8.
       backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
       split: Background videos and maze styles. [default: the recipe's]
-      labels: Also store depth or segmentation.
+      labels: Also store depth, segmentation or flow (optical flow to the next frame).
       device: Device that renders: cpu, or cuda with warp.
       name: Name of the new release. [default: NAME-repainted]
       out (FOLDER): Folder of the new release.

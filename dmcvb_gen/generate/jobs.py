@@ -48,7 +48,7 @@ class Job:
       seed, names: the random streams of the episodes.
       device: renders the pictures, "cpu" or "cuda".
       stored: where states are read from; None: they are simulated.
-      labels: "depth" and "segmentation", stored beside the pixels.
+      labels: "depth", "segmentation" and "flow", stored beside the pixels.
     """
 
     target: Target

@@ -16,18 +16,19 @@ from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.generate.flow import render_flow
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import LABEL_TYPES
+from dmcvb_gen.spec import LABEL_SHAPES, LABEL_TYPES
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 PAINT_FRAMES = 2004
 """Frames rendered between two calls of the progress callback."""
 LABEL_FRAMES = 512
-"""Frames of depth and segmentation that are rendered at once."""
+"""Frames of depth, segmentation or flow that are rendered at once."""
 SIMULATION_STREAMS = ("initial_state", "policy")
 """Random streams of an episode that the simulation uses; the others are for distractors."""
 
@@ -261,19 +262,25 @@ def paint_labels(
     label: str,
     hide_goal: bool,
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Depth or segmentation of what the subset's pictures show, one array a view.
+    """Depth, segmentation or flow of what the subset's pictures show, one array a view.
 
     Args:
-      label: "depth" or "segmentation".
+      label: one of `LABEL_TYPES`.
 
     Yields:
-      (name, (episode, rows, size, size)); rows past an episode's end stay zero.
+      (name, (episode, rows, size, size, ...)); rows past an episode's end stay zero.
     """
-    episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
+    last = length[:, None] - (label == "flow")  # whose next frame is there
+    episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= last)
     for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
-        out = np.zeros((len(physics), rows, renderer.size, renderer.size), LABEL_TYPES[label])
+        size = (renderer.size, renderer.size, *LABEL_SHAPES.get(label, ()))
+        out = np.zeros((len(physics), rows, *size), LABEL_TYPES[label])
         for first in range(0, len(episode), LABEL_FRAMES):
             e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
-            found = renderer.render_labels(physics[e, r], exogenous[e, r], [view], hide_goal)
-            out[e, r] = found[label][:, 0]
+            frames = (physics[e, r], exogenous[e, r])
+            if label == "flow":
+                after = (physics[e, r + 1], exogenous[e, r + 1])
+                out[e, r] = render_flow(renderer, *frames, *after, view, hide_goal)
+            else:
+                out[e, r] = renderer.render_labels(*frames, [view], hide_goal)[label][:, 0]
         yield name, out

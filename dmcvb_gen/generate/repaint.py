@@ -32,7 +32,7 @@ from dmcvb_gen.generate.render import (
 from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
-from dmcvb_gen.spec import LABEL_TYPES, Distractor, is_maze, select
+from dmcvb_gen.spec import LABEL_SHAPES, LABEL_TYPES, Distractor, is_maze, select
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -51,7 +51,7 @@ class Repainting:
       backgrounds: "builtin" or a folder of videos.
       split: "train" or "val": the videos of locomotion, the styles of mazes.
       device: where pictures are painted.
-      labels: "depth" and "segmentation", stored beside the pixels.
+      labels: "depth", "segmentation" and "flow", stored beside the pixels.
       name: of the new release.
     """
 
@@ -88,9 +88,14 @@ class Repainted:
 
 
 def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
-    """Specs of depth and segmentation: "depth", or "depth/<view>" where a task has several views."""
-    names = [(label, name) for label in labels for name in view_arrays(label, task.views)]
-    return tuple(ArraySpec(name, LABEL_TYPES[label], (size, size), ("height", "width")) for label, name in names)
+    """Specs of depth, segmentation and flow: "depth", or "depth/<view>" if a task has several views."""
+    specs = []
+    for label in labels:
+        shape, dims = (size, size, *LABEL_SHAPES.get(label, ())), ("height", "width", "direction")
+        specs += [
+            ArraySpec(name, LABEL_TYPES[label], shape, dims[: len(shape)]) for name in view_arrays(label, task.views)
+        ]
+    return tuple(specs)
 
 
 def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallback = ignore) -> Manifest:

@@ -29,6 +29,7 @@ from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
     GOAL_PICTURES,
     HIDDEN,
+    LABEL_TYPES,
     SPLITS,
     VISIBLE,
     GoalMode,
@@ -42,6 +43,9 @@ PURPOSE = "evaluation"
 """Names the random streams: no episode here has those of released data."""
 FIXED_GOALS = 5
 """Pairs of start and goal that "fixed" episodes go round by default (benchmark B3)."""
+
+ENVIRONMENT_MODALITIES = {"depth": (0, np.inf), "segmentation": (-1, np.iinfo(np.int16).max)}
+"""Labels a pixel that observations may have -> their smallest and largest value."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class Scene:
       backgrounds: "builtin" or a folder of videos.
       own_videos: digest of the videos of the data, if these are not the built-in ones; then give `backgrounds`.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
+      modalities: "depth" (meters, 0: sky) and "segmentation" (geom id, -1: sky), which observations have besides.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
       fixed_goals: of "fixed": how many pairs of start and goal there are; an episode takes the next one.
       goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
@@ -76,6 +81,7 @@ class Scene:
     backgrounds: str = "builtin"
     own_videos: str | None = None
     views: Sequence[str] | None = None
+    modalities: Sequence[str] = ()
     max_steps: int | None = None
     goal: str | None = None
     fixed_goals: int = FIXED_GOALS
@@ -109,6 +115,11 @@ class Scene:
                 f"the data show videos of their own (digest {self.own_videos[:12]}), not the built-in ones: give their "
                 "folder with backgrounds=FOLDER"
             )
+        for modality in self.modalities:
+            if modality == "flow":
+                raise DmcvbError("an environment has no flow: the next frame is not known yet; leave flow away")
+            if modality not in ENVIRONMENT_MODALITIES:
+                raise UnknownNameError("modality", modality, ENVIRONMENT_MODALITIES)
         if self.goal and not maze:
             raise DmcvbError(f"{self.task} has no goal in its pictures; leave goal away")
 
@@ -125,6 +136,7 @@ class _Stage:
         self.setting = spec.distractor
         hide = scene.goal == HIDDEN if scene.goal else spec.hides_goal
         self.pictures = Pictures(self.task.views, hide).select(scene.views)
+        self.modalities = tuple(scene.modalities)
         self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if spec.goal is GoalMode.FIXED else None
         self._first_pair = scene.goal_pair or 0
@@ -149,12 +161,16 @@ class _Stage:
         self.goal_pair = np.full(count, -1)
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
-        """Of one place: observations {"pixels", "state"}, and actions."""
+        """Of one place: observations {"pixels", "state"} and modalities, and actions."""
         shape = (self.size, self.size, 3 * len(self.pictures.views))
         observation: dict[str, spaces.Space] = {
             "pixels": spaces.Box(0, 255, shape, np.uint8),
             "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
         }
+        shape = (self.size, self.size, len(self.pictures.views))
+        for name in self.modalities:
+            low, high = ENVIRONMENT_MODALITIES[name]
+            observation[name] = spaces.Box(low, high, shape, np.dtype(LABEL_TYPES[name]).type)
         return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
 
     def start(self, places: Iterable[int], seeds: Sequence[int]) -> None:
@@ -191,12 +207,17 @@ class _Stage:
         )
 
     def observe(self) -> dict[str, np.ndarray]:
-        """ "pixels" (place, size, size, 3 * view) uint8 and "state" (place, state) float32."""
+        """ "pixels" (place, size, size, 3 * view) uint8, "state" (place, state) float32, modalities (place, size, size,
+        view)."""
         physics, shown = self.batch.physics(), self.pictures
         labels = self.labels(physics)
         pictures = self.renderer.render(physics, labels, shown.views, shown.hide_goal)  # (place, view, size, size, 3)
         pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
-        return {"pixels": pixels, "state": self.state.astype(np.float32)}
+        observation = {"pixels": pixels, "state": self.state.astype(np.float32)}
+        if self.modalities:
+            found = self.renderer.render_labels(physics, labels, shown.views, shown.hide_goal)
+            observation |= {name: np.moveaxis(found[name], 1, 3) for name in self.modalities}
+        return observation
 
     def step(self, actions: ArrayLike, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rewards, terminated, truncated of one agent step of the active places.

@@ -18,6 +18,28 @@ if TYPE_CHECKING:
 
 TASKS = ("walker-walk", "cheetah-run", "humanoid-walk")
 """Locomotion tasks (a test holds these lists equal to the tasks' own, which would import MuJoCo)."""
+SUITE = (
+    "acrobot-swingup",
+    "ball_in_cup-catch",
+    "cartpole-balance",
+    "cartpole-swingup",
+    "finger-spin",
+    "finger-turn_hard",
+    "fish-swim",
+    "hopper-hop",
+    "hopper-stand",
+    "humanoid-run",
+    "humanoid-stand",
+    "pendulum-swingup",
+    "point_mass-easy",
+    "quadruped-walk",
+    "reacher-easy",
+    "reacher-hard",
+    "swimmer-swimmer6",
+    "walker-run",
+    "walker-stand",
+)
+"""More tasks of dm_control's suite that have names; every other one is an argument of `DistractedEnv`."""
 _LAYOUTS = ("empty7x7", "easy7x7a", "easy7x7b", "easy7x7c", "medium7x7a", "medium7x7b", "medium7x7c")
 MAZES = tuple(str(MazeName(layout)) for layout in _LAYOUTS)
 NAMESPACE = "dmcvb_gen"
@@ -32,7 +54,7 @@ def environment_id(task: str, setting: str) -> str:
 
 def environments() -> dict[str, tuple[str, str]]:
     """Registered names -> (task, setting)."""
-    pairs = [(task, setting) for task in TASKS for setting in DISTRACTOR_KINDS]
+    pairs = [(task, setting) for task in (*TASKS, *SUITE) for setting in DISTRACTOR_KINDS]
     pairs += [(task, goal) for task in MAZES for goal in GOAL_MODES]
     return {environment_id(task, setting): (task, setting) for task, setting in pairs}
 

@@ -18,9 +18,9 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.dm import DmEnv
 from dmcvb_gen.loaders.envs import FIXED_GOALS, DistractedEnv, DistractedVectorEnv
 from dmcvb_gen.loaders.layout import data_layout
-from dmcvb_gen.loaders.register import MAZES, TASKS, environment_ids
+from dmcvb_gen.loaders.register import MAZES, SUITE, TASKS, environment_ids
 from dmcvb_gen.spec import DISTRACTOR_KINDS as SETTINGS
-from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task, suite_ids
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from tests.conftest import TINY_MAZE, stack_channels
 
@@ -29,8 +29,18 @@ SMALL = dict(size=16)
 
 def test_every_task_and_distractor_is_registered():
     assert TASKS == LOCOMOTION_TASKS and MAZES == ANT_MAZE_TASKS
-    assert len(environment_ids()) == len(TASKS) * len(SETTINGS) + 3 * len(MAZES)
+    assert set(SUITE) < set(suite_ids()) and not set(SUITE) & set(TASKS)
+    assert len(environment_ids()) == (len(TASKS) + len(SUITE)) * len(SETTINGS) + 3 * len(MAZES)
     assert set(environment_ids()) <= set(gymnasium.registry)
+
+
+@pytest.mark.parametrize("task", SUITE)
+def test_a_suite_task_is_made_by_its_name(task):
+    env = gymnasium.make(f"dmcvb_gen/{task}-dynamic-v0", **SMALL)
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+    observation, reward, *_ = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation) and np.isfinite(reward)
+    env.close()
 
 
 def test_importing_the_package_is_enough_and_loads_no_simulator():

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from dmcvb_gen.dataset import Manifest
 from dmcvb_gen.dataset.pictures import Pictures, shown
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
+from dmcvb_gen.spec import LABEL_TYPES
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class ExportEpisode:
       state: (L + 1, state) float32.
       action, reward, discount: (L, action), (L,), (L,) float32.
       terminated: the task ended it; else the time limit did.
+      modalities: "depth", "segmentation", "flow" that the subset stores, "depth/top" if it has several views ->
+        (L + 1, height, width, ...), see `spec.LABEL_TYPES`.
     """
 
     index: int
@@ -33,6 +36,7 @@ class ExportEpisode:
     reward: np.ndarray
     discount: np.ndarray
     terminated: bool
+    modalities: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def length(self) -> int:
@@ -41,6 +45,10 @@ class ExportEpisode:
     def stacked(self) -> np.ndarray:
         """(L + 1, height, width, 3 * view) uint8: the views side by side in the channels."""
         return np.concatenate(list(self.pixels.values()), axis=-1)
+
+    def named_modalities(self) -> dict[str, np.ndarray]:
+        """The modalities by names without a slash: "depth", "depth_top"."""
+        return {name.replace("/", "_"): values for name, values in self.modalities.items()}
 
     def arrived(self) -> dict[str, np.ndarray]:
         """Actions, rewards, discounts in the alignment of dm_env: row t holds the action that led to observation t.
@@ -94,7 +102,8 @@ class Source:
 
     def __iter__(self) -> Iterator[ExportEpisode]:
         pictures = self.pictures
-        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *pictures.arrays]
+        modalities = [name for name in self.subset.arrays if name.partition("/")[0] in LABEL_TYPES]
+        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *pictures.arrays, *modalities]
         for index in self.episodes:
             values = self.subset.episode(index, arrays)
             yield ExportEpisode(
@@ -102,6 +111,7 @@ class Source:
                 seed=int(values["seed"]),
                 pixels={view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
                 terminated=bool(values["terminated"]),
+                modalities={name: values[name] for name in modalities},
                 **{name: values[name] for name in ("state", "action", "reward", "discount")},
             )
             self.tick(1)

@@ -27,14 +27,14 @@ def _step_types(rows: int) -> np.ndarray:
 @register_exporter(
     "hdf5",
     reader="V-D4RL's DrQ+BC loader (`observation`, `action`, `reward`, `discount`, `step_type`)",
-    keeps="pixels (channels first), states, actions, rewards, discounts",
+    keeps="pixels (channels first), states, actions, rewards, discounts; depth, segmentation, flow",
     drops="physics, labels, seeds",
     mark="data_*.hdf5",
     modules=("h5py",),
 )
 def write_hdf5(source: Source, folder: Path) -> None:
     """Write `data_000.hdf5`, ...: `observation` (row, 3 * view, height, width) uint8, `action`, `reward`, `discount`,
-    `state` float32 and `step_type`, episodes one after the other."""
+    `state` float32 and `step_type`, episodes one after the other; stored `depth`, `segmentation`, `flow` as well."""
     import h5py
 
     file, written = None, 0
@@ -49,6 +49,7 @@ def write_hdf5(source: Source, folder: Path) -> None:
             **episode.arrived(),
             "state": episode.state,
             "step_type": _step_types(episode.length + 1),
+            **episode.named_modalities(),
         }
         for name, value in values.items():
             _append(file, name, value)
@@ -73,13 +74,13 @@ def _append(file, name: str, value: np.ndarray) -> None:
     reader=(
         "V-D4RL's DreamerV2 loader (`image`, `action`, `reward`, `discount`, `is_first`, `is_last`, `is_terminal`)"
     ),
-    keeps="pixels, states, actions, rewards, discounts",
+    keeps="pixels, states, actions, rewards, discounts; depth, segmentation, flow",
     drops="physics, labels, seeds",
     mark="[0-9]*-[0-9]*.npz",
 )
 def write_npz(source: Source, folder: Path) -> None:
     """Write `<episode>-<rows>.npz`: `image` (row, height, width, 3 * view) uint8, `action`, `reward`, `discount`,
-    `state` float32, `is_first`, `is_last`, `is_terminal` bool."""
+    `state` float32, `is_first`, `is_last`, `is_terminal` bool; `depth`, `segmentation`, `flow` if they are stored."""
     for episode in source:
         rows = episode.length + 1
         arrays: dict[str, Any] = _flags(episode) | _arrays(episode)
@@ -87,7 +88,8 @@ def write_npz(source: Source, folder: Path) -> None:
 
 
 def _arrays(episode: ExportEpisode) -> dict[str, np.ndarray]:
-    return {"image": episode.stacked(), "state": episode.state, **episode.arrived()}
+    arrays = {"image": episode.stacked(), "state": episode.state, **episode.arrived()}
+    return arrays | episode.named_modalities()
 
 
 def _flags(episode: ExportEpisode) -> dict[str, np.ndarray]:

@@ -1,0 +1,64 @@
+"""Depth, segmentation and flow through a release of each family: stored, verified, read, exported; and environments."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.repaint import Repainting, repaint
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.tasks import get_task
+from tests.conftest import roll_out, small_recipe
+
+MODALITIES = ["depth", "segmentation", "flow"]
+
+
+@pytest.mark.parametrize("family", ["locomotion", "suite", "maze"])
+def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_release):
+    source = maze_release
+    if family != "maze":
+        task = {"locomotion": "humanoid-walk", "suite": "hopper-hop"}[family]
+        pattern = {"tasks": task, "levels": "random", "settings": ["dynamic"], "episodes": 2, "max_steps": 6}
+        roll_out(small_recipe(subsets=[pattern]), source := tmp_path / "source")
+    repaint(Repainting(source, tmp_path / "r", size=16, labels=MODALITIES))
+    assert verify(tmp_path / "r").sound
+    [(name, subset)] = open_release(tmp_path / "r").subsets.items()
+    views = get_task(subset.task).views
+    assert len([array for array in subset.arrays if array.partition("/")[0] == "flow"]) == len(views)
+    for index in range(2):
+        episode = dmcvb_gen.open(str(tmp_path / "r"))[name].episode(index)
+        flow = episode["flow" if len(views) == 1 else f"flow/{views[0]}"]
+        length = len(flow) - 1
+        assert flow.shape == (length + 1, 16, 16, 2) and flow.dtype == np.float32
+        assert not flow[-1].any() and np.abs(flow[:-1]).max() > 0 and np.isfinite(flow).all()
+    result = CliRunner().invoke(main, ["export", str(tmp_path / "r"), "--to", "npz", "--out", str(tmp_path / "npz")])
+    assert result.exit_code == 0, result.output
+    file = np.load(sorted((tmp_path / "npz").rglob("*.npz"))[-1])
+    key = "flow" if len(views) == 1 else f"flow_{views[0]}"
+    np.testing.assert_array_equal(file[key], flow)
+    assert file[key.replace("flow", "segmentation")].dtype == np.int16
+
+
+@pytest.mark.parametrize("task", ["walker-walk", "cartpole-swingup", "ant-maze-empty7x7"])
+def test_environments_give_depth_and_segmentation(task):
+    setting = "visible" if task.startswith("ant") else "dynamic"
+    name, options = f"dmcvb_gen/{task}-{setting}-v0", dict(size=16, modalities=["depth", "segmentation"])
+    env = gymnasium.make(name, **options)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert ((observation["depth"] > 0) == (observation["segmentation"] >= 0)).mean() > 0.9
+    env.close()
+    many = gymnasium.make_vec(name, num_envs=2, **options)
+    observations, _ = many.reset(seed=0)
+    assert many.observation_space.contains(observations)
+    many.close()
+    with pytest.raises(DmcvbError, match="has no flow"):
+        gymnasium.make(name, modalities=["flow"])
+    with pytest.raises(UnknownNameError, match="depht"):
+        gymnasium.make(name, modalities=["depht"])
