@@ -99,7 +99,7 @@ def rollout(
       distractors: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: none]
       difficulty: Strength of the distractors. [default: medium]
       intensity: Scale of the distractors instead of a difficulty: easy is 0.1, medium 0.2, hard 0.3.
-      vary (PART,...): Vary only these parts: camera, color, background, shake. [default: the first three]
+      vary (PART,...): Vary only these parts: camera, color, background, shake, light. [default: the first three]
       video_count: Background videos in use. [default: by the difficulty]
       correlated (RHO): dynamic: also show a spurious cue that correlates with the last action.
       goals: Mazes: visible or hidden. [default: visible]

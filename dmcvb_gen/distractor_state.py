@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 
-def _label(dtype: str, *dimensions: str) -> Any:
-    """A stored label: its data type, and its dimensions after episode and step."""
-    return field(metadata={"dtype": dtype, "dimensions": dimensions})
+def _label(dtype: str, *dimensions: str, optional: bool = False) -> Any:
+    """A stored label: its data type, and its dimensions after episode and step; optional ones may be None."""
+    metadata = {"dtype": dtype, "dimensions": dimensions}
+    return field(metadata=metadata, default=None) if optional else field(metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class DistractorState:
       background_video: (...,) int16, index of the video seen through the sky; -1: the model's own sky.
       background_frame: (...,) int16, frame of that video; -1 with the model's own sky.
       style: (...,) int16, visual look of a maze, its style * 100 + variant; -1: none.
+      light_shift: (..., 3) float32 meters, by which all lamps are moved; None if the light does not vary.
     """
 
     camera_position: np.ndarray = _label("float32", "view", "xyz")
@@ -35,6 +37,7 @@ class DistractorState:
     background_video: np.ndarray = _label("int16")
     background_frame: np.ndarray = _label("int16")
     style: np.ndarray = _label("int16")
+    light_shift: np.ndarray | None = _label("float32", "xyz", optional=True)
 
     def __getitem__(self, index: Any) -> DistractorState:
         """Index the leading axes of all labels alike."""
@@ -44,8 +47,10 @@ class DistractorState:
         return len(self.background_video)
 
     def items(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Name and values of every label that is there."""
         for label in fields(self):
-            yield label.name, getattr(self, label.name)
+            if (values := getattr(self, label.name)) is not None:
+                yield label.name, values
 
     def flat(self) -> DistractorState:
         """With the leading (episode, step) axes made one frame axis."""
@@ -59,3 +64,5 @@ LABEL_DTYPES: dict[str, str] = {label.name: label.metadata["dtype"] for label in
 LABEL_DIMENSIONS: dict[str, tuple[str, ...]] = {
     label.name: label.metadata["dimensions"] for label in fields(DistractorState)
 }
+OPTIONAL_LABELS = {"light_shift": "light"}
+"""Label -> the part of a distractor that gives it; it is stored only if that part varies."""

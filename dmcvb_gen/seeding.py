@@ -11,7 +11,7 @@ import hashlib
 
 import numpy as np
 
-STREAMS = ("initial_state", "policy", "camera", "color", "background", "style", "cue", "shake")
+STREAMS = ("initial_state", "policy", "camera", "color", "background", "style", "cue", "shake", "light")
 """The streams of an episode, in the order of their spawn keys. Append only: an index is part of the data."""
 
 

@@ -74,9 +74,11 @@ DIFFICULTIES = tuple(DIFFICULTY_SCALES)
 SCALED_PARTS = ("camera", "color")
 DISTRACTOR_PARTS = (*SCALED_PARTS, "background")
 """The parts of DMC-VB's distractors, each of which can vary alone."""
-CUE, SHAKE = "cue", "shake"
+CUE, SHAKE, LIGHT = "cue", "shake", "light"
 """Parts besides, of dynamic distractors alone. A cue's number is its correlation with the action before a frame."""
-ALL_PARTS = (*DISTRACTOR_PARTS, SHAKE, CUE)
+FURTHER_PARTS = (SHAKE, LIGHT)
+"""Of these, those with a scale s."""
+ALL_PARTS = (*DISTRACTOR_PARTS, *FURTHER_PARTS, CUE)
 """In the order of a difficulty's spelling."""
 ALL = "all"
 """In a difficulty, in place of a number of background videos: all of them."""
@@ -154,8 +156,9 @@ class Distractor:
       kind: "none", "static", "dynamic", or one of a user's own.
       difficulty: "easy", "medium" or "hard"; or a scale above 0 and up to 1 ("0.35"); or the parts that vary, each
         with a number of its own if medium's is not meant: "camera0.1-color0.5-background4" (a background's number is
-        how many videos are in play). Two parts of dynamic distractors come besides: "shake0.3" shifts the camera in
-        every frame, "cue0.8" is a spurious cue in the colors that correlates with the last action by 0.8. What amounts
+        how many videos are in play). Three parts of dynamic distractors come besides: "shake0.3" shifts the camera in
+        every frame, "light0.3" moves the lamps, and "cue0.8" is a spurious cue in the colors that correlates with the
+        last action by 0.8. What amounts
         to a word is turned into it: "0.2" is "medium".
 
     Raises:
@@ -175,7 +178,9 @@ class Distractor:
             raise DmcvbError(f"distractor {self.kind} has no parts such as {self.difficulty}; give a scale, e.g. 0.35")
 
         if self.kind != "dynamic" and not set(_strengths(self.difficulty)) <= set(DISTRACTOR_PARTS):
-            raise DmcvbError(f"distractor {self.kind} has no cue and no shake; ask for dynamic_{self.difficulty}")
+            raise DmcvbError(
+                f"distractor {self.kind} has no {CUE}, {SHAKE} or {LIGHT}; ask for dynamic_{self.difficulty}"
+            )
 
     @property
     def name(self) -> str:
@@ -193,8 +198,8 @@ class Distractor:
     @property
     def scale(self) -> float:
         """The scale s of all ranges; the largest one if parts have their own, 0 without distractors."""
-        strengths = _strengths(self.difficulty)
-        return 0.0 if self.kind == "none" else max(float(strengths.get(part) or 0.0) for part in (*SCALED_PARTS, SHAKE))
+        strengths, parts = _strengths(self.difficulty), (*SCALED_PARTS, *FURTHER_PARTS)
+        return 0.0 if self.kind == "none" else max(float(strengths.get(part) or 0.0) for part in parts)
 
     @property
     def videos(self) -> int | None:
@@ -223,14 +228,14 @@ def difficulty_of(
       UnknownNameError: there is no such part. DmcvbError: a number is out of range.
     """
     for part in parts:
-        if part not in (*DISTRACTOR_PARTS, SHAKE):
-            raise UnknownNameError("part of a distractor", part, (*DISTRACTOR_PARTS, SHAKE))
+        if part not in (*DISTRACTOR_PARTS, *FURTHER_PARTS):
+            raise UnknownNameError("part of a distractor", part, (*DISTRACTOR_PARTS, *FURTHER_PARTS))
     scale = DIFFICULTY_SCALES["medium"] if intensity is None else intensity
     if not parts and videos is None and cue is None:
         return _canonical(_number(scale))
     count = _videos_at(scale) if videos is None else videos
     numbers = {"camera": _number(scale), "color": _number(scale), "background": ALL if count is None else str(count)}
-    numbers[SHAKE] = _number(scale)
+    numbers |= dict.fromkeys(FURTHER_PARTS, _number(scale))
     words = [f"{part}{numbers[part]}" for part in parts or DISTRACTOR_PARTS]
     return _canonical("-".join(words + ([f"{CUE}{_number(cue)}"] if cue is not None else [])))
 

@@ -298,7 +298,8 @@ class Subset:
 
     def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
         """The stored labels of the distractors, leading shape (episode, step); see `read`."""
-        return DistractorState(**{name: self.read(f"exogenous/{name}", episodes) for name in DISTRACTOR_STATE_NAMES})
+        names = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in self.arrays]
+        return DistractorState(**{name: self.read(f"exogenous/{name}", episodes) for name in names})
 
     def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """One episode, cut to its length L.

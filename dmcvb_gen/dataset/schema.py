@@ -29,7 +29,7 @@ Rows past L are never written: a missing chunk costs no storage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +38,7 @@ from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
 
 from dmcvb_gen.dataset.manifest import SCHEMA_VERSION, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, stored_pictures
-from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES
+from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_LABELS
 
 PIXEL_CHUNK_STEPS = 32
 """Steps an inner chunk of the pictures: the unit of reading (chosen with scripts/bench_store.py)."""
@@ -121,14 +121,18 @@ def picture_spec(name: str, size: int) -> ArraySpec:
 
 def subset_specs(shape: EpisodeShape, record: SubsetRecord) -> tuple[ArraySpec, ...]:
     """All arrays of the subset of a record, with the pictures that it stores."""
-    return array_specs(shape, record.size, stored_pictures(record, shape.goal))
+    varying = [part for part in OPTIONAL_LABELS.values() if record.distractor.varies(part)]
+    return array_specs(shape, record.size, stored_pictures(record, shape.goal), varying)
 
 
-def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None = None) -> tuple[ArraySpec, ...]:
+def array_specs(
+    shape: EpisodeShape, size: int, pictures: Sequence[str] | None = None, varying: Collection[str] = ()
+) -> tuple[ArraySpec, ...]:
     """All arrays of a subset with episodes of `shape` and pictures of `size`.
 
     Args:
       pictures: names of its picture arrays; those of all views by default, with the goal and without it.
+      varying: parts of the distractor that vary and have labels of their own, see `OPTIONAL_LABELS`.
     """
     both = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
     names = both if pictures is None else pictures
@@ -140,7 +144,7 @@ def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None =
         ArraySpec("reward", "float32"),
         ArraySpec("discount", "float32"),
         ArraySpec("physics", "float64", (shape.physics_size,), ("physics_dim",)),
-        *_label_specs(shape),
+        *_label_specs(shape, varying),
         ArraySpec("length", "int32", steps=False),
         ArraySpec("terminated", "bool", steps=False),
         ArraySpec("return", "float64", steps=False),
@@ -151,12 +155,13 @@ def array_specs(shape: EpisodeShape, size: int, pictures: Sequence[str] | None =
     return tuple(specs)
 
 
-def _label_specs(shape: EpisodeShape) -> list[ArraySpec]:
+def _label_specs(shape: EpisodeShape, varying: Collection[str]) -> list[ArraySpec]:
     """The distractors' labels, in the order of `DistractorState`."""
     sizes = {"view": len(shape.views), "material": shape.materials, "xyz": 3, "wxyz": 4, "rgb": 3}
     return [
         ArraySpec(f"exogenous/{name}", dtype, tuple(sizes[d] for d in LABEL_DIMENSIONS[name]), LABEL_DIMENSIONS[name])
         for name, dtype in LABEL_DTYPES.items()
+        if OPTIONAL_LABELS.get(name, "") in ("", *varying)
     ]
 
 

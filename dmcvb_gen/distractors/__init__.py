@@ -70,7 +70,9 @@ class DistractorSampler:
             actions = np.zeros((*physics.shape[:-1], self.task.action_size))
         for distractor in self._drawn:
             distractor.adjust(found, actions, frames)
-        return DistractorState(**{name: found[name].astype(dtype) for name, dtype in LABEL_DTYPES.items()})
+        return DistractorState(
+            **{name: found[name].astype(LABEL_DTYPES[name]) for name in LABEL_DTYPES if name in found}
+        )
 
 
 def sample_distractors(

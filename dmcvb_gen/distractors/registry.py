@@ -15,11 +15,12 @@ from dmcvb_gen.distractors.base import KINDS, Distractor, DistractorPart
 from dmcvb_gen.distractors.camera import Camera
 from dmcvb_gen.distractors.color import Color
 from dmcvb_gen.distractors.cue import Cue
+from dmcvb_gen.distractors.light import Light
 from dmcvb_gen.distractors.shake import Shake
 from dmcvb_gen.distractors.style import Style
 from dmcvb_gen.spec import DISTRACTOR_ENTRY_POINTS, own_distractors
 
-BUILT_IN: tuple[type[DistractorPart], ...] = (Camera, Color, Background, Style, Cue, Shake)
+BUILT_IN: tuple[type[DistractorPart], ...] = (Camera, Color, Background, Style, Cue, Shake, Light)
 """Together they give every label."""
 _registered: dict[str, tuple[type[DistractorPart], ...]] = {}
 

@@ -19,7 +19,7 @@ from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.dataset.schema import stored_name
-from dmcvb_gen.distractors import background, camera, color, cue, shake
+from dmcvb_gen.distractors import background, camera, color, cue, light, shake
 from dmcvb_gen.distractors.base import KINDS, Distractor
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import StoreError
@@ -33,7 +33,7 @@ from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_problem, write_table
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
-from dmcvb_gen.spec import CUE, FIXED, SHAKE
+from dmcvb_gen.spec import CUE, FIXED, LIGHT, SHAKE
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.text import pluralize
@@ -341,6 +341,9 @@ def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
         cells = [text if setting.varies(part) else "the model's own" for part, text in shown.items()]
         if setting.varies(SHAKE):
             cells[0] += f"; shaken, std {shake.SHARE * setting.scale_of(SHAKE):.3g} of its distance a frame"
+        if setting.varies(LIGHT):
+            most = ", ".join(f"{share:.3g}" for share in light.RANGE * setting.scale_of(LIGHT))
+            cells[1] += f"; lamps walk within +-{most} of their height along x, y, z"
         if setting.varies(CUE):
             cells[1] += f"; a shade of {cue.SHADE:g} by the last action's sign (correlation {setting.scale_of(CUE):g})"
         rows.append((name, f"s = {setting.scale:g}", *cells))

@@ -153,7 +153,8 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
             episode, length = int(subset.episodes[index]), int(subset.lengths[index])
             values = subset.episode(episode)
             steps = _sample(length + 1, SAMPLE_FRAMES)
-            labels = DistractorState(**{name: values[f"exogenous/{name}"] for name in DISTRACTOR_STATE_NAMES})
+            names = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in values]
+            labels = DistractorState(**{name: values[f"exogenous/{name}"] for name in names})
             for name in subset.pixel_arrays:
                 stored = values[name][steps]
                 view, hidden = picture_of(name) or (name, False)

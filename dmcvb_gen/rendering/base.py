@@ -6,6 +6,7 @@ import abc
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 from PIL import Image
 
@@ -101,6 +102,25 @@ class Renderer(abc.ABC):
 
     def close(self) -> None:  # noqa: B027  (a renderer may hold nothing)
         """Free what the renderer holds; it cannot be used afterwards."""
+
+
+def moved_lamps(
+    model: mujoco.MjModel, position: np.ndarray, direction: np.ndarray, shift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move lamps by a shift. A directional one turns as if it stood at its height and kept to the point below it.
+
+    Args:
+      position, direction: (frame, lamp, 3) float64, of all lamps of the model.
+      shift: (frame, 3) meters.
+
+    Returns:
+      Position and direction, as given.
+    """
+    shift = shift.astype(np.float64)[:, None]
+    spot = (model.light_type != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)[None, :, None]
+    turned = direction * np.abs(position[..., 2:]) - shift
+    turned /= np.maximum(np.sqrt((turned * turned).sum(axis=-1, keepdims=True)), 1e-9)
+    return np.where(spot, position + shift, position), np.where(spot, direction, turned)
 
 
 def check_size(size: int) -> None:

@@ -23,7 +23,7 @@ from PIL import Image
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials, moved_lamps
 from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
@@ -173,6 +173,9 @@ class OpenglRenderer(Renderer):
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
         mujoco.mj_tendon(model, data)
+        if exogenous.light_shift is not None:
+            lamps, shift = (data.light_xpos[None], data.light_xdir[None]), exogenous.light_shift[frame : frame + 1]
+            data.light_xpos[:], data.light_xdir[:] = (part[0] for part in moved_lamps(model, *lamps, shift))
         model.mat_rgba[:, :3] = exogenous.material_rgb[frame]
         model.geom_matid[:] = geom_materials(self.task, int(exogenous.style[frame]))
         model.geom_rgba[:] = self.task.model.geom_rgba

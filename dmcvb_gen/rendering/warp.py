@@ -22,7 +22,7 @@ from PIL import Image
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.extras import installed
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials, moved_lamps
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
 
@@ -274,8 +274,11 @@ class WarpRenderer(Renderer):
             put(data.geom_xpos, pose["geom_xpos"][rows])
             put(data.geom_xmat, pose["geom_xmat"][rows].reshape(worlds, -1, 3, 3))
             if mjm.nlight:
-                put(data.light_xpos, pose["light_xpos"][rows])
-                put(data.light_xdir, pose["light_xdir"][rows])
+                lamps = pose["light_xpos"][rows], pose["light_xdir"][rows]
+                if exogenous.light_shift is not None:
+                    lamps = moved_lamps(mjm, *lamps, exogenous.light_shift)
+                put(data.light_xpos, lamps[0])
+                put(data.light_xdir, lamps[1])
             cam_xpos = np.zeros((worlds, mjm.ncam, 3))
             cam_xmat = np.zeros((worlds, mjm.ncam, 3, 3))
             cam_xpos[:, camera] = exogenous.camera_position[:, view]

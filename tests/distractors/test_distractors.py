@@ -18,7 +18,7 @@ from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
 
-STREAMS = ("camera", "color", "background", "style", "cue", "shake")
+STREAMS = ("camera", "color", "background", "style", "cue", "shake", "light")
 DIFFICULTIES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 
 

@@ -13,9 +13,12 @@ from hypothesis import strategies as st
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
+from dmcvb_gen.distractors import floor_alpha_for
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
-from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, SHAKE, Distractor, difficulty_of
+from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.rendering.opengl import unavailable
+from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, FURTHER_PARTS, LIGHT, SHAKE, Distractor, difficulty_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.cameras import seen_materials
 from tests.distractors.test_distractors import labels, physics_of
@@ -26,7 +29,7 @@ SCALES = st.integers(1, 1000).map(lambda thousandths: thousandths / 1000)
 
 @given(
     SCALES,
-    st.lists(st.sampled_from([*DISTRACTOR_PARTS, SHAKE]), unique=True),
+    st.lists(st.sampled_from([*DISTRACTOR_PARTS, *FURTHER_PARTS]), unique=True),
     st.none() | st.integers(1, 40),
     st.none() | SCALES,
 )
@@ -37,7 +40,7 @@ def test_a_name_says_all_and_has_one_spelling(scale, parts, videos, rho):
     for part in DISTRACTOR_PARTS:
         assert setting.varies(part) == (part in parts or not parts)
     assert setting.varies(SHAKE) == (SHAKE in parts)
-    for part in ("camera", "color", SHAKE):
+    for part in ("camera", "color", SHAKE, LIGHT):
         assert setting.scale_of(part) == (scale if setting.varies(part) else 0)
     if setting.varies("background") and videos:
         assert setting.videos == videos
@@ -84,6 +87,38 @@ def test_only_the_parts_that_are_named_vary_and_by_their_own_scale(task_id):
     np.testing.assert_array_equal(shaken.material_rgb, plain.material_rgb)
     shift = (shaken.camera_position - plain.camera_position) / np.linalg.norm(task.model.cam_poscom0[0])
     assert abs(shift.std() / 0.05 - 1) < 0.2 and abs(np.diff(shift, axis=1).std() / (0.05 * 2**0.5) - 1) < 0.2
+    lit = labels(task, "dynamic_light0.5", physics)
+    np.testing.assert_array_equal(lit.camera_position, plain.camera_position)
+    np.testing.assert_array_equal(lit.material_rgb, plain.material_rgb)
+    most = np.array([1, 1, 0.25]) * task.model.light_pos[:, 2].max()
+    assert plain.light_shift is None and (np.abs(lit.light_shift) <= most + 1e-6).all()
+    assert np.abs(np.diff(lit.light_shift, axis=1)).max() > 0.01 * most.max()
+
+
+@pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "finger-spin"])
+def test_the_renderers_agree_on_moved_lamps(task_id):
+    """Finger's lamp is directional, the others are spots."""
+    if unavailable():
+        pytest.skip(unavailable())
+    task, setting = get_task(task_id), Distractor.parse("dynamic_light0.5")
+    physics = physics_of(task)[:, ::20]
+    frames, lit = physics.reshape(-1, physics.shape[-1]), labels(task, "dynamic_light0.5", physics).flat()
+    still = labels(task, "none", physics).flat()
+    pictures = {}
+    for name in ("native", "opengl", "warp"):
+        renderer = make_renderer(name, task, 64, floor_alpha=floor_alpha_for(task, setting))
+        pictures[name] = renderer.render(frames, lit).astype(float)
+        if name == "native":
+            effect = np.abs(pictures[name] - renderer.render(frames, still)).mean()
+        renderer.close()
+    gap = {name: np.abs(pictures[name] - pictures["opengl"]).mean() for name in ("native", "warp")}
+    assert effect > 2 and gap["native"] < 1.5 and gap["warp"] < 8, (effect, gap)
+
+
+def test_a_task_without_lamps_has_no_light_to_vary():
+    task = get_task("ant-maze-empty7x7")
+    with pytest.raises(DmcvbError, match="no lamp"):
+        labels(task, "dynamic_light0.5", physics_of(task, frames=2))
 
 
 @pytest.mark.slow
@@ -127,7 +162,7 @@ def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
         (["walker-walk", "--distractor", "dynamic", "--vary", "color", "--video-count", "2"], "--video-count has no"),
         (["ant-maze-empty7x7", "--video-count", "2"], "--video-count has no effect in mazes"),
         (["--recipe", "quickstart", "--intensity", "0.5"], "ask for --distractor dynamic_0.35 instead"),
-        (["walker-walk", "--distractor", "static", "--correlated", "0.5"], "has no cue and no shake"),
+        (["walker-walk", "--distractor", "static", "--correlated", "0.5"], "has no cue, shake or light"),
         (["walker-walk", "--distractor", "dynamic", "--correlated", "1.5"], "not in the range"),
         (["walker-walk", "--distractor", "dynamic_2"], "is not above 0 and up to 1"),
     ],
@@ -186,6 +221,14 @@ def test_a_cue_stands_beside_all_other_distractors_in_every_command(tmp_path):
     run("repaint", folder, "--distractor", "dynamic_shake0.5", "--out", tmp_path / "shaken")
     assert json.loads(run("verify", tmp_path / "shaken", "--json"))["sound"]
     assert "same digest" in run("regenerate", tmp_path / "shaken", "--check")
+    run("repaint", folder, "--distractor", "dynamic_color0.2-light0.5", "--out", tmp_path / "lit")
+    assert json.loads(run("verify", tmp_path / "lit", "--json"))["sound"]
+    assert "same digest" in run("regenerate", tmp_path / "lit", "--check")
+    [lit] = open_release(tmp_path / "lit").subsets.values()
+    assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
+    run("card", tmp_path / "lit")
+    assert "lamps walk within" in (tmp_path / "lit" / "README.md").read_text()
+    run("export", tmp_path / "lit", "--to", "npz", "--out", tmp_path / "npz")
     cue, action = cue_and_action(again)
     np.testing.assert_array_equal(cue, action)  # the stored actions decide
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, moved_lamps
 from dmcvb_gen.rendering.native import records as columns
 from dmcvb_gen.rendering.native.compiled import call
 from dmcvb_gen.rendering.native.frame import Frames, Still, labeler, make_work, painter
@@ -170,7 +170,10 @@ class NativeRenderer(Renderer):
         sky = [self._textures.background(*key) if key[0] >= 0 else scene.sky for key in backgrounds]
         lamp = np.zeros((count, len(scene.shine), 6))
         if len(scene.lamps):
-            lamp[..., :3], lamp[..., 3:] = poses["light_xpos"][:, scene.lamps], poses["light_xdir"][:, scene.lamps]
+            place, direction = poses["light_xpos"], poses["light_xdir"]
+            if exogenous.light_shift is not None:
+                place, direction = moved_lamps(self.task.model, place, direction, exogenous.light_shift)
+            lamp[..., :3], lamp[..., 3:] = place[:, scene.lamps], direction[:, scene.lamps]
             lamp[..., :3] -= self._far_away[:, None] * lamp[..., 3:]
         center, turn = _poses(scene, poses)
         return Frames(

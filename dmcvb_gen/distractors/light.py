@@ -1,0 +1,48 @@
+"""Lamps that wander: light and shadows come from other places, on top of what else varies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dmcvb_gen import arithmetic
+from dmcvb_gen.distractors.base import DistractorPart, Scene
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.tasks.base import ACTION_REPEAT
+
+RANGE = np.array([2.0, 2.0, 0.5])
+"""Largest shift along x, y and z, times s, as a share of the highest lamp's height."""
+STEP_STD = 0.05
+"""Standard deviation of a tick's step, as a share of the largest shift."""
+
+
+class Light(DistractorPart):
+    """One walk for all lamps of the model, which starts uniform in its range and stops at its ends."""
+
+    kinds = ("dynamic",)
+    stream = "light"
+    names = ("light_shift",)
+
+    def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        model = scene.task.model
+        heights = model.light_pos[model.light_active.astype(bool), 2]
+        if not len(heights):
+            raise DmcvbError(f"{scene.task.id} has no lamp, so its light cannot vary; remove light")
+        most = RANGE * scene.setting.scale_of("light") * float(heights.max())
+        place = (2 * np.stack([rng.random(3) for rng in generators]) - 1) * most
+        ticks = ACTION_REPEAT * (scene.frames - 1)
+        noise = np.stack([arithmetic.normal(rng, (ticks, 3)) for rng in generators], axis=1)
+        self._shift = np.empty((len(generators), scene.frames, 3))
+        self._shift[:, 0] = place
+        for tick in range(ticks):
+            place = np.clip(place + STEP_STD * most * noise[tick], -most, most)
+            if (tick + 1) % ACTION_REPEAT == 0:
+                self._shift[:, (tick + 1) // ACTION_REPEAT] = place
+
+    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
+        return {"light_shift": self._shift[:, frames]}
+
+    @classmethod
+    def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
+        return {}  # the label is stored only if it varies
