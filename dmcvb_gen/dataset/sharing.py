@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from dmcvb_gen.dataset.manifest import CommitRecord, FileRecord, Manifest, subset_path
@@ -20,10 +20,13 @@ Commits = Mapping[str, Mapping[int, CommitRecord]]
 """Subset -> shard -> commit record."""
 
 
-def link_equal_files(root: Path, manifest: Manifest, commits: Commits) -> int:
+def link_equal_files(root: Path, manifest: Manifest, commits: Commits, changed: Collection[str] | None = None) -> int:
     """Make files of sibling subsets (one task and level) that have equal bytes links to one file.
 
-    A file that does not have its digest any more is never linked to.
+    A file that does not have its digest any more is never linked to, and becomes a link to one that has.
+
+    Args:
+      changed: paths of files that are new; others that are whole stay as they are. All by default.
 
     Returns:
       How many files became links. 0 if the folder cannot be written or has no hard links.
@@ -31,14 +34,14 @@ def link_equal_files(root: Path, manifest: Manifest, commits: Commits) -> int:
     linked = 0
     try:
         with folder_in_the_making(root, "links") as scratch:
-            for equal in _equal_files(manifest, commits):
-                linked += _link_all(root, equal, scratch / "link")
+            for equal in equal_files(manifest, commits):
+                linked += _link_all(root, equal, scratch / "link", changed)
     except OSError:
         pass  # the release is whole without links
     return linked
 
 
-def _equal_files(manifest: Manifest, commits: Commits) -> Iterable[list[FileRecord]]:
+def equal_files(manifest: Manifest, commits: Commits) -> Iterable[list[FileRecord]]:
     """Files with one digest, of the same array and shard of sibling subsets."""
     groups: dict[tuple[str, ...], list[FileRecord]] = {}
     for record in manifest.subsets:
@@ -49,23 +52,26 @@ def _equal_files(manifest: Manifest, commits: Commits) -> Iterable[list[FileReco
     return [files for files in groups.values() if len(files) > 1]
 
 
-def _link_all(root: Path, files: list[FileRecord], temporary: Path) -> int:
-    """Put links to the first whole file in place of the others.
+def _link_all(root: Path, files: list[FileRecord], temporary: Path, changed: Collection[str] | None) -> int:
+    """Put links to the first whole file in place of the others, or only of damaged and `changed` ones.
 
     Raises:
       OSError: the file system has no links, or a file vanished.
     """
+    if changed is not None and not any(file.path in changed for file in files):
+        return 0
     nodes = {file.path: os.stat(root / file.path) for file in files}
     if len({(node.st_dev, node.st_ino) for node in nodes.values()}) == 1:
         return 0
-    whole = next((file for file in files if sha256_file(root / file.path) == file.sha256), None)
+    sound = [file for file in files if sha256_file(root / file.path) == file.sha256]
+    if not sound:
+        return 0
+    first = min(sound, key=lambda file: changed is not None and file.path in changed)
     linked = 0
     for file in files:
-        if whole and (nodes[file.path].st_dev, nodes[file.path].st_ino) != (
-            nodes[whole.path].st_dev,
-            nodes[whole.path].st_ino,
-        ):
-            os.link(root / whole.path, temporary)
+        kept = changed is not None and file in sound and file.path not in changed
+        if not kept and not os.path.samestat(nodes[file.path], nodes[first.path]):
+            os.link(root / first.path, temporary)
             os.replace(temporary, root / file.path)
             temporary.unlink(missing_ok=True)  # it stays if both names were one file already
             linked += 1

@@ -231,7 +231,8 @@ class Regeneration:
             copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
             restored += sorted(_input_files(root) - before)
             commits = {record.name: read_commits(root, record) for record in manifest.subsets}
-            link_equal_files(root, manifest, commits)
+            repaired = [commits[found.subset][found.shard] for found in outcomes if found.repaired]
+            link_equal_files(root, manifest, commits, {file.path for commit in repaired for file in commit.files})
             restore_index(root, manifest, commits)
         return Outcome(tuple(outcomes), environment_diff(manifest), restored=tuple(restored))
 

@@ -46,7 +46,7 @@ from dmcvb_gen.dataset.manifest import (
     subset_path,
 )
 from dmcvb_gen.dataset.shards import ShardKey, chosen_shards
-from dmcvb_gen.dataset.sharing import link_equal_files, link_known
+from dmcvb_gen.dataset.sharing import equal_files, link_equal_files, link_known
 from dmcvb_gen.dataset.writer import LOCK, finish_release, mark_created, read_commits, write_lock
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
@@ -237,10 +237,11 @@ class Download:
         self.commits = _fetch_commits(source, listed, shards, workers)
         self._metadata = source.metadata(shards.values())
         self._kept: dict[ShardKey, CommitRecord] = {}
-        self._equal: dict[str, list[str]] = collections.defaultdict(list)
-        for _, commit in self.commits.values():
-            for file in commit.files:
-                self._equal[file.sha256].append(file.path)
+        self._equal = {
+            file.path: [other.path for other in equal if other is not file]
+            for equal in equal_files(source.manifest, _by_subset(self.commits))
+            for file in equal
+        }
 
     @classmethod
     @contextlib.contextmanager
@@ -345,7 +346,7 @@ class Download:
             key, file = item
             if self.stop.is_set():
                 raise StoreError("stopped; what was moved stays, run the same command again")
-            if link_known(self.out, file, (path for path in self._equal[file.sha256] if path != file.path)):
+            if link_known(self.out, file, self._equal.get(file.path, ())):
                 return key, True, file.bytes
             return key, self.source.storage.download(file, self.out), file.bytes
 
@@ -395,6 +396,13 @@ def _fetch_commits(
 
     found = in_parallel(one, list(zip(shards, listed, strict=True)), workers)
     return dict(zip(shards, found, strict=True))
+
+
+def _by_subset(commits: dict[ShardKey, tuple[bytes, CommitRecord]]) -> dict[str, dict[int, CommitRecord]]:
+    found: dict[str, dict[int, CommitRecord]] = {}
+    for (name, shard), (_, commit) in commits.items():
+        found.setdefault(name, {})[shard] = commit
+    return found
 
 
 def _bare(record: SubsetRecord) -> SubsetRecord:
