@@ -19,6 +19,7 @@ from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 from tests.conftest import maze_recipe, roll_out, small_recipe
 
+pytestmark = pytest.mark.slow  # whole releases of three families
 SHARED = {"state", "action", "reward", "physics", "seed"}
 
 

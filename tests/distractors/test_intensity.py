@@ -95,6 +95,7 @@ def test_only_the_parts_that_are_named_vary_and_by_their_own_scale(task_id):
     assert np.abs(np.diff(lit.light_shift, axis=1)).max() > 0.01 * most.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "finger-spin"])
 def test_the_renderers_agree_on_moved_lamps(task_id):
     """Finger's lamp is directional, the others are spots."""

@@ -19,6 +19,7 @@ from tests.conftest import roll_out, small_recipe
 MODALITIES = ["depth", "segmentation", "flow"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["locomotion", "suite", "maze"])
 def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_release):
     source = maze_release

@@ -112,6 +112,7 @@ def test_a_url_is_no_folder(tmp_path, small_release):
         assert CliRunner().invoke(main, command).exit_code == 2
 
 
+@pytest.mark.slow
 def test_data_of_two_releases_are_compared(maze_release, small_release, tmp_path):
     """An imported subset beside one of ours: returns, lengths, successes and each number of the state, with its z."""
     export(str(small_release), "rlds", tmp_path / "tfds", [NAME])
