@@ -1,4 +1,4 @@
-"""Functions whose bits do not depend on the processor: float64 arrays in, float64 arrays out.
+"""Functions of float64 arrays whose bits do not depend on the processor.
 
 numpy's `exp`, `sin` and their like come from vector libraries that are chosen by processor, and so do the products of
 BLAS; their last bits differ between machines. Whatever decides a stored number takes its functions from here: they are

@@ -385,7 +385,7 @@ def fetch(
 
 
 def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore) -> "tuple[Moved, RenderResult | None]":
-    """What the arguments of `fetch` ask for: what was moved and, with `paint`, what was painted."""
+    """Fetch as the arguments of `fetch` say: return what was moved and, with `paint`, what was painted."""
     from dmcvb_gen.release.fetch import fetch, fetch_and_paint
 
     what = (options["url"], options["out"], as_names(options["only"]), options["episodes"])
@@ -492,7 +492,7 @@ def validate(
 
 
 def validation_setup(options: Mapping[str, Any]) -> "Setup":
-    """What all cells of a validation share, from the arguments of `validate`."""
+    """Make the settings that all cells of a validation share from the arguments of `validate`."""
     from dmcvb_gen.benchmarks.run import default_workers
     from dmcvb_gen.benchmarks.validate import make_setup
 

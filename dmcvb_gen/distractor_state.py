@@ -53,7 +53,7 @@ class DistractorState:
                 yield label.name, values
 
     def flat(self) -> DistractorState:
-        """With the leading (episode, step) axes made one frame axis."""
+        """Return a copy whose leading (episode, step) axes are one frame axis."""
         lead = self.background_video.ndim
         return DistractorState(**{name: value.reshape(-1, *value.shape[lead:]) for name, value in self.items()})
 

@@ -1,4 +1,4 @@
-"""Packages that not everybody needs: the name of a module that is missing in, the line that installs it out."""
+"""Optional packages: find the line that installs a missing module."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _PACKAGES = {
 
 
 def install_hint(module: str) -> str | None:
-    """What to do where `module` (or its parent) is not installed; None for a module that is not one of ours to name."""
+    """Say how to install a missing `module` (or its parent); None for a module that no extra brings."""
     top = module.split(".")[0]
     package = _PACKAGES.get(top, top)
     for extra, modules in EXTRAS.items():
@@ -52,7 +52,7 @@ def install_hint(module: str) -> str | None:
 
 
 def installed(module: str) -> bool:
-    """Whether a module can be imported; it is not."""
+    """Return True if a module can be imported, without importing it."""
     try:
         return find_spec(module) is not None
     except (ImportError, ValueError):

@@ -68,7 +68,7 @@ def _owner() -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Where a process id means a process: the machine's name, its last start and the process namespace."""
+    """Return the scope of process ids: the machine's name, its last start and the process namespace."""
     name = re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()) or "unknown"
     facts = ""
     with contextlib.suppress(OSError):  # of Linux alone

@@ -23,7 +23,7 @@ _OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 def is_own(name: str) -> bool:
-    """Whether a name has the form "<module>:<function>"."""
+    """Return True if a name has the form "<module>:<function>"."""
     return _OWN_ID.fullmatch(name) is not None
 
 

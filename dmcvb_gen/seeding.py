@@ -1,4 +1,4 @@
-"""Random streams: (seed, names, episode) in, independent numpy generators out.
+"""Random streams: independent numpy generators for each (seed, names, episode).
 
 Every random number of a release comes from here. An episode's streams depend on the
 recipe's seed, on names (task, level, ...) and on the episode's index alone, never on

@@ -1,4 +1,4 @@
-"""What a subset is: typed values for tasks, levels, distractors and goal modes, and the one place that parses them.
+"""Typed values for the tasks, levels, distractors and goal modes of subsets, and the one place that parses them.
 
 A subset is named "<task>/<level>/<setting>": "walker-walk/expert/dynamic_hard", "ant-maze-easy7x7a/medium/hidden".
 The setting is the stored form of two things: the distractor of a locomotion task, or the goal mode of a maze.
@@ -42,7 +42,7 @@ class Level(enum.StrEnum):
 
 
 class GoalMode(enum.StrEnum):
-    """How a maze treats its goal: random and seen (B1), random and left out of the images (B3's pre-training), or
+    """Treatment of a maze's goal: random and seen (B1), random and left out of the images (B3's pre-training), or
     fixed pairs of start and goal, left out too (B3)."""
 
     VISIBLE = "visible"
@@ -51,7 +51,7 @@ class GoalMode(enum.StrEnum):
 
     @property
     def hides_goal(self) -> bool:
-        """Whether the images leave the goal out."""
+        """True if the images leave the goal out."""
         return self is not GoalMode.VISIBLE
 
 
@@ -133,7 +133,7 @@ class MazeName:
 
 
 def is_maze(task_id: str) -> bool:
-    """Whether an id names a maze, for callers that have no `Task` at hand."""
+    """Return True if an id names a maze, for callers that have no `Task` at hand."""
     return task_id.startswith(f"{ANT_MAZE}-")
 
 
@@ -188,7 +188,7 @@ class Distractor:
         return self.kind if self.kind == "none" or self.difficulty == "medium" else f"{self.kind}_{self.difficulty}"
 
     def varies(self, part: str) -> bool:
-        """Whether a part (of `ALL_PARTS`) varies; none does under a user's own kind."""
+        """Return True if a part (of `ALL_PARTS`) varies; none does under a user's own kind."""
         return self.kind in DISTRACTOR_KINDS and self.kind != "none" and part in _strengths(self.difficulty)
 
     def scale_of(self, part: str) -> float:
@@ -245,7 +245,7 @@ def _number(value: float) -> str:
 
 
 def _videos_at(scale: float) -> int | None:
-    """How many videos are in play at a scale: as many as at the next word above it."""
+    """Return the number of videos in play at a scale: as many as at the next word above it."""
     return next((DIFFICULTY_VIDEOS[word] for word, top in DIFFICULTY_SCALES.items() if scale <= top), None)
 
 
@@ -368,12 +368,12 @@ class SubsetSpec:
 
     @property
     def hides_goal(self) -> bool:
-        """Whether the images leave a goal out."""
+        """True if the images leave a goal out."""
         return self.goal is not None and self.goal.hides_goal
 
     @property
     def camera_moves(self) -> bool:
-        """Whether the camera moves: it follows the ant in mazes, and wanders in dynamic distractors."""
+        """True if the camera moves: it follows the ant in mazes, and wanders in dynamic distractors."""
         return self.goal is not None or (
             self.distractor.kind == "dynamic" and (self.distractor.varies("camera") or self.distractor.varies(SHAKE))
         )
@@ -385,7 +385,7 @@ def subset_name(task_id: str, level: str, setting: str) -> str:
 
 
 def matches(name: str, patterns: Sequence[str]) -> bool:
-    """Whether a subset's name fits one of the patterns: "walker-walk/*/static", "walker-walk/expert", "*"."""
+    """Return True if a subset's name fits one of the patterns: "walker-walk/*/static", "walker-walk/expert", "*"."""
     return any(
         fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(name, f"{pattern.rstrip('/')}/*")
         for pattern in patterns

@@ -47,7 +47,7 @@ def pack_state(state: Any) -> bytes:
 
 
 def read_state(folder: str | Path) -> dict[str, Any] | None:
-    """What a run saved in its folder, `pack_state` undone; None where it has saved nothing yet.
+    """Read the state that a run saved in its folder; None if it has saved nothing yet.
 
     Raises:
       DmcvbError: the file is damaged, or an older version's.
@@ -62,7 +62,7 @@ def read_state(folder: str | Path) -> dict[str, Any] | None:
 
 
 def read_state_file(path: str | Path, otherwise: str) -> Any:
-    """What `pack_state` made the file of.
+    """Read a file that `pack_state` made.
 
     Args:
       otherwise: what to do if it cannot be read, for the message.

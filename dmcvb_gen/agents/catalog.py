@@ -1,4 +1,4 @@
-"""Agents by name: "id+bc" in, what pre-trains its encoder and what learns its policy out.
+"""Find agents by name: "id+bc" is an encoder pre-trained by inverse dynamics with a policy by BC.
 
     MODULE:NAME                          a user's own agent (`benchmarks.own`)
     [PRETRAIN+]POLICY[:OPTION,...]
@@ -36,7 +36,7 @@ def policies() -> tuple[str, ...]:
 
 
 def encoders() -> tuple[str, ...]:
-    """What may pre-train an encoder."""
+    """Return the names that may pre-train an encoder."""
     return tuple(name for name, part in PARTS.all().items() if issubclass(part, ReadyEncoder) or part.pretrains)
 
 
@@ -203,11 +203,11 @@ def make_encoder(
 
 
 def make_pretrainer(agent: Agent, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER) -> Learner:
-    """What pre-trains phi."""
+    """Make the learner that pre-trains phi."""
     return PARTS.get(agent.pretrain)(encoder, sizes, architecture, **agent.options_of(agent.pretrain))
 
 
 def make_policy(agent: Agent, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER) -> Policy:
-    """What learns the policy, on the pre-trained encoder (frozen) or with one of its own."""
+    """Make the learner of the policy, on the pre-trained encoder (frozen) or with one of its own."""
     frozen = agent.pretrain is not None
     return PARTS.get(agent.policy)(encoder, sizes, architecture, frozen=frozen, **agent.options_of(agent.policy))

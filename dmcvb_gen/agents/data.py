@@ -1,4 +1,4 @@
-"""Training data of the agents: a step table in, batches of frame stacks, states and transitions on a device out.
+"""Training data of the agents: batches of frame stacks, states and transitions from a step table.
 
 The rows are those of `dataset.steps.StepTable`. Pictures stay uint8 until they are in a batch. They are held in memory
 (or on the accelerator) if they fit, else decoded once into a file that is mapped into memory.
@@ -182,7 +182,7 @@ class TrainingData:
 
     @property
     def sizes(self) -> Sizes:
-        """What networks for these data are made for."""
+        """Sizes that networks for these data need."""
         pictures = () if self.frames is None else (self.channels, self.frames.size, self.stack)
         return Sizes(self.state.shape[1], self.action.shape[1], *pictures)
 
@@ -343,7 +343,7 @@ def batches(
 
 
 def part_count(share: float, episodes: int) -> int:
-    """How many of so many episodes a share is, at least one."""
+    """Return the number of episodes in a share of them, at least one."""
     return max(1, round(share * episodes))
 
 

@@ -1,4 +1,4 @@
-"""DINO: the user's own vision transformer (safetensors) in, a frozen encoder of frame stacks out.
+"""DINO: a frozen encoder of frame stacks from the weights of a vision transformer that the user brings.
 
 Nothing is downloaded. The network is timm's; its size is read from the shapes of the weights (ViT-S or -B, patches of 8
 or 16), whose names are those of the DINO release (Caron et al. 2021) and of timm.

@@ -1,4 +1,4 @@
-"""What all agents share: the batch they learn from, the base classes of their parts, and the registry of these parts.
+"""Base of all agents: the batch that they learn from, the base classes of their parts, and the registry of parts.
 
 An agent is a policy, on its own encoder or on one that was pre-trained. Each part has a file in this folder, which
 reads like its equation: o is an observation (frame stack or state), already normalized and augmented; a the action
@@ -147,7 +147,7 @@ class Policy(Learner):
         """(batch, action) in [-1, 1]."""
 
     def acts_by(self, weight: str) -> bool:
-        """Whether actions depend on the weight of that name."""
+        """Return True if actions depend on the weight of that name."""
         return not weight.startswith(self.only_learns)
 
 

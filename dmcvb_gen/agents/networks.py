@@ -1,4 +1,4 @@
-"""Networks of DMC-VB's agents: frame stacks, states or latents in, latents, actions, values or pictures out.
+"""Networks of DMC-VB's agents: encoders, actors, critics and decoders.
 
 Sizes are those of the paper's appendix "Architecture and hyperparameters". Frame stacks are
 (batch, channel, 64, 64) float in [-0.5, 0.5], channels = 3 x frames x views (9 for locomotion, 27 for mazes).

@@ -1,4 +1,4 @@
-"""The one trainer of all agents: a learner and its data in, a learning curve out; goes on where it was stopped.
+"""Train any agent on its data and record its learning curve; a stopped training resumes.
 
 Every random number of step i (which transitions, shifts, TD3's noise) comes from (seed, i), so a run that is stopped
 and resumed draws what it would have drawn.
@@ -35,7 +35,7 @@ Curve = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """How long and how to train (paper, table "Hyperparameters").
+    """Length and settings of a training (paper, table "Hyperparameters").
 
     Attributes:
       steps: Adam steps.
@@ -183,7 +183,7 @@ class _Means:
         self._sums, self._counts = sums or {}, counts or {}
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
-        """What it was made from, with what was added since."""
+        """Return the state that it was made from, with what was added since."""
         return dict(self._sums), dict(self._counts)
 
     def add(self, losses: dict[str, torch.Tensor]) -> None:

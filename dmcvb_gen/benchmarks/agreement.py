@@ -1,4 +1,4 @@
-"""How well a report's scores are ordered as the paper's: results in, Spearman's rho with its interval out.
+"""Compare the order of a report's scores with the paper's: Spearman's rho with its interval.
 
 A score is taken as a share of its data's mean return, ours of our data and the paper's of the paper's, so that tasks
 and levels compare. The interval is a stratified bootstrap: episodes are drawn again within each cell and seed, as

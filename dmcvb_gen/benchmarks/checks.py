@@ -1,4 +1,4 @@
-"""Structure checks before any training: a release in, findings and warnings out.
+"""Check the structure of a release before any training.
 
 `release.verify` looks at bytes, shapes, values, physics and sampled pixels; here it is asked first, and what only a
 benchmark cares about comes on top: returns as the policies and the paper promise, labels that fit their setting,
@@ -40,7 +40,7 @@ PAINTED_EPISODES = 8
 
 @dataclass(frozen=True)
 class Structure:
-    """What the checks found.
+    """Result of the checks.
 
     Attributes:
       checked: how many subsets, episodes, steps were looked at.
@@ -87,7 +87,7 @@ def check_policy_returns(subset: Subset) -> Iterator[Issue]:
 
 
 def _comparable(subset: Subset) -> bool:
-    """Whether returns are of episodes as policies were evaluated on, and as the paper's tables are of."""
+    """Return True if returns belong to episodes like those of the policies' evaluation and of the paper's tables."""
     return subset.setting != FIXED and subset.record.max_steps == get_task(subset.task).max_steps
 
 
@@ -178,7 +178,7 @@ def known_returns(release: Release) -> dict[str, np.ndarray]:
 
 
 def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str, ...]:
-    """What is another version here than where the pictures that are painted on reading belong."""
+    """List the versions that differ from those for which the pictures rendered on reading are promised."""
     painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
     sources = {record.name: background_source(release.path, record, backgrounds) for record in painted}
     return render_differences(release.manifest, painted, sources)
@@ -233,7 +233,7 @@ def check_structure(
 
 
 def _check_subset(subset: Subset, tick: ProgressCallback) -> tuple[list[Issue], list[Issue]]:
-    """What is wrong, and what is odd."""
+    """Return what is wrong with a subset, and what is odd about it."""
     tick(subset.name)
     found = [*check_policy_returns(subset), *check_labels(subset), *check_pictures(subset)]
     return found, list(check_paper_returns(subset))

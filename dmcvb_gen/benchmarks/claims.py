@@ -1,4 +1,4 @@
-"""The paper's claims, tested on our scores: results of one or more seeds in, answers with their spread out.
+"""Test the paper's claims on our scores of one or more seeds.
 
 Results that differ in nothing but the seed are taken together: the mean of all their episodes; its standard error is
 that of the episodes, or of the seeds' means where these lie further apart. A difference counts from two of its
@@ -28,7 +28,7 @@ YES, NO, OPEN = "yes", "no", "open"
 
 @dataclass(frozen=True)
 class Place:
-    """What results share that differ by agent, setting or data alone."""
+    """Facts that results share if they differ by agent, setting or data alone."""
 
     benchmark: str
     task: str
@@ -147,12 +147,12 @@ def _pool(results: Sequence[Mapping[str, Any]]) -> Pooled:
 
 
 def answer_of(difference: float, error: float) -> str:
-    """Whether a difference is above 0; open within two standard errors."""
+    """Say if a difference is above 0; it is open within two standard errors."""
     return OPEN if abs(difference) < ERRORS * error else YES if difference > 0 else NO
 
 
 def above(claim: str, where: str, names: Sequence[str], scores: Sequence[Pooled]) -> Answer:
-    """Whether the first of two scores is above the second."""
+    """Say if the first of two scores is above the second."""
     (first, second), (more, less) = names, scores
     difference, error = more.mean - less.mean, math.hypot(more.stderr, less.stderr)
     numbers = f"{first} {more}, {second} {less}; difference {difference:+.1f} +- {error:.1f}"
@@ -160,7 +160,7 @@ def above(claim: str, where: str, names: Sequence[str], scores: Sequence[Pooled]
 
 
 def pretrained(claim: str) -> Callable[[Scores], Iterator[Answer]]:
-    """Whether an encoder of other data helps: policies on it above BC on the policy's data alone."""
+    """Say if an encoder of other data helps: are policies on it above BC on the policy's data alone?"""
 
     def ask(scores: Scores) -> Iterator[Answer]:
         for place, score in scores.items():

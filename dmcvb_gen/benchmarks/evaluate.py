@@ -1,4 +1,4 @@
-"""Online evaluation: a policy in, scores of fresh episodes out, all in one batch.
+"""Score a policy on fresh episodes, all in one batch.
 
 The episodes are those of a task, painted at the data's size by the data's renderer, with a setting's distractors:
 unseen `val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). In mazes
@@ -110,7 +110,7 @@ def renderer_choice(subset: Subset) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EvaluationScene:
-    """What evaluation episodes are of.
+    """Task, distractors and pictures of evaluation episodes.
 
     Attributes:
       task, setting: e.g. "walker-walk", "dynamic"; they name the random streams, too.
@@ -130,14 +130,14 @@ class EvaluationScene:
 
     @classmethod
     def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
-        """That of a subset; `backgrounds`: where the videos are, if not where the manifest says."""
+        """Return the scene of a subset; `backgrounds`: the videos' folder, if it is not where the manifest says."""
         choice, source = renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
         pictures, size = training_pictures(subset), subset.record.size
         return cls(subset.task, subset.setting, pictures, size, choice["name"], choice["samples"], source)
 
     @classmethod
     def parse(cls, where: str, **options: Any) -> EvaluationScene:
-        """That of "walker-walk/dynamic" or "ant-maze-empty7x7/visible"; `options`: size, renderer, samples, ...
+        """Return the scene of "walker-walk/dynamic" or "ant-maze-empty7x7/visible"; `options`: size, renderer, ...
 
         Raises:
           DmcvbError: the text has another form, or there is no such task or setting.

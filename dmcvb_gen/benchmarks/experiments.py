@@ -1,4 +1,4 @@
-"""One cell: a release, a cell and a profile in, one JSON result out; what is done is not done again (see `setup`)."""
+"""Train and score one cell on a release and write its result as JSON; finished parts are kept (see `setup`)."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ UNIT_EPISODES = 100
 def train_settings(
     setup: Setup, steps: int, pixels: bool = True, evaluations: int = 1, frozen: bool = False
 ) -> TrainSettings:
-    """How a piece of a cell is trained under a profile; `frozen`: on an encoder that does not learn."""
+    """Return a profile's training settings for a part of a cell; `frozen`: on an encoder that does not learn."""
     return TrainSettings(
         steps=steps,
         batch_size=setup.profile.batch_size if pixels else setup.profile.state_batch_size,
@@ -305,7 +305,7 @@ def _save_trained(setup: Setup, cell: Cell, policy: Policy, data: TrainingData) 
 def _facts(
     setup: Setup, cell: Cell, subset: Subset, data: TrainingData, curve: Curve, seconds: dict[str, float]
 ) -> dict[str, Any]:
-    """What a result says of a cell, encoder and inspection apart."""
+    """Return the facts of a result, without encoder and inspection."""
     agent, profile = cell.agent, setup.profile
     evaluations = [point for point in curve if "score" in point]
     best = max(evaluations, key=lambda point: point["score"]["mean"])
@@ -344,7 +344,7 @@ def _facts(
 
 @dataclass(frozen=True)
 class DataScore:
-    """What the episodes that a policy learned from scored themselves.
+    """Score of the episodes that a policy learned from.
 
     Attributes:
       mean: of the returns.
@@ -398,7 +398,7 @@ def _peak_memory(device: str) -> int:
 def inspect(
     setup: Setup, encoder: nn.Module, data: TrainingData, cell: Cell, folder: Path, tick: ProgressCallback = ignore
 ) -> dict[str, Any]:
-    """What a frozen encoder still knows: test errors of decoders of its observations and states (section 5.1).
+    """Measure what a frozen encoder still knows: test errors of decoders of its observations and states (section 5.1).
 
     Args:
       folder: where the decoders' states are kept while they train, one in a folder each.

@@ -1,4 +1,4 @@
-"""Figures of a validation's page: returns, results and pictures in, PNGs as data URLs out."""
+"""Draw the figures of a validation's page, as PNGs in data URLs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fixed goals of a maze (benchmark B3): a subset in, its (start, goal) pairs and their cells out.
+"""Fixed goals of a maze (benchmark B3): (start, goal) pairs of a subset and their cells.
 
 What a subset was asked to be decides, never how much of it is at hand: a part of a release is scored on the starts
 and goals of the whole one.

@@ -42,7 +42,7 @@ class Release(BaseModel):
 
 
 class Evaluation(BaseModel):
-    """How the score was taken, beside the protocol of `validate`.
+    """Details of the evaluation beside the protocol of `validate`.
 
     Attributes:
       episodes: 30 by that protocol. steps: agent steps of an episode at most. seed: of starts and distractors.

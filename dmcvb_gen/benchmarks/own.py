@@ -1,4 +1,4 @@
-"""Agents of one's own in a validation: "module:name" in, a policy out.
+"""Load your own agents ("module:name") for a validation.
 
 The name is that of a ready policy, or of a function whose only parameter is called `data`: it gets the episodes that a
 cell learns from (`AgentData`) and returns a policy. A policy is a callable as `dmcvb_gen.evaluate` takes it. Two
@@ -23,7 +23,7 @@ from dmcvb_gen.loaders.source import StepSource
 
 @dataclass(frozen=True)
 class AgentData:
-    """What an agent of one's own learns from.
+    """Data that your own agent learns from.
 
     Attributes:
       sources: one a subset, all steps of its training episodes (`StepSource`: len(), [i] and gather(), numpy alone).
@@ -72,7 +72,7 @@ class OwnAgent:
 
     @property
     def learns(self) -> bool:
-        """Whether it is a function of data that returns a policy."""
+        """True if it is a function of data that returns a policy."""
         if isinstance(self.value, type):
             return False
         try:

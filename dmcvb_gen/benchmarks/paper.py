@@ -1,4 +1,4 @@
-"""The paper's scores of benchmark 1: task, level, distractor and agent in, its mean and standard error out."""
+"""The paper's scores of benchmark 1: means and standard errors by task, level, distractor and agent."""
 
 from __future__ import annotations
 

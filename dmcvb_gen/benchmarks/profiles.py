@@ -1,4 +1,4 @@
-"""How much a validation trains and evaluates: `PROFILES["quick"]`; only "paper" is sized as the paper is."""
+"""Budgets of a validation: `PROFILES["quick"]`; only "paper" is sized as the paper is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of a validation: results in, one self-contained HTML page, its tables as Markdown and a JSON file out.
+"""Write the report of a validation: one self-contained HTML page, its tables as Markdown, and a JSON file.
 
 Wherever a score stands, the profile that made it stands beside it. The page's text lies in data/report.html.jinja,
 the tables' in data/report.md.jinja; here is what they show.
@@ -196,7 +196,7 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup
 
 
 def render_tables(facts: Mapping[str, Any]) -> str:
-    """What the page says but for pictures, times and settings, as Markdown; `facts` as in report.json."""
+    """Render the page's tables as Markdown, without pictures, times and settings; `facts` as in report.json."""
     text = _template("report.md.jinja").render(**_tables(facts))
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
@@ -382,7 +382,7 @@ def _data_lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What must be known to read the scores."""
+    """Return the notes that a reader of the scores needs."""
     most = max((result["evaluations"] for result in results), default=1)
     kind = "of the trained policy" if most == 1 else f"the best of {most} over a training, as in the paper"
     notes = [f"A score is an online evaluation {kind}: mean and standard error over its episodes."]

@@ -1,4 +1,4 @@
-"""Many cells: cells in, their results out as they come; encoders are trained first, each once.
+"""Run many cells and yield their results as they come; encoders are trained first, each once.
 
 A cell that cannot be run has a result of {"error": one line}; what it raised lies in its log, and the others go on.
 """
@@ -76,7 +76,7 @@ def share_memory(setup: Setup, workers: int) -> Setup:
 
 
 def needs_of(setup: Setup) -> Needs:
-    """What a cell takes on a cluster; no bytes of memory: its share of a node."""
+    """Return the resources of a cell on a cluster; without a number of bytes, its share of a node."""
     if setup.device == "cpu":
         return Needs(cpus=setup.threads, memory=setup.memory)
     return Needs(cpus=setup.threads, gpus=1)  # the bound is of the accelerator's memory, which a cell has alone

@@ -1,4 +1,4 @@
-"""What all cells of a validation share, and what decides a result: setup and cell in, file names and fingerprints out.
+"""Settings that all cells of a validation share, and the file names and fingerprints of their results.
 
     <out>/encoders/<id>.safetensors, .json   a pre-trained encoder and its learning curve, shared by cells
     <out>/cells/<id>.json                    a cell's scores, curve, settings, times
@@ -36,7 +36,7 @@ RESULT_VERSION = 3
 
 @dataclass(frozen=True)
 class Setup:
-    """What all cells of a run share.
+    """Settings that all cells of a run share.
 
     Attributes:
       root: the release's folder. out: the report's folder.
@@ -115,7 +115,7 @@ class Pretraining:
 
 
 def pretraining_of(cell: Cell) -> Pretraining | None:
-    """What a cell's encoder needs; None if it is trained with the policy, or comes from a file."""
+    """Return the pre-training of a cell's encoder; None if it is trained with the policy, or comes from a file."""
     if cell.agent.pretrain is None or cell.agent.ready_encoder:
         return None
     setting = cell.pretrain_parts[0].subset.split("/")[-1]

@@ -1,4 +1,4 @@
-"""What a benchmark is: a release's subsets in, cells (agent, pre-training set, policy set) out.
+"""Benchmarks, which turn a release's subsets into cells (agent, pre-training set, policy set).
 
 Each benchmark has a file in `definitions`, and registers itself; `plan_benchmark` gives the cells of one.
 """
@@ -67,7 +67,7 @@ class Cell:
 
     @property
     def pretrain_label(self) -> str:
-        """What the encoder learns from, with its setting where that is another one; "" for the policy's data."""
+        """Name the encoder's data, with its setting if that is another one; "" for the policy's data."""
         labels = []
         for part in self.pretrain:
             setting = part.subset.split("/")[-1]
@@ -176,7 +176,7 @@ class SubsetFinder:
         return found
 
     def _command(self, benchmark: str, task: str, lacking: list[tuple[str, str]]) -> str:
-        """How to roll out a task with what is lacking, and with what the release has of it."""
+        """Return the command that rolls out a task with what is missing and what the release has of it."""
         have = [(level, setting) for t, level, setting in self._names if t == task]
         levels = dict.fromkeys(level for level, _ in have + lacking)
         settings = dict.fromkeys(setting for _, setting in have + lacking)
@@ -215,11 +215,11 @@ class Benchmark(abc.ABC):
         return None
 
     def reference(self, cell: Cell) -> str:
-        """What a cell's score is set beside, in words; by default the paper's appendix "Dataset size study"."""
+        """Name what a cell's score is compared with; by default the paper's appendix "Dataset size study"."""
         return f"BC on all of expert/{_whole_setting(cell)}"
 
     def is_reference(self, other: Cell, cell: Cell) -> bool:
-        """Whether another cell of the same task is that reference."""
+        """Return True if another cell of the same task is that reference."""
         return (other.setting, other.agent.name, other.policy_label) == (_whole_setting(cell), "bc", "expert")
 
     def group(self, task: str, policy_label: str) -> tuple[str, str]:
@@ -227,7 +227,7 @@ class Benchmark(abc.ABC):
         return paper_task(task), policy_label
 
     def warnings(self, release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
-        """What makes its scores say less than they seem to."""
+        """List what makes its scores say less than they seem to."""
         return iter(())
 
     @property

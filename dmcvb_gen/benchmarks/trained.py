@@ -1,4 +1,4 @@
-"""Trained agents in files: a cell's policy in, something that `dmcvb_gen.evaluate` takes out.
+"""Load the trained policies that `validate` keeps, for `dmcvb_gen.evaluate`.
 
     agent = load_agent("reports/mini/cells/b1_walker-walk_none_state-bc_expert.safetensors")
     dmcvb_gen.evaluate(agent, "walker-walk/none", pixels=agent.pixels, stack=agent.stack)
@@ -66,7 +66,7 @@ class TrainedAgent:
 
     @property
     def pixels(self) -> bool:
-        """Whether it sees pictures."""
+        """True if it sees pictures."""
         return not self.agent.sees_state
 
     @property
@@ -75,7 +75,7 @@ class TrainedAgent:
         return self.agent.stack
 
     def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """Observations of all episodes in, (episode, action) float32 in [-1, 1] out."""
+        """Return (episode, action) float32 in [-1, 1] for the observations of all episodes."""
         if self.pixels:
             seen = normalize_pixels(torch.from_numpy(observation["pixels"]))
         else:

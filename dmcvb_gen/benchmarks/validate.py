@@ -1,4 +1,4 @@
-"""Validation: a release in, a report out: structure checks, then benchmarks, then one page that says it all."""
+"""Validate a release: check its structure, run the benchmarks, and write one page about it all."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ STATE_BC_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Validation:
-    """What a validation found.
+    """Result of a validation.
 
     Attributes:
       structure: of the release.
@@ -61,18 +61,18 @@ class Validation:
 
     @property
     def sound(self) -> bool:
-        """Whether what is there is right, and every cell could be run."""
+        """True if the release is sound and every cell could be run."""
         return self.structure.sound and not self.failed
 
     @property
     def complete(self) -> bool:
-        """Whether every episode is there."""
+        """True if every episode is there."""
         return self.episodes[0] == self.episodes[1]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Who is told how a validation goes on.
+    """Callbacks that follow a validation.
 
     Attributes:
       checking: a tick, told the subset that is checked.
@@ -114,7 +114,7 @@ def make_setup(
     training: bool = True,
     **fields: Any,
 ) -> Setup:
-    """What all cells of a validation share, from what a person gives.
+    """Make the settings that all cells of a validation share from a user's arguments.
 
     Args:
       path: the release's folder.

@@ -137,7 +137,7 @@ def format_bytes(count: float) -> str:
 
 
 def moved_files(moved: Any) -> str:
-    """What a publish or fetch moved, in words."""
+    """Say what a publish or fetch moved."""
     return f"{moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now"
 
 

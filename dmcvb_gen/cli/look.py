@@ -61,7 +61,7 @@ def info(path, options, as_json):
     )
     size = format_bytes(facts["bytes"])
     if facts["disk_bytes"] not in (None, facts["bytes"]):
-        size += f" ({format_bytes(facts['disk_bytes'])} on disk: equal files are links)"
+        size += f" ({format_bytes(facts['disk_bytes'])} on disk)"
     click.echo(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}")
     if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
         click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")

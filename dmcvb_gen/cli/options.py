@@ -137,7 +137,7 @@ def _repeatable(text: str) -> str:
 
 
 def _cluster(*, executor: Annotated[str, ("processes", "ray")] = "processes", ray_address: str | None = None):
-    """What comes with `workers`.
+    """Return the options that come with `workers`.
 
     Args:
       executor: Executor that runs the jobs: local processes or Ray.

@@ -63,7 +63,7 @@ def _tell(text):
 
 
 def _painted_facts(done):
-    """What painting gave, for programs."""
+    """Return the result of painting for programs."""
     return dict(
         shards=done.shards,
         known=done.known,
@@ -75,7 +75,7 @@ def _painted_facts(done):
 
 
 def _painted(place, done):
-    """What painting gave, in lines."""
+    """Yield the result of painting in lines."""
     painted = f"{pluralize(done.shards, 'shards')} painted; {_compared(done)}."
     yield f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}"
     yield from (f"  differs: {name}" for name in done.differing[:10])

@@ -38,7 +38,7 @@ def verify(release, as_json, **options):
 
 
 def _verified(path, result):
-    """What verify found, in lines."""
+    """Yield the result of verify in lines."""
     yield from (f"FAIL {finding}" for finding in result.findings[:50])
     if len(result.findings) > 50:
         yield f"... and {len(result.findings) - 50} more"
@@ -77,7 +77,7 @@ def regenerate(release, out, as_json, **options):
 
 
 def _regenerated(place, outcome):
-    """What regenerate did, in lines."""
+    """Yield the result of regenerate in lines."""
     yield from outcome.shards
     if any(shard.equal is False for shard in outcome.shards):
         for name, (there, here) in outcome.environment.items():

@@ -12,7 +12,7 @@ from dmcvb_gen.storage.remote import is_url
 
 
 def is_given(context: click.Context, name: str) -> bool:
-    """Whether the command line itself has an option, not its default."""
+    """Return True if the command line itself gives an option."""
     return context.get_parameter_source(name) == ParameterSource.COMMANDLINE
 
 

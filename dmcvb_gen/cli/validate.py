@@ -77,7 +77,7 @@ def _agents(names: tuple[str, ...] | None, own: tuple[str, ...]) -> list[str]:
 
 
 def _validated(result, profile) -> Iterator[str]:
-    """What validate found, in lines."""
+    """Yield the result of validate in lines."""
     yield from (f"FAIL {finding}" for finding in result.structure.findings[:50])
     yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
     yield from (f"warning: {finding}" for finding in result.warnings)

@@ -56,7 +56,7 @@ def view(path, only, episodes, size, max_mb, open_it, serve, port, out, options,
 
 
 def _has_browser() -> bool:
-    """Whether there is a graphical browser; one in the terminal would take the terminal."""
+    """Return True if there is a graphical browser; one in the terminal would take the terminal."""
     try:
         return not isinstance(webbrowser.get(), webbrowser.GenericBrowser)
     except webbrowser.Error:

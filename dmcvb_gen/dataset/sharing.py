@@ -23,10 +23,11 @@ Commits = Mapping[str, Mapping[int, CommitRecord]]
 def link_equal_files(root: Path, manifest: Manifest, commits: Commits, changed: Collection[str] | None = None) -> int:
     """Make files of sibling subsets (one task and level) that have equal bytes links to one file.
 
-    A file that does not have its digest any more is never linked to, and becomes a link to one that has.
+    A file that does not have its digest any more is never linked to.
 
     Args:
-      changed: paths of files that are new; others that are whole stay as they are. All by default.
+      changed: of a repair: paths of files that are new. Only these, and damaged files, become links then. By default
+        all files do that have their digests; damaged ones are left for `verify` to find.
 
     Returns:
       How many files became links. 0 if the folder cannot be written or has no hard links.
@@ -69,7 +70,7 @@ def _link_all(root: Path, files: list[FileRecord], temporary: Path, changed: Col
     first = min(sound, key=lambda file: changed is not None and file.path in changed)
     linked = 0
     for file in files:
-        kept = changed is not None and file in sound and file.path not in changed
+        kept = file not in sound if changed is None else file in sound and file.path not in changed
         if not kept and not os.path.samestat(nodes[file.path], nodes[first.path]):
             os.link(root / first.path, temporary)
             os.replace(temporary, root / file.path)

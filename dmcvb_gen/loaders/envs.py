@@ -50,7 +50,7 @@ ENVIRONMENT_MODALITIES = {"depth": (0, np.inf), "segmentation": (-1, np.iinfo(np
 
 @dataclass(frozen=True)
 class Scene:
-    """What an environment shows; every field may be given to `DistractedEnv`, `gymnasium.make` and `make_vec`.
+    """Settings of an environment; `DistractedEnv`, `gymnasium.make` and `make_vec` take every field.
 
     Attributes:
       task: e.g. "walker-walk".
@@ -161,7 +161,7 @@ class _Stage:
         self.goal_pair = np.full(count, -1)
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
-        """Of one place: observations {"pixels", "state"} and modalities, and actions."""
+        """Spaces of one place: observations {"pixels", "state"} and modalities, and actions."""
         shape = (self.size, self.size, 3 * len(self.pictures.views))
         observation: dict[str, spaces.Space] = {
             "pixels": spaces.Box(0, 255, shape, np.uint8),
@@ -288,7 +288,7 @@ class DistractedEnv(gymnasium.Env):
         self._pixels: np.ndarray | None = None
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
-        """Of observations {"pixels", "state"}, and of actions."""
+        """Spaces of observations {"pixels", "state"}, and of actions."""
         return self._stage.spaces()
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:

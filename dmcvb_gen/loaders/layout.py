@@ -29,7 +29,7 @@ class _Stack:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of one place: (stack * channel, size, size)."""
+        """Shape of one place: (stack * channel, size, size)."""
         _, stack, channels, height, width = self._frames.shape
         return stack * channels, height, width
 

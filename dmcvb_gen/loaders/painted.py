@@ -1,4 +1,4 @@
-"""Pictures painted when they are read: a subset without (or with other) pictures in, the same subset with them out.
+"""Render the pictures of a subset when they are read, if it stores none or others are asked for.
 
 Nothing is stored: an episode's pictures are painted from its physics states and labels when they are first asked for,
 and kept while there is room. With fresh distractors every epoch sees the same episodes from other cameras, in other
@@ -37,7 +37,7 @@ DEFAULT_CACHE = 1_000_000_000
 
 @dataclass(frozen=True)
 class Painting:
-    """How pictures are rendered when they are read.
+    """Settings by which pictures are rendered when they are read.
 
     Attributes:
       distractors: "stored" or "resample".
@@ -132,7 +132,7 @@ class PaintedSubset(SubsetReader):
 
     @property
     def fresh(self) -> bool:
-        """Whether each epoch shows other distractors."""
+        """True if each epoch shows other distractors."""
         return self.painting.distractors == RESAMPLED
 
     @property

@@ -96,7 +96,7 @@ def stream(
 def _batches(
     subset: Subset, order: np.ndarray, batch_size: int | None, world: int, workers: int, drop_last: bool
 ) -> list[list[int]]:
-    """How many batches each rank's workers give: as many a rank as the shortest rank has.
+    """Count the batches of each rank's workers: every rank has as many as the shortest one.
 
     Of single steps (no batch size), each worker gives as many as that worker of any rank has: a loader that makes
     batches of them makes them by worker.

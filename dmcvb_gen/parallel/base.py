@@ -1,4 +1,4 @@
-"""What every pool of workers is: functions and arguments in, results as they come."""
+"""Base of all pools of workers, which run functions and give results as they come."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Future:
 
 
 class Pool(abc.ABC):
-    """Where functions are run; a context manager that ends its workers when it is left, at once on an error.
+    """Pool of workers; a context manager that ends its workers when it is left, at once on an error.
 
     `submit(key, function, *arguments)` has `function(*arguments, tick=...)` run; `results()` gives (key, result) as
     they come, until nothing is left of what was submitted, then or meanwhile. The first exception of a function is
@@ -105,7 +105,7 @@ class SerialPool(Pool):
 
 @dataclass(frozen=True)
 class Needs:
-    """What a piece of work takes, for executors that place it: CPU cores, bytes of memory, a share of a GPU."""
+    """Resources of a piece of work: CPU cores, bytes of memory, a share of a GPU."""
 
     cpus: float = 1
     memory: int | None = None

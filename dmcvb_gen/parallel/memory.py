@@ -1,4 +1,4 @@
-"""How much main memory is free."""
+"""Measure how much main memory is free."""
 
 from __future__ import annotations
 

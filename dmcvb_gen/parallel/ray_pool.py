@@ -142,7 +142,7 @@ def _nobody(address: str, reason: str) -> DmcvbError:
 
 
 def _work(function, arguments, threads: int) -> tuple[list[tuple], Any]:
-    """What a function told, added up where it told numbers, and its result."""
+    """Run a function and return its progress (numbers are added up) and its result."""
     limit_threads(threads)
     told: list[tuple] = []
 

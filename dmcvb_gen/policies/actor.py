@@ -1,4 +1,4 @@
-"""Acting: a policy's header and weights and a batch of observations in, actions out, the same bits on every processor.
+"""Compute a policy's actions for a batch of observations, with the same bits on every processor.
 
 Every sum is added up in one fixed order, from the first input to the last, and every function comes from `arithmetic`;
 so an action depends on its own observation alone, not on the rows beside it nor on the machine.
@@ -73,7 +73,7 @@ def _layer_norm(x: np.ndarray, scale: np.ndarray, shift: np.ndarray) -> np.ndarr
 
 
 class Policy:
-    """A behaviour policy: observations in, actions out, one call for a whole batch.
+    """A behaviour policy, which gives the actions of a whole batch of observations in one call.
 
     Attributes:
       header: where it comes from; None for uniform random actions.

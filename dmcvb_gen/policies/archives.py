@@ -1,4 +1,4 @@
-"""The package's own policies: a task and a file's name in, the file unpacked into the user's cache out.
+"""Unpack the package's own policies into the user's cache.
 
 `data/<group>.zip` hold the files, one archive a group (a locomotion task, or all mazes, whose policies repeat one
 network), see `packing`; `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every
@@ -24,7 +24,7 @@ INDEX = "policies.json"
 
 
 def data_folder() -> Traversable:
-    """Where archives and their list lie."""
+    """Folder of the archives and their list."""
     return resources.files("dmcvb_gen.policies") / "data"
 
 
@@ -40,7 +40,7 @@ def bundled_digests() -> dict[str, str]:
 
 
 def bundled_file(name: str) -> Path:
-    """Where a bundled file ("<task>/<file>") lies, unpacked and checked.
+    """Return the path of a bundled file ("<task>/<file>"), unpacked and checked.
 
     Raises:
       DmcvbError: it cannot be unpacked, because no folder for it can be written.

@@ -1,4 +1,4 @@
-"""Other programs' policies as ours: a Stable-Baselines3 zip or a torch state dict in, header and weights out.
+"""Convert policies of other programs: a Stable-Baselines3 zip or a torch state dict.
 
 Nothing is unpickled: parameters are read by torch's weights-only loader, and of a zip's `data` its plain JSON.
 
@@ -48,7 +48,7 @@ PARAMETERS, DATA = "policy.pth", "data"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a program keeps the parts of an actor, by the names of its parameters.
+    """Parameter names under which a program keeps the parts of an actor.
 
     Attributes:
       algorithm: for the header.

@@ -1,4 +1,4 @@
-"""Measuring a policy: policy and task in, returns of fresh episodes out, all episodes in one batch of fixed size."""
+"""Measure a policy's returns on fresh episodes, all in one batch of fixed size."""
 
 from __future__ import annotations
 

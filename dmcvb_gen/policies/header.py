@@ -1,4 +1,4 @@
-"""What a policy file says of itself: JSON in; a checked header, and the weights that it asks for, out."""
+"""The header of a policy file: checked JSON, and the weights that it asks for."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Evaluation(_Model):
 
 
 class PolicyHeader(_Model):
-    """What a policy file says of itself.
+    """Header of a policy file.
 
     Attributes:
       task: the task's id.
@@ -105,7 +105,7 @@ class PolicyHeader(_Model):
 
     @property
     def origin(self) -> str:
-        """How the policy came to be, in a few words for people."""
+        """Origin of the policy, in a few words."""
         return origin_of(self.algorithm)
 
     def without_local_paths(self) -> PolicyHeader:
@@ -118,7 +118,7 @@ class PolicyHeader(_Model):
 
 
 def origin_of(algorithm: str) -> str:
-    """How policies of an algorithm come to be, in a few words for people, after "trained ..."."""
+    """Say how policies of an algorithm are trained, in a few words that follow "trained ..."."""
     return ORIGINS.get(algorithm, f"by {algorithm}")
 
 

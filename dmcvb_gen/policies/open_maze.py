@@ -1,4 +1,4 @@
-"""Knowing a maze: what an ant sees and where to head in, what it would see in an open maze with its goal there out.
+"""Turn what an ant sees and its next waypoint into what it would see in an open maze with its goal there.
 
 A policy that runs straight to goals gets through every maze when it is shown a point on the way instead of the goal.
 A small network, part of the policy, gives that point: from where the ant and the goal are, never from the layout.
@@ -29,7 +29,7 @@ def places(observation: np.ndarray) -> np.ndarray:
 
 
 def open_maze_observation(observation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """What the ant would see if it stood in the middle of an open maze and its goal lay at `vector` from it.
+    """Return what the ant would see in the middle of an open maze with its goal at `vector` from it.
 
     The torso's frame follows from two directions that are seen in it, up and to the true goal.
 

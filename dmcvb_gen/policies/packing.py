@@ -1,4 +1,4 @@
-"""Policy files in few bytes: safetensors files in, one archive out, and the same bytes back.
+"""Pack policy files (safetensors) into one small archive, and unpack the same bytes.
 
 Weights hardly compress, because 23 bits of a float32 are noise. But policies of one task have much in common: a layer
 resembles the same layer of an earlier file. It is stored as a difference to `scale * earlier`, with one scale a row or
@@ -34,7 +34,7 @@ Layers = defaultdict[tuple[str, tuple[int, int]], list[np.ndarray]]
 
 
 class _Choice(NamedTuple):
-    """How a layer was written.
+    """Encoding of a layer.
 
     Attributes:
       reference: place of the earlier layer; -1 if the guess is zero.
@@ -67,7 +67,7 @@ class _Streams:
 
 
 def pack_files(contents: dict[str, bytes]) -> bytes:
-    """One archive of safetensors files of float32 arrays: name -> bytes in, the archive's bytes out.
+    """Pack safetensors files of float32 arrays, name -> bytes, into the bytes of one archive.
 
     Raises:
       ValueError: a file is of another kind.

@@ -1,4 +1,4 @@
-"""The paper's table of episode returns: task and level in, its row out."""
+"""The paper's table of episode returns by task and level."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of behaviour policies: safetensors weights with a JSON header in, policies out, and back.
+"""Read and write files of behaviour policies: safetensors weights with a JSON header.
 
 Loading one runs no code from the file, allocates no more than the file holds, and refuses what does not fit.
 """

@@ -1,4 +1,4 @@
-"""What a task is: a MuJoCo model, a state with named fields, a reward; simulated as a batch of episodes.
+"""Base of all tasks: a MuJoCo model, a state with named fields, a reward; simulated as a batch of episodes.
 
 A `Task` is the description (one per task id, shared freely). `Task.batch` makes an `EpisodeBatch`:
 `size` episodes side by side on `mujoco.batch.Batch`, stepped together. Tasks know nothing of pixels.
@@ -37,7 +37,7 @@ it looks. The solver's warm start is in, so that a step redone from a stored sta
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one agent step of a batch gave.
+    """Result of one agent step of a batch.
 
     Attributes:
       state: (size, state) float64, the states after the step.
@@ -93,7 +93,7 @@ class Task(abc.ABC):
 
     @property
     def picture_model(self) -> mujoco.MjModel:
-        """What painters need: `model` with its textures, where that goes without them."""
+        """Model for renderers: `model` with its textures, if `model` itself has none."""
         return self.model
 
     def styles(self, split: str) -> tuple[int, ...]:
@@ -124,7 +124,7 @@ class Task(abc.ABC):
 
     @property
     def state_slices(self) -> dict[str, slice]:
-        """Where each field lies in the state."""
+        """Slice of each field in the state."""
         ends = np.cumsum(list(self.state_fields.values()))
         return {
             name: slice(int(end - size), int(end))
@@ -221,7 +221,7 @@ class EpisodeBatch(abc.ABC):
         pairs: Sequence[tuple],
         ids: np.ndarray | Sequence[int] | None = None,
     ) -> np.ndarray:
-        """As `reset`, at given (start, goal) cells: mazes have them.
+        """Do as `reset` at given (start, goal) cells, which mazes have.
 
         Raises:
           DmcvbError: the task has no goals.
@@ -281,7 +281,7 @@ class EpisodeBatch(abc.ABC):
 
     @property
     def _physics_columns(self) -> np.ndarray:
-        """Where the components of `PHYSICS_SPEC` lie in a batch's state rows (`mjSTATE_INTEGRATION`)."""
+        """Return the columns of `PHYSICS_SPEC`'s components in a batch's state rows (`mjSTATE_INTEGRATION`)."""
         if not hasattr(self, "_columns"):
             self._columns = physics_columns(self.task.model)
         return self._columns

@@ -1,4 +1,4 @@
-"""Where cameras, bodies, geoms and lights are: physics states in, poses out, in batches and in float64."""
+"""Compute the poses of cameras, bodies, geoms and lights from physics states, in batches and in float64."""
 
 from __future__ import annotations
 

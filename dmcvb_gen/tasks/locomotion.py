@@ -1,4 +1,4 @@
-"""walker-walk, cheetah-run, humanoid-walk: dm_control's models in, batches of episodes out.
+"""walker-walk, cheetah-run and humanoid-walk: dm_control's models, simulated as batches of episodes.
 
 The three tasks answer the questions of dm_control's suite (initial state, state, reward) for a whole
 batch. dm_control is the authority: from the same physics state and actions they give its numbers.
@@ -96,7 +96,7 @@ class WalkerBatch(EpisodeBatch):
         return self._xmat[:, self._torso, 8]
 
     def horizontal_velocity(self):
-        """Of the centre of mass, m/s."""
+        """Horizontal velocity of the centre of mass, m/s."""
         return self._sensors[:, self._velocity]
 
     def state(self):

@@ -235,7 +235,7 @@ class SuiteBatch(EpisodeBatch):
         self._refresh(ids)
 
     def _refresh(self, ids):
-        """As dm_control does after a reset: everything is computed, without actuation."""
+        """Compute everything without actuation, as dm_control does after a reset."""
         flags = self._flags[ids].copy()
         self._flags[ids] = flags | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
         self.sims.forward(ids=ids)

@@ -1,1 +1,1 @@
-"""Learners of behaviour policies: tasks and settings in, run folders of checkpoints and picked policy files out."""
+"""Train behaviour policies into run folders of checkpoints, and select policy files from them."""

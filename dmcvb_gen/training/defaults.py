@@ -1,4 +1,4 @@
-"""Settings per task that are known to work: task in, the settings and budget of its run out."""
+"""Default settings and budgets of each task's training."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def parse_settings(pairs: tuple[str, ...], config: str | Path | None, algorithm:
 def run_config(
     task_id: str, algorithm: str, settings: dict[str, Any], found: RunConfig | None = None, **given: Any
 ) -> RunConfig:
-    """What a run trains: what is given, else what the run to go on with has, else the task's defaults.
+    """Return the config of a run: the given values, else those of the run to resume, else the task's defaults.
 
     Args:
       settings: given settings, checked.

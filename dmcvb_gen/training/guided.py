@@ -1,4 +1,4 @@
-"""Learning the way through a maze: a policy of the open maze in, one that knows a layout out.
+"""Teach a policy of the open maze the way through a layout.
 
 A policy that walks straight to goals gets through every maze when it is shown a point on the way instead of the
 goal. A guide that has the layout before it can show such points, but behaviour policies must not see the layout; so
@@ -175,7 +175,7 @@ class Student:
         self.owed, self.updates, self.loss = 0.0, 0, 0.0
 
     def weights(self) -> dict[str, torch.Tensor]:
-        """Of the whole policy: it walks as ever, and knows the way as far as it has been learned."""
+        """Return the weights of the whole policy: it walks as before and knows the way as far as learned."""
         known = {name: value for name, value in self.run.walker.weights.items() if not name.startswith("way.")}
         return as_tensors(known) | self.way.weights()
 

@@ -1,4 +1,4 @@
-"""Which checkpoints of a long run may go: its learning curve in, agent steps to delete out."""
+"""Choose the checkpoints of a long run that may be deleted, from its learning curve."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of float32 in memory-mapped files: a path and a shape in, an array that survives the process out."""
+"""Arrays of float32 rows in memory-mapped files that outlive the process."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ ProgressCallback = Callable[[int], Any]
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """What a run trains; written once to run.json, a resumed run must have the same.
+    """Config of a run; written once to run.json, and a resumed run must have the same.
 
     Attributes:
       steps: agent steps (at action repeat 2) to train; a resumed run may have more.
@@ -96,7 +96,7 @@ class RunConfig:
 
     @property
     def init_name(self) -> str | None:
-        """What a policy file says that it started from: the path's last name, for the rest is nobody's business."""
+        """Return the last name of the path that a run starts from; the rest is private to the machine."""
         return self.init_from and Path(os.path.abspath(self.init_from)).name
 
 
@@ -128,7 +128,7 @@ def command_of(config: RunConfig) -> str:
 
 
 def read_config(folder: str | Path) -> RunConfig | None:
-    """What the run in a folder trains; None where there is no run.
+    """Return the config of the run in a folder; None if there is no run.
 
     Raises:
       DmcvbError: run.json is damaged.
@@ -207,7 +207,7 @@ class Run(abc.ABC):
         """The header's fields that say how the actor is built."""
 
     def describe(self) -> dict[str, Any]:
-        """What else the header's `training` should say."""
+        """Return further facts for the header's `training`."""
         return {}
 
     @abc.abstractmethod

@@ -1,4 +1,4 @@
-"""Soft actor-critic on batched simulations: transitions in, a squashed Gaussian actor out.
+"""Soft actor-critic on batched simulations, with a squashed Gaussian actor.
 
 SAC (Haarnoja et al. 2018) with what makes humanoids learnable and CPUs fast: running observation
 normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products where the
@@ -134,7 +134,7 @@ class ReturnScale:
         return 1 / max(spread, 1e-3)
 
     def state(self) -> dict[str, torch.Tensor]:
-        """What it continues from."""
+        """Return the state that it continues from."""
         numbers = [self._norm.count, float(self._norm.mean[0]), float(self._norm.m2[0]), self.largest]
         running = torch.from_numpy(self._running.copy())
         return {"numbers": torch.tensor(numbers, dtype=torch.float64), "running": running}
@@ -352,7 +352,7 @@ class RunningNorm:
 
 
 class ReplayLearner(abc.ABC):
-    """What learns from a replay buffer: an actor, running statistics of observations, and whatever else `update` needs.
+    """Base of learners from a replay buffer: an actor, running statistics of observations, and what `update` needs.
 
     Attributes of subclasses:
       _parts, _optimizers: names of the networks and optimizers that `state` holds.
@@ -492,7 +492,7 @@ class Sac(ReplayLearner):
         return values.min(dim=0).values if self.settings.clipped else values.mean(dim=0)
 
     def critic_loss(self, observation, action, reward, discount, next_observation):
-        """How far the critics are from their Bellman targets, (1)."""
+        """Return the loss of the critics against their Bellman targets, (1)."""
         with torch.no_grad():
             next_observation = self.actor.normalize(next_observation)
             next_action, log_prob = self.sample_action(next_observation)

@@ -214,7 +214,7 @@ class Sb3Run(Run):
         return state
 
     def _last(self, normalize: VecNormalize | None) -> tuple[str, ...]:
-        """What the model remembers of the step before."""
+        """Return what the model remembers of the step before."""
         return ("_last_obs", "_last_episode_starts", *(("_last_original_obs",) if normalize else ()))
 
     def _restore(

@@ -56,7 +56,7 @@ MIN_POINTS = 8
 
 @dataclass(frozen=True)
 class Convergence:
-    """Where a curve ends.
+    """Convergence of a curve.
 
     Attributes:
       value: return at convergence, the mean of the last quarter of the smoothed curve.
@@ -85,7 +85,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class Selection:
-    """What could be picked, and why the rest could not.
+    """Result of a selection: the picked checkpoints, and why others could not be picked.
 
     Attributes:
       base: return at 0 % of the way.

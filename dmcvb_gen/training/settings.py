@@ -1,4 +1,4 @@
-"""Settings of the learners: names and values as given in, checked data classes out."""
+"""Check the settings of the learners and turn them into data classes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ALGORITHMS = {
 
 @dataclasses.dataclass(frozen=True)
 class Sb3Settings:
-    """What all Stable-Baselines3 learners have; names and meaning are SB3's where it has them.
+    """Settings of all Stable-Baselines3 learners; names and meanings are SB3's if it has them.
 
     Attributes:
       simulations: episodes stepped side by side.

@@ -1,4 +1,4 @@
-"""Training a behaviour policy online on states: task and settings in, a run folder of checkpoints out.
+"""Train a behaviour policy online on states, into a run folder of checkpoints.
 
 The package's own SAC and MPO are trained here, Stable-Baselines3's algorithms in `sb3`; `open_run` gives the one that
 is asked for. What a run folder holds is said in `runs`.
@@ -101,7 +101,7 @@ class MpoRun(ReplayRun):
 
 
 class ReplayLoop:
-    """What a run goes round: episodes fill the buffer, the learner learns from it; its state can be saved.
+    """Loop of a run: episodes fill the buffer and the learner learns from it; its state can be saved.
 
     Args:
       saved: `state()` to go on from; None at the start.
@@ -231,7 +231,7 @@ def run_class(algorithm: str) -> type[Run]:
 
 
 def _digest(path: str | None) -> str | None:
-    """Of the policy file that a run starts from, None where it starts from none."""
+    """Return the digest of the policy file that a run starts from; None if it starts from none."""
     return sha256_file(path) if path and Path(path).is_file() else None
 
 

@@ -78,12 +78,11 @@ def test_a_release_reads_back_with_its_shapes_and_alignment(small_release):
 
 
 def test_repainting_a_stored_frame_gives_the_stored_pixels(small_release):
-    from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
     from dmcvb_gen.generate.render import renderer_for
 
     subset = open_release(small_release)[NAME]
     episode = subset.episode(2)
-    labels = DistractorState(**{name: episode[f"exogenous/{name}"] for name in DISTRACTOR_STATE_NAMES})
+    labels = subset.labels([2])[0]
     steps = [0, 3, 250, 500]
     renderer, _ = renderer_for(subset.record, "builtin", "train")
     np.testing.assert_array_equal(

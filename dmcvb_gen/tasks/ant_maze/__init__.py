@@ -1,4 +1,4 @@
-"""Ant mazes: task ids in, tasks out.
+"""Make the tasks of ant mazes from their ids.
 
 "ant-maze-empty7x7" is one of DMC-VB's layouts; "ant-maze-mine:*****/*...*/*****" carries a layout of its own;
 an ending "@geodesic" takes the shortest path's length for the reward.

@@ -1,4 +1,4 @@
-"""How far it is to the goal: layout and goal in, fields of shortest-path distance out (scikit-fmm).
+"""Compute fields of shortest-path distance to the goal of a maze (scikit-fmm).
 
 Two measures. "saturated" is DMC-VB's: travel times of a wave from the whole goal cell, on a grid of 10
 pixels a cell, as fast as another wave's travel time from the walls, up to 5 pixels (the "saturated fast marching

@@ -1,4 +1,4 @@
-"""Maze layouts: rows of text in, walls, free cells and their places in the world out.
+"""Maze layouts: walls, free cells and their places in the world, from rows of text.
 
 A layout is a rectangle of `*` (wall) and space or `.` (floor). The outer cells are walls, all floor is
 connected. Row 0 is the north side (largest y).
@@ -66,7 +66,7 @@ class Layout:
 
     @property
     def entity_layer(self) -> str:
-        """As labmaze reads it."""
+        """Return the layout as labmaze reads it."""
         return "".join(row.replace(".", " ") + "\n" for row in self.rows)
 
     @property

@@ -381,7 +381,7 @@ class AntMaze(Task):
 
 
 def _mocap_columns(model: mujoco.MjModel) -> slice:
-    """Where the goal's position lies in a physics state (`PHYSICS_SPEC`)."""
+    """Return the columns of the goal's position in a physics state (`PHYSICS_SPEC`)."""
     before = PHYSICS_SPEC & (int(mujoco.mjtState.mjSTATE_MOCAP_POS) - 1)
     start = mujoco.mj_stateSize(model, before)
     return slice(start, start + 3)
