@@ -77,7 +77,7 @@ DISTRACTOR_PARTS = (*SCALED_PARTS, "background")
 CUE, SHAKE, LIGHT = "cue", "shake", "light"
 """Parts besides, of dynamic distractors alone. A cue's number is its correlation with the action before a frame."""
 FURTHER_PARTS = (SHAKE, LIGHT)
-"""Of these, those with a scale s."""
+"""Further parts that have a scale s, for dynamic distractors alone."""
 ALL_PARTS = (*DISTRACTOR_PARTS, *FURTHER_PARTS, CUE)
 """In the order of a difficulty's spelling."""
 ALL = "all"

@@ -43,7 +43,7 @@ from dmcvb_gen.training.training import open_run
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
 SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
-"""Of the paper's expert: the returns at which the two sides' times are compared."""
+"""Shares of the paper's expert return at which the two times are compared."""
 
 Curve = list[tuple[float, float]]
 """(seconds of training, return) of each evaluation."""
