@@ -54,7 +54,7 @@ def equal_files(manifest: Manifest, commits: Commits) -> Iterable[list[FileRecor
 
 
 def _link_all(root: Path, files: list[FileRecord], temporary: Path, changed: Collection[str] | None) -> int:
-    """Put links to the first whole file in place of the others, or only of damaged and `changed` ones.
+    """Replace files by links to the first one that has its digest; see `link_equal_files` for which.
 
     Raises:
       OSError: the file system has no links, or a file vanished.

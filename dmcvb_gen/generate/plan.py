@@ -496,7 +496,7 @@ def finish(plan: Plan) -> Manifest:
 
 
 def _is_done(manifest: Manifest, plan: Plan) -> bool:
-    """Return True if a release has its digests and nothing had to be made, so that they stay as they are."""
+    """Return True if a release has its digests and nothing had to be made: its digests are then kept."""
     return manifest.complete and manifest.digest is not None and not plan.jobs
 
 

@@ -1,4 +1,4 @@
-"""Equal files of sibling subsets are one file on the disk; nobody who reads or repairs a release notices."""
+"""Equal files of sibling subsets are one file on the disk, and every command works as it does without links."""
 
 from __future__ import annotations
 
