@@ -27,7 +27,7 @@ from dmcvb_gen.generate.paint import RenderConfig, without_pictures
 from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.loaders.painted import open_painted
-from dmcvb_gen.loaders.release import open_for_reading
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
 from dmcvb_gen.release.fetch import fetch, fetch_and_paint
 from dmcvb_gen.spec import is_maze
 
@@ -175,6 +175,34 @@ def batches_table(options) -> None:
             started = time.perf_counter()
             count = sum(1 for _ in subset.batches(options.batch, seed=0))
             print(f"{name:22} {count / (time.perf_counter() - started):8.1f} batches/s", flush=True)
+        rate = painter_rate(open_painted(root))
+        print(f"{'painter alone':22} {rate / options.batch:8.1f} batches/s of new images, one process")
+        for name, subset in {"stored": stored, "fresh distractors": fresh}.items():
+            found = loader_rate(subset, options)
+            share = f", {found / (rate * options.workers):.0%} of the painter times the workers" * (subset is fresh)
+            print(f"{name}, {options.workers} workers {found / options.batch:8.1f} batches/s{share}", flush=True)
+
+
+def painter_rate(release: ReleaseReader) -> float:
+    """Images a second that one process renders, and nothing else."""
+    subset = next(iter(release.subsets.values()))
+    subset.painted(int(subset.episodes[0]))  # backgrounds are decoded
+    started = time.perf_counter()
+    count = sum(len(subset.painted(int(episode))["pixels"]) for episode in subset.episodes[1:])
+    return count / (time.perf_counter() - started)
+
+
+def loader_rate(subset: SubsetReader, options) -> float:
+    """Steps a second out of a `DataLoader`, in the second epoch, when its workers have started."""
+    from torch.utils.data import DataLoader
+
+    data = subset.torch("stream", batch_size=options.batch)
+    loader = DataLoader(data, batch_size=None, num_workers=options.workers, persistent_workers=True)
+    for epoch in range(1, 3):  # nothing of them is kept from elsewhere
+        data.set_epoch(epoch)
+        started = time.perf_counter()
+        count = sum(len(batch["action"]) for batch in loader)
+    return count / (time.perf_counter() - started)
 
 
 def main() -> None:
@@ -189,7 +217,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--per-shard", type=int, default=5, help="episodes")
     parser.add_argument("--mbits", type=float, nargs="+", default=[10, 100, 1000])
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="that paint")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="that paint, or feed training")
     parser.add_argument("--batch", type=int, default=256)
     options = parser.parse_args()
     for asked, table in (

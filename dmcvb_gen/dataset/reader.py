@@ -280,6 +280,9 @@ class Subset:
             raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
         return chosen
 
+    def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
+        """Take notice that rows of these episodes will be read, part by part; does nothing for stored pictures."""
+
     def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
         """Rows of episodes, one episode after the other.
 

@@ -102,6 +102,7 @@ class StepTable:
         row = 0
         for part, length in zip(parts, lengths, strict=True):
             few = max(1, READ_BYTES // (3 * size**2 * (1 + int(length.max(initial=0)))))
+            part.subset.prepare(part.episodes, part.pictures)
             for episode in range(0, max(1, len(length)), few):
                 read = part.subset.rows([*FIELDS, *part.pictures], part.episodes[episode : episode + few])
                 for name, found in values.items():

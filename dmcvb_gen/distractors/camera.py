@@ -36,19 +36,28 @@ class CameraRange:
 
 def spherical(position: np.ndarray) -> np.ndarray:
     """(..., 3) x y z -> (..., 3) radius, polar angle, azimuth in [-pi, pi)."""
-    x, y, z = np.moveaxis(np.asarray(position, np.float64), -1, 0)
-    radius = np.sqrt(x * x + y * y + z * z)
-    azimuth = arithmetic.arctan2(y, x)
-    azimuth = np.where(azimuth >= np.pi - 1e-9, azimuth - 2 * np.pi, azimuth)
-    return np.stack([radius, arithmetic.arccos(np.clip(z / radius, -1, 1)), azimuth], axis=-1)
+    return np.stack(_spherical(*np.moveaxis(np.asarray(position, np.float64), -1, 0)), axis=-1)
 
 
 def cartesian(coordinates: np.ndarray) -> np.ndarray:
     """(..., 3) radius, polar angle, azimuth -> (..., 3) x y z."""
-    radius, polar, azimuth = np.moveaxis(coordinates, -1, 0)
-    (sin_polar, cos_polar), (sin_azimuth, cos_azimuth) = arithmetic.sin_cos(polar), arithmetic.sin_cos(azimuth)
+    radius, *angles = np.moveaxis(coordinates, -1, 0)
+    return np.stack(_cartesian(radius, np.stack(angles)), axis=-1)
+
+
+def _spherical(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    radius = np.sqrt(x * x + y * y + z * z)
+    cosine = np.clip(z / radius, -1, 1)
+    sine = np.sqrt((1 - cosine) * (1 + cosine))
+    polar, azimuth = arithmetic.arctan2(np.stack([sine, y]), np.stack([cosine, x]))
+    return radius, polar, np.where(azimuth >= np.pi - 1e-9, azimuth - 2 * np.pi, azimuth)
+
+
+def _cartesian(radius: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(...,) radius, (2, ...) polar angle and azimuth -> x, y, z, each (...,)."""
+    (sin_polar, sin_azimuth), (cos_polar, cos_azimuth) = arithmetic.sin_cos(angles)
     flat = radius * sin_polar
-    return np.stack([flat * cos_azimuth, flat * sin_azimuth, radius * cos_polar], axis=-1)
+    return flat * cos_azimuth, flat * sin_azimuth, radius * cos_polar
 
 
 def camera_range(offset: np.ndarray, setting: Distractor) -> CameraRange:
@@ -93,28 +102,34 @@ def camera_walk(
     velocity = heading / arithmetic.norm(heading, axis=1, keepdims=True) * share[:, :1] * MAX_SPEED * unit
     roll_velocity = (2 * share[:, 1] - 1) * limit
     ticks = ACTION_REPEAT * (frames - 1)
-    noise = np.stack([arithmetic.normal(rng, (ticks, 4)) for rng in generators], axis=1)
-    position = cartesian(place)
+    # The coordinate comes first from here on, and calls are few: of a loop over ticks they are what takes the time.
+    noise = np.stack([arithmetic.normal(rng, (ticks, 4)).T for rng in generators], axis=-1)  # (4, tick, episode)
+    pushes, twists = VELOCITY_STD * unit * noise[:3], ROLL_VELOCITY_STD * scale * noise[3]
+    position, velocity = cartesian(place).T, velocity.T
     for tick in range(ticks):
-        velocity = velocity + VELOCITY_STD * unit * noise[tick, :, :3]
-        speed = arithmetic.norm(velocity, axis=1, keepdims=True)
-        velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(speed, 1e-12))
-        reached = cartesian(_clip(spherical(position + velocity), bounds))
+        velocity = velocity + pushes[:, tick]
+        velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(arithmetic.norm(velocity, axis=0), 1e-12))
+        reached = _within(position + velocity, bounds)
         position, velocity = reached, reached - position  # a limit takes the speed towards it
-        roll_velocity = np.clip(roll_velocity + ROLL_VELOCITY_STD * scale * noise[tick, :, 3], -limit, limit)
+        roll_velocity = np.clip(roll_velocity + twists[tick], -limit, limit)
         rolled = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
         roll, roll_velocity = rolled, rolled - roll
         if (tick + 1) % ACTION_REPEAT == 0:
             frame = (tick + 1) // ACTION_REPEAT
-            offsets[:, frame], rolls[:, frame] = position, roll
+            offsets[:, frame], rolls[:, frame] = position.T, roll
     return offsets, rolls
 
 
-def _clip(coordinates: np.ndarray, bounds: CameraRange) -> np.ndarray:
-    """Clip into the ranges; a camera just past the azimuth's seam at pi is past its near end, not its far one."""
+def _within(position: np.ndarray, bounds: CameraRange) -> np.ndarray:
+    """Move places, (3, episode) x y z, into the ranges.
+
+    A camera just past the azimuth's seam at pi is past its near end, not its far one.
+    """
+    radius, polar, azimuth = _spherical(*position)
     middle = (bounds.low[2] + bounds.high[2]) / 2
-    azimuth = middle + (coordinates[:, 2] - middle + np.pi) % (2 * np.pi) - np.pi
-    return np.clip(np.column_stack([coordinates[:, :2], azimuth]), bounds.low, bounds.high)
+    azimuth = middle + (azimuth - middle + np.pi) % (2 * np.pi) - np.pi
+    inside = np.clip(np.stack([radius, polar, azimuth]), bounds.low[:, None], bounds.high[:, None])
+    return np.stack(_cartesian(inside[0], inside[1:]))
 
 
 def nominal_target(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.jobs import stream_names
@@ -33,6 +34,10 @@ DISTRACTORS = (STORED, RESAMPLED)
 """Labels to paint with: those of the data, or fresh ones for every epoch."""
 DEFAULT_CACHE = 1_000_000_000
 """Bytes of painted episodes that a subset keeps."""
+DRAWN_TOGETHER = 32
+"""Episodes whose fresh distractors are drawn at once: one episode's walks take as long as those of dozens."""
+DRAWN_KEPT = 16 * DRAWN_TOGETHER
+"""Episodes whose fresh distractors a subset keeps."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +109,12 @@ class PaintedSubset(SubsetReader):
 
     def _start(self) -> None:
         self._kept: OrderedDict[tuple[int, int, str], np.ndarray] = OrderedDict()
+        self._drawn: OrderedDict[tuple[int, int], DistractorState] = OrderedDict()
         self._painter: tuple[Renderer, Any] | None = None
         self._bytes, self._lock = 0, threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:  # painters and what they painted stay where they are
-        left = ("_kept", "_bytes", "_painter", "_lock")
+        left = ("_kept", "_drawn", "_bytes", "_painter", "_lock")
         return {name: value for name, value in super().__getstate__().items() if name not in left}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -160,11 +166,21 @@ class PaintedSubset(SubsetReader):
         if not pictures or not len(chosen):
             return super().rows(names, chosen)
         counts = self.read("length", chosen) + 1
+        self.prepare(chosen, pictures)
         painted = [self.painted(int(episode), pictures) for episode in chosen]
         values = super().rows([name for name in names if name not in pictures], chosen)
         for name in pictures:
             values[name] = np.concatenate([p[name][:count] for p, count in zip(painted, counts, strict=True)])
         return values
+
+    def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
+        """Draw fresh distractors of episodes together, as far as their pictures are not kept and there is room."""
+        with self._lock:
+            names, epoch = tuple(pictures), self.epoch
+            missing = [int(e) for e in episodes if any((int(e), epoch, name) not in self._kept for name in names)]
+            if self.fresh and len(missing) <= DRAWN_KEPT:
+                for first in range(0, len(missing), DRAWN_TOGETHER):
+                    self._draw_labels(missing[first : first + DRAWN_TOGETHER])
 
     def painted(self, episode: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Picture arrays of an episode by name, each (row, height, width, 3) uint8.
@@ -193,22 +209,40 @@ class PaintedSubset(SubsetReader):
             return found
 
     def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
-        if self._painter is None:
-            self._painter = renderer_for(self.record, self._videos())
-        renderer, videos = self._painter
+        renderer, _ = self._open_painter()
         index = [episode]
         length = self.read("length", index)
         used = int(length.max()) + 1
         physics = self.read("physics", index)[:, :used]
-        if self.fresh:
-            names = (*self._names, f"epoch {self.epoch}")
-            streams, action = (self.record, self._seed, names, np.array(index)), self.read("action", index)
-            labels = distractor_state_of(*streams, physics, length, videos, action)
-        else:
-            labels = self.labels(index)[:, :used]
+        labels = self._fresh_labels(episode)[None, :used] if self.fresh else self.labels(index)[:, :used]
         task, rows = get_task(self.task), self.record.max_steps + 1
         pictures = paint(task, renderer, physics, labels, length, rows, arrays=arrays)
         return {name: value[0].copy() for name, value in pictures}
+
+    def _open_painter(self) -> tuple[Renderer, Any]:
+        if self._painter is None:
+            self._painter = renderer_for(self.record, self._videos())
+        return self._painter
+
+    def _fresh_labels(self, episode: int) -> DistractorState:
+        """Labels of an episode's frames in this epoch; they are drawn with those of its neighbors."""
+        if (episode, self.epoch) not in self._drawn:
+            first = int(np.searchsorted(self.episodes, episode)) // DRAWN_TOGETHER * DRAWN_TOGETHER
+            self._draw_labels(self.episodes[first : first + DRAWN_TOGETHER].tolist())
+        return self._drawn[episode, self.epoch]
+
+    def _draw_labels(self, episodes: list[int]) -> None:
+        new = [episode for episode in episodes if (episode, self.epoch) not in self._drawn]
+        if new:
+            names, (_, videos) = (*self._names, f"epoch {self.epoch}"), self._open_painter()
+            streams = (self.record, self._seed, names, np.array(new))
+            physics, length, action = (self.read(name, new) for name in ("physics", "length", "action"))
+            labels = distractor_state_of(*streams, physics, length, videos, action)
+            self._drawn |= {(episode, self.epoch): labels[place] for place, episode in enumerate(new)}
+        for episode in episodes:
+            self._drawn.move_to_end((episode, self.epoch))
+        while len(self._drawn) > DRAWN_KEPT:
+            self._drawn.popitem(last=False)
 
     def _videos(self) -> str:
         given = self.painting.backgrounds

@@ -65,6 +65,7 @@ class ProcessPool(Pool):
                         raise error
                     yield key, result
         except BrokenProcessPool:
+            self._terminate()  # one that was just starting was overlooked
             raise StoreError(
                 f"a worker process was killed (out of memory?); {self._kept}, with fewer --workers than "
                 f"{self._workers} if it happens again"
@@ -74,7 +75,13 @@ class ProcessPool(Pool):
         while self._waiting and len(self._running) < IN_FLIGHT * self._workers:
             key, function, arguments = self._waiting.popleft()
             number = next(self._numbers)
-            self._running[self._pool.submit(_work, number, function, arguments)] = (number, key)
+            try:
+                future = self._pool.submit(_work, number, function, arguments)
+            except OSError:
+                if self._pool._broken:  # a worker died, and its queue was closed while the next worker started
+                    raise BrokenProcessPool from None
+                raise
+            self._running[future] = (number, key)
 
     def _listen(self, block: bool = False) -> None:
         """Pass on what the workers tell, and take the results that were on their way; `block` waits for one a while."""
@@ -90,10 +97,13 @@ class ProcessPool(Pool):
             if block and any(not process.is_alive() for process in (self._pool._processes or {}).values()):
                 raise BrokenProcessPool from None
 
+    def _terminate(self) -> None:
+        for process in list((self._pool._processes or {}).values()):
+            process.terminate()
+
     def close(self, at_once=False):
         if at_once:
-            for process in list((self._pool._processes or {}).values()):
-                process.terminate()
+            self._terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._listen()
         self._messages.close()

@@ -210,6 +210,16 @@ def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
     assert np.array_equal(before, subset.read(array, [0]))
 
 
+def test_fresh_distractors_are_the_same_alone_and_drawn_together(made, monkeypatch):
+    opened = [dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample") for _ in range(2)]
+    together, alone = (next(reversed(release.subsets.values())) for release in opened)
+    array, episodes = together.picture_names[0], together.episodes[::-1]
+    batch = together.rows([array], episodes)[array]
+    monkeypatch.setattr("dmcvb_gen.loaders.painted.DRAWN_TOGETHER", 1)
+    assert len(together._drawn) == len(episodes)
+    np.testing.assert_array_equal(batch, np.concatenate([alone.rows([array], [e])[array] for e in episodes]))
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
 def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made, kind, workers):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
@@ -90,6 +91,19 @@ def test_the_next_piece_of_work_begins_while_a_result_is_on_its_way(workers):
 def test_a_worker_that_dies_with_a_result_on_its_way_is_said():
     with pytest.raises(StoreError, match="killed"):
         list(run_all(send_and_die, [1, 2], 2))
+
+
+def test_a_worker_that_dies_while_the_next_one_starts_is_said(monkeypatch):
+    spawn = ProcessPoolExecutor._spawn_process
+
+    def spawn_late(executor):
+        if executor._processes:
+            time.sleep(5)  # the first worker has died by then
+        spawn(executor)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_spawn_process", spawn_late)
+    with pytest.raises(StoreError, match="killed"):
+        list(run_all(die, [1, 2], 2))
 
 
 def test_a_killed_worker_is_one_line_with_a_cure():

@@ -96,14 +96,18 @@ class Source:
         return self.pictures.views
 
     @property
+    def modalities(self) -> tuple[str, ...]:
+        """Stored arrays of depth, segmentation and flow: "depth", or "depth/top", ..."""
+        return tuple(name for name in self.subset.arrays if name.partition("/")[0] in LABEL_TYPES)
+
+    @property
     def description(self) -> str:
         manifest = self.manifest
         return f"{self.subset.name} of {manifest.name} {manifest.version} ({manifest.license}), {manifest.generator}"
 
     def __iter__(self) -> Iterator[ExportEpisode]:
         pictures = self.pictures
-        modalities = [name for name in self.subset.arrays if name.partition("/")[0] in LABEL_TYPES]
-        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *pictures.arrays, *modalities]
+        arrays = ["state", "action", "reward", "discount", "terminated", "seed", *pictures.arrays, *self.modalities]
         for index in self.episodes:
             values = self.subset.episode(index, arrays)
             yield ExportEpisode(
@@ -111,7 +115,7 @@ class Source:
                 seed=int(values["seed"]),
                 pixels={view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
                 terminated=bool(values["terminated"]),
-                modalities={name: values[name] for name in modalities},
+                modalities={name: values[name] for name in self.modalities},
                 **{name: values[name] for name in ("state", "action", "reward", "discount")},
             )
             self.tick(1)

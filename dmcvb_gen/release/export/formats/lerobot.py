@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.release.export.coloring import ENCODINGS, color
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
 
@@ -34,7 +35,7 @@ CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
 @register_exporter(
     "lerobot",
     reader="LeRobot v3 (Parquet with PNG pictures, or mp4), `datasets.load_dataset`",
-    keeps="pixels, states, actions, rewards, ends",
+    keeps="pixels, states, actions, rewards, ends; depth, segmentation, flow as images",
     drops="the last observation of each episode, physics, labels",
     mark="meta/info.json",
     modules=("pyarrow",),
@@ -43,7 +44,8 @@ CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
 def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
 
-    Several subsets are the tasks of one data set. The last observation of an episode has no action and is left out,
+    Several subsets are the tasks of one data set. Depth, segmentation and flow that are stored become images of their
+    own, "observation.images.depth", by `coloring.color`; info.json says how their values are read back. The last observation of an episode has no action and is left out,
     as LeRobot's frames all have one.
 
     Raises:
@@ -125,6 +127,7 @@ class _Layout:
     Attributes:
       tasks: their texts; `task_index` counts them. robot: what they have in common.
       keys: view -> feature of its pictures.
+      modalities: array of depth, segmentation or flow -> feature of its pictures.
       features: as info.json says them.
     """
 
@@ -133,7 +136,7 @@ class _Layout:
         for source in sources:
             if _shape(source) != _shape(first):
                 raise StoreError(
-                    f"{source.subset.name} and {first.subset.name} differ in views, size, state or action, so they "
+                    f"{source.subset.name} and {first.subset.name} differ in views, size, state, action or modalities, so they "
                     "do not fit into one data set; merge fewer with --only"
                 )
         self.sources, self.video, self.size = sources, video, first.subset.record.size
@@ -145,6 +148,7 @@ class _Layout:
         self.rate, self.fps = first.steps_per_second, round(first.steps_per_second)
         single = len(first.views) == 1
         self.keys = {view: "observation.image" if single else f"observation.images.{view}" for view in first.views}
+        self.modalities = {name: f"observation.images.{name.replace('/', '_')}" for name in first.modalities}
         self.features = self._features(first)
 
     def _features(self, source: Source) -> dict[str, Any]:
@@ -163,6 +167,7 @@ class _Layout:
         actions = [task.model.actuator(i).name or f"actuator.{i}" for i in range(task.action_size)]
         return {
             **{key: picture for key in self.keys.values()},
+            **{key: self._modality(picture, name) for name, key in self.modalities.items()},
             "observation.state": {"dtype": "float32", "shape": [len(state)], "names": state},
             "action": {"dtype": "float32", "shape": [len(actions)], "names": actions},
             "next.reward": {"dtype": "float32", **scalar},
@@ -172,6 +177,10 @@ class _Layout:
             **{n: {"dtype": "int64", **scalar} for n in ("frame_index", "episode_index", "index", "task_index")},
         }
 
+    def _modality(self, picture: dict[str, Any], name: str) -> dict[str, Any]:
+        info = picture.get("info", {}) | {"encoding": ENCODINGS[name.partition("/")[0]]}
+        return picture | {"info": info}
+
     def _video_info(self) -> dict[str, Any]:
         sizes = {"video.height": self.size, "video.width": self.size, "video.channels": 3}
         codec = {"video.codec": "h264", "video.pix_fmt": PIXEL_FORMAT, "video.is_depth_map": False}
@@ -179,7 +188,10 @@ class _Layout:
 
     def pictures(self, episode: ExportEpisode) -> dict[str, np.ndarray]:
         """Feature -> (L, size, size, 3)."""
-        return {key: episode.pixels[view][: episode.length] for view, key in self.keys.items()}
+        pictures = {key: episode.pixels[view][: episode.length] for view, key in self.keys.items()}
+        for name, key in self.modalities.items():
+            pictures[key] = color(name.partition("/")[0], episode.modalities[name][: episode.length])
+        return pictures
 
     def frames(self, episode: ExportEpisode, number: int, index: int, task: int) -> dict[str, np.ndarray]:
         """The columns of an episode but its pictures, each with a row a frame."""
@@ -223,7 +235,7 @@ class _Layout:
 def _shape(source: Source) -> tuple:
     subset = source.subset
     sizes = (subset.array(name).shape[-1] for name in ("state", "action"))
-    return source.views, subset.record.size, *sizes, source.steps_per_second
+    return source.views, source.modalities, subset.record.size, *sizes, source.steps_per_second
 
 
 class _Files:
@@ -275,7 +287,7 @@ class _Files:
         path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._table, self._frames = pq.ParquetWriter(path, self._schema), 0
-        for key in self._layout.keys.values() if self._layout.video else ():
+        for key in (*self._layout.keys.values(), *self._layout.modalities.values()) if self._layout.video else ():
             path = self._folder / VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
             path.parent.mkdir(parents=True, exist_ok=True)
             self._videos[key] = _video(path, self._layout.size, self._layout.fps)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.release.export.coloring import color
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
 
@@ -13,13 +14,15 @@ from dmcvb_gen.release.export.registry import register_exporter
 @register_exporter(
     "rerun",
     reader="Rerun (`rerun exports/.../*.rrd`): a recording an episode",
-    keeps="pixels, states, actions, rewards, discounts",
+    keeps="pixels, states, actions, rewards, discounts; depth, segmentation, flow as images",
     drops="physics, labels",
     mark="episode_*.rrd",
     modules=("rerun",),
 )
 def write(source: Source, folder: Path) -> None:
     """Write `episode_<index>.rrd` with the entities `image/<view>`, `state/<field>`, `action`, `reward` and `discount`.
+
+    Depth, segmentation and flow that are stored are images as well, "depth" or "depth/<view>", by `coloring.color`.
 
     Both timelines, `step` (a number) and `time` (simulated seconds), have a row for each observation; the last
     observation of an episode has no action, reward or discount.
@@ -55,8 +58,10 @@ def _write_episode(recording, episode: ExportEpisode, fields: dict[str, slice], 
         times = [rerun.TimeColumn("step", sequence=step), rerun.TimeColumn("time", duration=step * seconds)]
         recording.send_columns(entity, indexes=times, columns=columns)
 
-    for view, frames in episode.pixels.items():
-        entity = "image" if view == "pixels" else f"image/{view}"
+    shown = {"image" if view == "pixels" else f"image/{view}": frames for view, frames in episode.pixels.items()}
+    for name, values in episode.modalities.items():
+        shown[name] = color(name.partition("/")[0], values)
+    for entity, frames in shown.items():
         images = rerun.EncodedImage.columns(
             blob=[png(frame) for frame in frames], media_type=["image/png"] * len(frames)
         )
