@@ -311,7 +311,7 @@ def verify(
         _refuse("at a URL nothing is painted or simulated", backgrounds=backgrounds, executor=not _is_count(workers))
         with progress_bar(progress, " files", scaled=False) as bar:
             return verify_url(str(release), storage_options, everything, bar, workers or WORKERS)  # type: ignore[arg-type]
-    _refuse(f"{release} is no URL, and is read whole", all=everything, option=storage_options)
+    _refuse(f"{release} is a folder, which is always read whole", all=everything, option=storage_options)
     with progress_bar(progress, " checks", scaled=False) as bar:
         return run(release, None if backgrounds is None else str(backgrounds), bar, workers or 1)
 
@@ -393,7 +393,9 @@ def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore)
     given: dict[str, Any] = dict(options=options["storage_options"], workers=options["workers"])
     if not options["paint"]:
         if any(look):
-            raise DmcvbError("--size, --views and --goal say what to --paint (in Python, paint=True)")
+            raise DmcvbError(
+                "--size, --views and --goal have no effect without --paint: add it (in Python, paint=True)"
+            )
         with progress_bar(options["progress"], "B") as bar:
             return fetch(*what, tick=bar, **given), None
     with (

@@ -34,7 +34,7 @@ _PACKAGES = {
     "imageio_ffmpeg": "imageio-ffmpeg",
     "yaml": "PyYAML",
 }
-"""Module -> its package, where the names differ."""
+"""Module -> its package, if the names differ."""
 
 
 def install_hint(module: str) -> str | None:

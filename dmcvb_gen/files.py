@@ -88,7 +88,7 @@ def _umask() -> int:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make a rename last through a power cut, where the file system can."""
+    """Make a rename last through a power cut, if the file system can."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

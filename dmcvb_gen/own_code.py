@@ -44,7 +44,7 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
 
     Args:
       variable: the environment variable that lets it run.
-      kind: what it is, for messages: "task" or "behaviour".
+      kind: word for messages: "task" or "behaviour".
 
     Raises:
       DmcvbError: its code may not run, or cannot be found.

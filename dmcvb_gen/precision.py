@@ -13,7 +13,7 @@ import torch
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 PROBE_SECONDS = 0.2
-"""How long a probe takes at most once every product has run."""
+"""Seconds that a probe takes at most, once every product has run."""
 WORTH = 0.95
 """bfloat16 is chosen if it takes less than this share of float32's time: its results are less precise."""
 

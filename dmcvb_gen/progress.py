@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-LOG_SECONDS = 60.0  # between two lines of progress where nobody watches a bar
+LOG_SECONDS = 60.0  # between two lines of progress if nobody watches a bar
 
 
 class ProgressBar(tqdm):
@@ -18,7 +18,7 @@ class ProgressBar(tqdm):
 
     Args:
       shown: False draws nothing.
-      options: of tqdm.
+      options: options of tqdm.
     """
 
     def __init__(self, shown: bool = True, **options: Any) -> None:

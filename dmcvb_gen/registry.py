@@ -23,7 +23,7 @@ class Registry(Generic[Thing]):
     """Name -> thing of one kind.
 
     Args:
-      kind: what it holds, for messages: "format".
+      kind: word for what it holds, for messages: "format".
       package: the package of ours whose modules register their things on import.
       group: entry points of other packages, modules or objects in them, that do so too.
     """

@@ -26,7 +26,7 @@ def episode_stream(seed: int, names: tuple[str, ...], episode: int, stream: str)
 
     Args:
       seed: the recipe's seed, >= 0.
-      names: what the stream belongs to, e.g. ("walker-walk", "expert").
+      names: names of what the stream belongs to, e.g. ("walker-walk", "expert").
       episode: index of the episode in its subset, >= 0.
       stream: one of `STREAMS`.
     """

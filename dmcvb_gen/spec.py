@@ -127,7 +127,7 @@ class MazeName:
 
     @classmethod
     def parse(cls, task_id: str) -> MazeName | None:
-        """The parts of a task id, None where it does not name a maze."""
+        """The parts of a task id, None if it does not name a maze."""
         found = _MAZE_ID.fullmatch(task_id)
         return cls(**found.groupdict()) if found else None
 

@@ -19,7 +19,7 @@ from dmcvb_gen.errors import DmcvbError
 STATE = "state.safetensors"
 """The file's name in a run's `resume` folder."""
 OLD_STATE = "state.pt"
-"""What versions up to 0.1 wrote."""
+"""Ending of the files that versions up to 0.1 wrote."""
 
 
 def pack_state(state: Any) -> bytes:
@@ -41,7 +41,7 @@ def pack_state(state: Any) -> bytes:
             return {type(value).__name__: [tree(inner) for inner in value]}
         if value is None or isinstance(value, (bool, int, float, str)):
             return value
-        raise TypeError(f"a saved state holds no {type(value).__name__}")
+        raise TypeError(f"a saved state cannot hold a {type(value).__name__}")
 
     return safetensors.torch.save(tensors, metadata={"state": json.dumps(tree(state))})
 
@@ -56,7 +56,9 @@ def read_state(folder: str | Path) -> dict[str, Any] | None:
     if not path.exists():
         old = path.with_name(OLD_STATE)
         if old.exists():
-            raise DmcvbError(f"{old} is of an older dmcvb-gen and is not read; give a policy file, or start again")
+            raise DmcvbError(
+                f"{old} was written by an older dmcvb-gen and cannot be read; give a policy file, or start again"
+            )
         return None
     return read_state_file(path, "start again with another --out")
 

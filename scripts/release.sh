@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # A release from recipe to proof: rolled out, verified, validated, carded, published, fetched, made again in part.
 #   bash scripts/release.sh [RECIPE [OUT]]     dmcvb-mini and releases/RECIPE by default
-# Run again, it goes on where it stopped. A line a stage; what each printed is in OUT.log. Options by environment:
+# Rerun the command to resume. A line a stage; what each printed is in OUT.log. Options by environment:
 #   WORKERS (2), TENTH (its seed, 0), VALIDATE ("--profile smoke --benchmark b1 --agents bc,state-bc,id+bc", to see that
 #   agents train on every subset; "--profile brief ..." for scores takes minutes a cell; "" leaves it out)
 extras=train,hf

@@ -89,7 +89,7 @@ class Agent:
 
     @property
     def paper_name(self) -> str | None:
-        """The column of the paper's table; None where it has none."""
+        """The column of the paper's table; None if it has none."""
         if self.own or ":" in self.name or (self.sees_state and self.policy != "bc"):
             return None
         if self.sees_state:

@@ -41,7 +41,7 @@ class Source:
     """A part of a subset.
 
     Attributes:
-      share: of its episodes, drawn by the seed of the split.
+      share: share of its episodes, drawn by the seed of the split.
       episodes: so many of its episodes instead.
       goal_pair: only episodes of this fixed (start, goal) pair (mazes).
     """
@@ -78,7 +78,7 @@ class HeldFrames:
 
     Attributes:
       table: (row, channel, size, size + 2 PAD) uint8.
-      mapped: whether they lie in a file.
+      mapped: True if they lie in a file.
     """
 
     def __init__(self, frames: np.ndarray, device: str | torch.device = "cpu"):
@@ -124,8 +124,8 @@ class Sizes:
 
     Attributes:
       state, action: numbers of each.
-      channels: of an observation: 3 x views x frames of the stack. picture: pixels a side. stack: frames. All 0 for
-        agents that see states.
+      channels: channels of an observation: 3 x views x frames of the stack. picture: pixels a side. stack: frames.
+        All 0 for agents that see states.
     """
 
     state: int
@@ -143,13 +143,13 @@ class TrainingData:
       held_out: (episode,) bool, which episodes no agent learns from.
       stack: frames an observation.
       returns: (episode,) float64, of all episodes in it.
-      device: where everything is held.
+      device: device that holds everything.
 
     Attributes:
       state: (row, state) float32, normalized.
       action: (row, action) float32. reward, discount: (row,) float32.
       start, end: (row,) long, first and last row of the row's episode.
-      normalization: of the states, from the training episodes.
+      normalization: normalization of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.
       latent: (row, latent) float32 of a frozen encoder (`encoded`); None elsewhere.
     """
@@ -205,7 +205,7 @@ class TrainingData:
 
         Args:
           down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
-          dtype: of pictures. out: written over, if given.
+          dtype: dtype of pictures. out: memory to write them to, if given.
         """
         if self.frames is None:
             return self.state[rows]
@@ -267,7 +267,7 @@ class TrainingData:
         Args:
           rows: (batch,) long.
           steps: (batch,) long, how far off the next observation is; None: no next observation.
-          down, right, dtype: as for `observe`. Half the bytes are half the time to write them.
+          down, right, dtype: see `observe`. Half the bytes are half the time to write them.
           reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
             memory for a large batch costs several times the work that fills it.
           pictures: give observations even if the data are encoded.
@@ -320,7 +320,7 @@ class TrainingData:
 def batches(
     draw: Callable[[int, Batch | None], Batch], first: int, last: int, workers: int = 0, ahead: int = 4
 ) -> Iterator[tuple[int, Batch]]:
-    """(step, batch) for steps first .. last - 1, in order; drawn ahead by threads where there are workers.
+    """(step, batch) for steps first .. last - 1, in order; drawn ahead by threads if there are workers.
 
     A batch is to be used before the next one is asked for: without workers its memory is used again.
 
@@ -386,12 +386,12 @@ def load_data(
     memory: int | None = None,
     scratch: str | Path | None = None,
 ) -> TrainingData:
-    """Read subsets (mixed, where there are several) for training.
+    """Read subsets (mixed, if there are several) for training.
 
     Args:
       pixels: agents see pictures; else states.
       stack: frames an observation.
-      seed: of the episode split and of shares.
+      seed: seed of the episode split and of shares.
       memory: bytes of pictures to hold at most; larger data are mapped into memory from a file.
       scratch: folder of that file; the system's folder of temporary files by default.
 

@@ -23,7 +23,7 @@ from dmcvb_gen.files import sha256_file
 from dmcvb_gen.registry import Registry
 
 EMA_DECAY = 0.99
-"""Of LFD's target encoder and TD3-BC's target networks."""
+"""Decay of LFD's target encoder and TD3-BC's target networks."""
 LEARNING_RATE = 1e-3
 
 
@@ -35,7 +35,7 @@ class Batch:
       observation, next_observation: what the agent sees at t and t + k; None if nobody asks for it.
       state: (batch, state) normalized state at t.
       action: (batch, action) in [-1, 1].
-      reward, discount: (batch,) of the action at t; discount 0 where the task ended the episode.
+      reward, discount: (batch,) of the action at t; discount 0 if the task ended the episode.
       k: (batch,) long, how many steps lie between the two observations.
       latent, next_latent: (batch, latent) of a frozen encoder, of data that are encoded once; None elsewhere.
     """
@@ -77,8 +77,8 @@ class Learner(nn.Module, abc.ABC):
 
     Attributes:
       optimizers: by name; each holds the parameters that its loss moves and no others.
-      half: compute losses in bfloat16 where autocast finds it safe; weights and optimizers stay float32.
-      encoder: phi, where there is one.
+      half: compute losses in bfloat16 if autocast finds it safe; weights and optimizers stay float32.
+      encoder: phi, if there is one.
     """
 
     needs_next = False

@@ -19,7 +19,7 @@ HIDDEN = (256, 256)
 """Hidden layers of every MLP."""
 
 ACTIVATIONS = {"gelu": nn.GELU, "relu": nn.ReLU}
-"""What may stand behind a convolution."""
+"""Activations that may follow a convolution."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Architecture:
     """The convolutions of an encoder; its decoder has the same ones in reverse.
 
     Attributes:
-      channels: of each convolution's output. strides: of each.
+      channels: channels of each convolution's output. strides: stride of each convolution.
       activation: behind each convolution.
       patch: the first convolution cuts the picture into patches of its stride that do not overlap; it is 3x3 otherwise,
         as all others are.
@@ -119,7 +119,7 @@ class FrameDifferences(nn.Conv2d):
     pictures.
 
     Args:
-      channels: of the stack, oldest frame first. frames: of the stack.
+      channels: channels of the stack, oldest frame first. frames: frames of the stack.
     """
 
     def __init__(self, channels: int, out: int, kernel: int, stride: int, padding: int, frames: int):
@@ -143,7 +143,7 @@ class Convolutions(nn.Sequential):
     Weights lie in memory with the channels last, which makes the kernels a fifth faster on a CPU.
 
     Args:
-      frames: of the stack that the channels hold; only an architecture with `differences` asks.
+      frames: frames of the stack that the channels hold; only an architecture with `differences` asks.
     """
 
     def __init__(self, channels: int, size: int = 64, architecture: Architecture = PAPER, frames: int = 3):
@@ -168,7 +168,7 @@ class Encoder(nn.Module):
 
     Args:
       body: `Convolutions` for pictures, `nn.Identity` for states.
-      features: what the body gives.
+      features: width of the body's output.
       latent: width of the latent.
     """
 

@@ -26,7 +26,7 @@ HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
 """At least so many batches, and transitions, of the hold-out are what a test loss is the mean of; but no more batches
 than were trained on."""
 SAVE_SECONDS = 120.0
-"""Work that a stop may cost."""
+"""Seconds of work that a stop may cost."""
 RESUME_FILE = "resume.safetensors"
 
 Curve = list[dict[str, Any]]
@@ -89,7 +89,7 @@ def draw(
 
 
 def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:
-    """Losses on held-out episodes, always on the same, at `most` so many batches; {} where nothing is held out."""
+    """Losses on held-out episodes, always on the same, at `most` so many batches; {} if nothing is held out."""
     rows, apart = data.hold_out_rows, learner.k_max if learner.needs_next else 1
     if not (rows + apart <= data.end[rows]).any():  # as few or as short episodes as that
         return {}
@@ -114,9 +114,9 @@ def train(
     """Train a learner in place.
 
     Args:
-      folder: where the state is kept while it trains; a run with such a state goes on from it.
+      folder: folder of the state while it trains; a run with such a state resumes from it.
       evaluate: gives scores of the learner, added to the curve.
-      tick: told how many steps were made since the last call.
+      tick: called with the number of steps since the last call.
 
     Raises:
       DmcvbError: the folder holds the state of another learner, or a loss is no longer finite.

@@ -17,7 +17,7 @@ from scipy.stats import bootstrap, spearmanr
 from dmcvb_gen.benchmarks.paper import paper_score
 
 SAMPLES = 2_000
-"""Of the bootstrap."""
+"""Samples of the bootstrap."""
 FEWEST = 3
 """Cells below which a rank correlation says nothing."""
 ALL = "all tasks"
@@ -29,7 +29,7 @@ class Pair:
 
     Attributes:
       task, where: the task; level, setting and agent.
-      returns: of our episodes as shares of our data's mean return, an array a seed.
+      returns: returns of our episodes as shares of our data's mean return, an array a seed.
       paper: the paper's score as a share of the paper's data.
     """
 
@@ -48,7 +48,7 @@ class Agreement:
     """Spearman's rho of the cells of a task, or of all.
 
     Attributes:
-      cells: how many. low, high: ends of its 95 % interval.
+      cells: number of cells. low, high: ends of its 95 % interval.
     """
 
     task: str

@@ -43,9 +43,9 @@ class Structure:
     """Result of the checks.
 
     Attributes:
-      checked: how many subsets, episodes, steps were looked at.
-      findings: what is wrong with the data.
-      warnings: what is odd, and may be meant: data unlike the paper's.
+      checked: number of subsets, episodes and steps that were looked at.
+      findings: faults of the data.
+      warnings: oddities that may be meant: data unlike the paper's.
     """
 
     checked: dict[str, int]
@@ -92,7 +92,7 @@ def _comparable(subset: Subset) -> bool:
 
 
 def check_paper_returns(subset: Subset) -> Iterator[Issue]:
-    """Warns where the mean return is not near the paper's table."""
+    """Warn if the mean return is not near the paper's table."""
     paper, expert = paper_returns(subset.task, subset.level), paper_returns(subset.task, "expert")
     if not paper or not len(subset.returns) or not _comparable(subset):
         return
@@ -116,7 +116,7 @@ def check_labels(subset: Subset) -> Iterator[Issue]:
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
     for episode in map(int, subset.episodes):
         video, frame, color, style = subset.episode(episode, names).values()
-        problems = [(~np.isin(style, looks) | (style != style[0]), "the maze's look is not one of its data's")]
+        problems = [(~np.isin(style, looks) | (style != style[0]), "the maze's style is not one of its split's")]
         problems += _label_problems(setting, own, video, frame, color)
         for bad, message in problems:
             if bad.any():
@@ -206,7 +206,7 @@ def check_structure(
     """All checks of a local release, or of some of its subsets.
 
     Args:
-      backgrounds: where the manifest's videos are now, if they moved.
+      backgrounds: present place of the manifest's videos, if they moved.
       tick: told the subset that is looked at: for the bytes of each few shards, for values, for labels; it is told
         beforehand how often.
       workers: processes, or a Ray cluster that sees the folder; a subset each.

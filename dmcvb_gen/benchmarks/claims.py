@@ -1,7 +1,7 @@
 """Test the paper's claims on our scores of one or more seeds.
 
 Results that differ in nothing but the seed are taken together: the mean of all their episodes; its standard error is
-that of the episodes, or of the seeds' means where these lie further apart. A difference counts from two of its
+that of the episodes, or of the seeds' means if these lie further apart. A difference counts from two of its
 standard errors on; what lies nearer is left open, whatever its sign.
 """
 
@@ -42,7 +42,7 @@ class Pooled:
     """Scores of one cell over all seeds.
 
     Attributes:
-      mean, stderr: of the returns. seeds: each seed's mean.
+      mean, stderr: mean and standard error of the returns. seeds: each seed's mean.
       data: mean return of what the policy learned from.
       like_data: the policy's episodes were cut where the data's were, so that their returns can be compared.
     """
@@ -62,9 +62,9 @@ class Answer:
     """One claim at one place.
 
     Attributes:
-      claim: of `Benchmark.claims`. where: task, data, setting, agents.
+      claim: name out of `Benchmark.claims`. where: task, data, setting, agents.
       answer: "yes", "no", or "open" where the scores do not tell.
-      numbers: what it rests on.
+      numbers: scores that it rests on.
     """
 
     claim: str
@@ -112,7 +112,9 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
         raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")
     mixed = next((names for names in data.values() if len(names) > 1), None)
     if mixed:
-        raise DmcvbError(f"scores of one cell on different data are no two seeds: {'; '.join(sorted(mixed))}")
+        raise DmcvbError(
+            f"scores of one cell come from different data, so they cannot be pooled: {'; '.join(sorted(mixed))}"
+        )
     twice = next(((key, named) for key, named in seeds.items() if len(named) > 1), None)
     if twice:
         ((place, seed), named) = twice

@@ -39,11 +39,11 @@ The observations are "pixels" (episode, stack x view x 3, size, size) uint8, old
 gives them, and "state" (episode, state) float32. A policy that asks for no pictures gets the states alone.
 """
 STREAM_NAME = "validate"
-"""Of the evaluation's streams: no release is made from it."""
+"""Name of the evaluation's random streams, from which no release is made."""
 ROUNDING = 1e-5
 """How far an action may leave [-1, 1] before it is refused: what rounding does."""
 SPLIT = "val"
-"""Of videos and maze styles: none of them is in data."""
+"""Split of the videos and maze styles that no data show."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class Score:
     """Returns of online episodes.
 
     Attributes:
-      mean, stderr: of the returns; the standard error is std / sqrt(episodes), std with n - 1.
-      returns: of each episode.
+      mean, stderr: mean and standard error of the returns; the standard error is std / sqrt(episodes), std with n - 1.
+      returns: return of each episode.
       success: share of the episodes that the task ended (mazes), else None.
       speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_speed`).
       limit: agent steps after which an episode was cut.
-      seconds: that it took.
+      seconds: time that it took.
       pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
     """
 
@@ -114,7 +114,7 @@ class EvaluationScene:
 
     Attributes:
       task, setting: e.g. "walker-walk", "dynamic"; they name the random streams, too.
-      pictures: that the policy sees.
+      pictures: pictures that the policy sees.
       size: pixels a side.
       renderer, samples: its name; samples a pixel, None for the renderer's default.
       backgrounds: "builtin" or a folder of videos.
@@ -154,7 +154,7 @@ class EvaluationScene:
 
 
 def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
-    """Mean speed towards the goal of the episodes that reached it, m/s; None where none did.
+    """Mean speed towards the goal of the episodes that reached it, m/s; None if none did.
 
     Args:
       distance: (episode,) to the goal at the start in a straight line, meters.
@@ -170,14 +170,14 @@ class Evaluator:
     Args:
       where: the scene, or a subset whose task, setting, size and renderer are evaluated on.
       pixels: the policies see pictures; else states.
-      normalization: of the states, for learned policies that see them.
+      normalization: normalization of the states, for learned policies that see them.
       stack: frames an observation.
       episodes: run side by side, each once.
-      seed: of the evaluation's streams.
+      seed: seed of the evaluation's streams.
       pair: the fixed (start, goal) cells of a maze's episodes, instead of random ones.
       max_steps: cut episodes short (for tests and smoke runs).
-      backgrounds: where the `val` videos are, if not where the manifest says.
-      device: of policy and renderer.
+      backgrounds: folder of the `val` videos, if not the manifest's.
+      device: device of policy and renderer.
 
     Raises:
       DmcvbError: the renderer cannot start here, or there are no `val` videos.
@@ -359,8 +359,8 @@ def evaluate(
       policy: takes {"pixels": (episode, stack x view x 3, size, size) uint8, "state": (episode, state) float32} and
         gives (episode, action) in [-1, 1], as a numpy array or anything that numpy can read.
       where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible".
-      episodes: how many, each once.
-      seed: of starts and distractors; `validate` has 0.
+      episodes: number of episodes, each run once.
+      seed: seed of starts and distractors; `validate` has 0.
       stack: frames an observation; the first one of an episode is repeated.
       pixels: give pictures; without them an evaluation takes seconds.
       size: pixels a side. renderer: its name. backgrounds: "builtin" or a folder of videos.

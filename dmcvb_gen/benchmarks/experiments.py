@@ -152,7 +152,7 @@ def _load_encoder(setup: Setup, work: Pretraining, encoder: nn.Module) -> None:
 
 
 def encoded(setup: Setup, encoder: nn.Module, data: TrainingData) -> TrainingData:
-    """Data of a frozen encoder: its latents are computed once where the profile does not shift pictures."""
+    """Data of a frozen encoder: its latents are computed once if the profile does not shift pictures."""
     if setup.profile.frozen_shift:
         return data
     return data.encoded(encoder, torch.bfloat16 if setup.precision == "bfloat16" else torch.float32)
@@ -347,7 +347,7 @@ class DataScore:
     """Score of the episodes that a policy learned from.
 
     Attributes:
-      mean: of the returns.
+      mean: mean of the returns.
       success: share that reached the goal (mazes), else None. speed: towards it of those, m/s (mazes), else None.
       limit: agent steps that they were cut at.
     """
@@ -401,7 +401,7 @@ def inspect(
     """Measure what a frozen encoder still knows: test errors of decoders of its observations and states (section 5.1).
 
     Args:
-      folder: where the decoders' states are kept while they train, one in a folder each.
+      folder: folder of the decoders' states while they train, a folder each.
     """
     curves: dict[str, Curve] = {}
     errors: dict[str, Any] = {}

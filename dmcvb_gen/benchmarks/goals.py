@@ -32,7 +32,7 @@ class GoalPairs:
 
 
 def goal_pairs(subset: Subset) -> GoalPairs:
-    """Which pairs a subset has, by its record; by the episodes' own labels where that does not say it (imported)."""
+    """Which pairs a subset has, by its record; by the episodes' own labels if that does not say it (imported)."""
     per_goal = subset.record.episodes_per_goal
     if per_goal is None:
         return GoalPairs(tuple(int(pair) for pair in np.unique(subset.read("goal_pair")) if pair >= 0))

@@ -63,11 +63,11 @@ class Row(BaseModel):
 
     Attributes:
       agent: e.g. "state-bc". trained: profile of its training. seed: of its training.
-      task, setting: that it is evaluated on. data: what it learned from, e.g. "expert". data_episodes: how many.
+      task, setting: evaluation's. data: data that it learned from, e.g. "expert". data_episodes: their number.
       data_return: their mean return. paper: the paper's mean score of that agent on a million steps, if it has one.
       command: that made the score, run beside the release. made: date. generator: version. processor, precision: that
         trained it.
-      returns: of each evaluation episode.
+      returns: return of each evaluation episode.
       policy: SHA-256 of the policy file beside the row; None if there is none.
     """
 
@@ -254,9 +254,9 @@ class Check:
     """A row and its score, computed again.
 
     Attributes:
-      returns: of each episode, now; empty if there is no policy file.
-      holds: whether the score is the row's within three standard errors; None if it cannot be computed.
-      why: in words.
+      returns: return of each episode, now; empty if there is no policy file.
+      holds: True if the score is the row's within three standard errors; None if it cannot be computed.
+      why: reason in words.
     """
 
     row: Row

@@ -27,7 +27,7 @@ class AgentData:
 
     Attributes:
       sources: one a subset, all steps of its training episodes (`StepSource`: len(), [i] and gather(), numpy alone).
-      task, setting: that its policy is scored on. seed: of the validation.
+      task, setting: scene of its policy's score. seed: seed of the validation.
     """
 
     sources: tuple[StepSource, ...]

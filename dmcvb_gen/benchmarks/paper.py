@@ -18,7 +18,7 @@ def _table() -> dict[tuple[str, str, str, str], tuple[float, float]]:
 
 
 def paper_score(task: str, level: str, setting: str, agent: str | None) -> tuple[float, float] | None:
-    """(mean, standard error) of the published score; None where the paper has none.
+    """(mean, standard error) of the published score; None if the paper has none.
 
     Args:
       level: "expert", ..., or "expert+medium".

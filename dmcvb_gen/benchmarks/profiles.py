@@ -20,7 +20,7 @@ class Profile:
       readout_steps: Adam steps of each decoder on a frozen encoder; 0: no inspection.
       evaluations: online evaluations, evenly over a policy's training. Of several the best one counts, as in the paper,
         which makes the score somewhat too high.
-      episodes: of each evaluation.
+      episodes: episodes of each evaluation.
       episode_steps: agent steps an evaluation's episode is cut to; None: whole episodes.
       batch_size: transitions an Adam step.
       state_batch_size: the same of agents that see states.
@@ -30,7 +30,7 @@ class Profile:
       frozen_shift: likewise while a policy or decoder learns on a frozen encoder. Without shifts every observation is
         encoded once, and its latent kept.
       decay: the learning rate falls to zero over each training, instead of staying as the paper's.
-      scores: whether its scores mean anything.
+      scores: True if its scores mean anything.
       note: printed wherever a score stands.
     """
 

@@ -146,13 +146,13 @@ def release_episodes(release: Release) -> tuple[dict[str, int], dict[str, int]]:
 def compare(cell: Cell, results: Results) -> dict[str, Any]:
     """A score beside that of the cell's reference (`Benchmark.reference`).
 
-    A share means something where 0 is the least that an episode can return; elsewhere (mazes: -800 is not "twenty
+    A share means something if 0 is the least that an episode can return; elsewhere (mazes: -800 is not "twenty
     times" -40) the difference stands.
 
     Returns:
-      share, paper_share: of the reference's score, ours and the paper's; None where there is none.
-      difference: from the reference's score; None where there is none.
-      reference: what it refers to.
+      share, paper_share: shares of the reference's score, ours and the paper's; None if there is none.
+      difference: from the reference's score; None if there is none.
+      reference: words for what it refers to.
     """
     benchmark = BENCHMARKS.get(cell.benchmark)
     scores = {other: result["score"]["mean"] for other, result in results if "error" not in result}
@@ -346,7 +346,7 @@ def _groups(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
 
 
 def _number(value: float) -> str:
-    """A return: one decimal where that is worth something."""
+    """A return: one decimal if that is worth something."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
@@ -370,7 +370,7 @@ def _score(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _goal_lines(score: Mapping[str, Any]) -> list[str]:
-    """Success and speed, where a task has a goal."""
+    """Success and speed, if a task has a goal."""
     if score["success"] is None:
         return []
     lines = [f"success {100 * score['success']:.0f} %"]

@@ -37,7 +37,7 @@ def run_cells(
     Args:
       workers: processes (started fresh, never forked), which share the memory for pictures; 1: all in this one; or a
         Ray cluster whose nodes see the release and the report's folder.
-      tick: told what is trained and how many Adam steps were made.
+      tick: called with what is trained and the number of Adam steps made.
 
     Raises:
       StoreError: a worker was killed; finished cells are kept.
@@ -48,7 +48,7 @@ def run_cells(
         torch.set_num_threads(setup.threads)
     elif isinstance(workers, int):
         setup = share_memory(setup, workers)
-    kept = "finished cells are kept: run the same command again"
+    kept = "finished cells are kept: rerun the same command"
     with open_pool(workers, threads=setup.threads, tick=tick, kept=kept, needs=needs_of(setup)) as pool:
         setup = share_node(setup, pool.memory_each())
         for work in encoders:
@@ -83,7 +83,7 @@ def needs_of(setup: Setup) -> Needs:
 
 
 def share_node(setup: Setup, memory: int | None) -> Setup:
-    """The setup of cells that have `memory` bytes each; pictures take half of them, as they do where one is alone."""
+    """The setup of cells that have `memory` bytes each; pictures take half of them, as they do if one is alone."""
     if setup.memory is not None or memory is None or setup.device != "cpu":
         return setup
     return dataclasses.replace(setup, memory=memory // 2)

@@ -45,7 +45,7 @@ class Setup:
       precision: "float32" or "bfloat16", of losses on pictures.
       memory: bytes of pictures held at most, over all workers (on a cluster: by each cell); None: half of what is free
         (on a cluster: of a cell's share of its node).
-      run: of one run's cells, so that a process opens the release for the first of them; "": for each.
+      run: label of one run's cells, so that a process opens the release for the first of them; "": for each.
     """
 
     root: str
@@ -156,7 +156,7 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
 
 
 def read_result(path: Path, wanted: str | None = None) -> dict[str, Any] | None:
-    """A result file, or None where there is none with that fingerprint."""
+    """A result file, or None if there is none with that fingerprint."""
     try:
         result = json.loads(path.read_text())
     except (OSError, ValueError):

@@ -23,7 +23,7 @@ from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, LEVELS, VISIBLE, is_maze, su
 FIXED_GOALS = 5
 """Fixed (start, goal) pairs a layout, as the paper made them."""
 DEFAULT_EPISODES = 100
-"""That a command asks for where the release has none to go by."""
+"""Episodes that a command asks for if the release has none to go by."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Cell:
 
     Attributes:
       policy: parts that the policy learns from; it is evaluated in the task and setting of the first.
-      pretrain: parts that the encoder learns from; the policy's, where empty.
+      pretrain: parts that the encoder learns from; the policy's, if empty.
     """
 
     benchmark: str
@@ -100,7 +100,7 @@ class Missing:
 
     Attributes:
       subsets: those that the release lacks.
-      command: how to get those.
+      command: command that gets those.
       left_out: those that the release has and the user left out.
     """
 
@@ -138,7 +138,7 @@ class SubsetFinder:
         return [level for level in LEVELS if (task, level, setting) in self._names]
 
     def find(self, task: str, levels: Iterable[str], setting: str) -> tuple[str, ...] | None:
-        """Names of the subsets, or None where one is missing (which is then noted)."""
+        """Names of the subsets, or None if one is missing (which is then noted)."""
         lacking = [(level, setting) for level in levels if (task, level, setting) not in self._names]
         if lacking:
             self._asked.setdefault(task, []).extend(lacking)
@@ -150,7 +150,7 @@ class SubsetFinder:
         return names and tuple(Part(name, **share) for name in names)
 
     def first(self, task: str, level: str, setting: str, most: int) -> tuple[Part, ...] | None:
-        """Some episodes of a subset, all of them where it has no more than that."""
+        """Some episodes of a subset, all of them if it has no more than that."""
         names = self.find(task, [level], setting)
         return names and tuple(Part(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
 
@@ -196,7 +196,7 @@ class Benchmark(abc.ABC):
     """A benchmark: which cells a release has the data for, and what their scores are set beside.
 
     Attributes:
-      name: that it is registered under. title: of its table in the report.
+      name: name that it is registered under. title: title of its table in the report.
       agents: names of the agents that it runs unless others are asked for.
       compares_encoders: its agents are those with a pre-trained encoder; it sets BC beside them by itself.
     """
@@ -264,7 +264,7 @@ def plan_benchmark(
     """The cells that a release has the data for, and what is missing for the others.
 
     Args:
-      name: of a registered benchmark.
+      name: name of a registered benchmark.
       agents: names instead of the benchmark's own. B2 and B3 compare encoders: of these, they take those that have one
         of their own, beside BC without.
       left_out: subsets that are there but that the user left out of `release`.

@@ -35,7 +35,7 @@ def save_agent(
     """Write a trained policy.
 
     Args:
-      sizes, network: that it was made for. normalization: of the states that it learned from.
+      sizes, network: sizes and network of the agent. normalization: normalization of the states that it learned from.
     """
     facts = {
         "format": FORMAT,
@@ -56,7 +56,7 @@ class TrainedAgent:
     """A trained policy, to call with a batch of observations as `dmcvb_gen.evaluate` gives them.
 
     Attributes:
-      agent: by name, e.g. "id+bc". sizes: of its observations and actions.
+      agent: its name, e.g. "id+bc". sizes: sizes of its observations and actions.
     """
 
     agent: Agent

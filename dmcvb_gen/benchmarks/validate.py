@@ -40,9 +40,9 @@ class Validation:
     """Result of a validation.
 
     Attributes:
-      structure: of the release.
+      structure: result of the structure checks.
       results: (cell, result) of every cell; a result of {"error": ...} failed.
-      missing: what the benchmarks would need besides.
+      missing: subsets that the benchmarks would need besides.
       episodes: committed, and asked for by the manifest.
       report: the page. facts: the JSON file beside it.
     """
@@ -120,7 +120,7 @@ def make_setup(
       path: the release's folder.
       out: folder of the report, by default reports/<the release's folder>.
       profile: "smoke", "brief", "quick" or "paper". scale: factor of its steps.
-      workers: that share the cores; each gets as many threads as are left, on a cluster one.
+      workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
       precision: "auto" times float32 and bfloat16 and takes the faster one.
       memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
       training: False if only the structure is checked, which needs no probe of the precision.
@@ -160,11 +160,11 @@ def validate(
     Args:
       path: the release's folder.
       setup: profile, report folder, device.
-      benchmarks: of registered benchmarks; none: structure checks alone.
+      benchmarks: names of registered benchmarks; none: structure checks alone.
       agents: instead of each benchmark's own.
       patterns: only these subsets.
       workers: subsets checked and cells trained side by side, or a Ray cluster that sees the same folders.
-      train_unsound: run the benchmarks even where a structure check fails.
+      train_unsound: run the benchmarks even if a structure check fails.
 
     Raises:
       DmcvbError: there is no release, or a name is unknown, or the release has no data for a benchmark asked for, or

@@ -14,10 +14,10 @@ from dmcvb_gen.text import pluralize
 
 @command_of(commands.paint)
 def paint(release, as_json, **options):
-    """Fill in the pictures of a release that travelled without, and compare them with their known digests.
+    """Render the images of a release stored without pixels, and compare them with their known digests.
 
-    What is painted already stays; run again, it goes on. With --size, --views or --goal it becomes another release,
-    and its manifest says so. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 where pictures differ
+    Rerun the command to resume. With --size, --views or --goal it becomes another release,
+    and its manifest says so. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 if pictures differ
     from the known ones.
 
     \b

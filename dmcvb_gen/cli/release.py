@@ -110,10 +110,10 @@ def repaint(release, out, as_json, **options):
 
 @command_of(commands.publish, "release", "url")
 def publish(release, url, as_json, **options):
-    """Put a complete release at a URL: every file checked, the manifest last, a published version never changed.
+    """Upload a complete release: every file is checked, and the manifest comes last.
 
-    Run again after an interruption, it goes on. Credentials come from the environment. Of an export (`export`), the
-    files alone go there; one of LeRobot gets its tag on the Hub.
+    A published version never changes. Rerun the command to resume. Credentials come from the environment. An export can
+    be uploaded too; LeRobot's gets its tag on the Hub.
 
     \b
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
@@ -155,9 +155,9 @@ def card(path, check, out, url, as_json):
 
 @command_of(commands.export)
 def export(release, to, out, as_json, **options):
-    """Write subsets in another format: a folder a subset, nothing is written over. Run again, it goes on.
+    """Write subsets in another format: a folder for each subset. Rerun the command to resume.
 
-    A subset that is not whole is refused, unless --episodes names what is there.
+    An incomplete subset is refused, unless --episodes names what is there.
 
     \b
     dmcvb-gen export releases/mini --to hdf5 --only 'walker-walk/*/none' --out exports/mini
@@ -179,7 +179,7 @@ def export(release, to, out, as_json, **options):
 def import_command(folder, task, level, setting, name, partial, out, as_json):
     """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.
 
-    Run again, it goes on where it stopped.
+    Rerun the command to resume.
 
     \b
     dmcvb-gen import dmc_vb/locomotion --out releases/original
@@ -200,7 +200,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
 @remote_option
 @json_option
 def diff_command(one, other, data, options, as_json):
-    """Say which subsets, episodes and digests differ between two releases, by their manifests and commit records.
+    """Compare two releases by their manifests and commit records: subsets, episodes and digests.
 
     With --data, also compare the values: each z is the difference of the means in standard deviations of the first
     release. Exit code 0 when nothing differs, 1 when something does.

@@ -29,8 +29,8 @@ TRAINING = (
 def validate(own, strict, as_json, **options):
     """Check a release and run the paper's benchmarks on it, scores set beside the paper's.
 
-    Exit code 0 when sound and complete, 1 when a check or a cell fails or episodes are missing, 2 on bad usage. The
-    same command goes on where it stopped.
+    Exit code 0 when sound and complete, 1 when a check or a cell fails or episodes are missing, 2 on bad usage. Rerun
+    the command to resume.
 
     \b
     dmcvb-gen validate releases/mini --profile smoke

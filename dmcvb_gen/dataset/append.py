@@ -34,7 +34,7 @@ def taken_up(root: Path, asked: Manifest) -> Manifest:
 
 
 def merged(old: Manifest, asked: Manifest, place: str) -> Manifest:
-    """`old`, grown by what `asked` has more; `old` itself where that is nothing.
+    """`old`, grown by what `asked` has more; `old` itself if that is nothing.
 
     Raises:
       StoreError: a subset is there in another form, or cannot grow.

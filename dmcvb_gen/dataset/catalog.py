@@ -13,7 +13,7 @@ def releases_at(url: str, options: dict[str, Any] | None = None) -> list[dict[st
     """The release at a URL, or those in the folders right below it; what is being published is none yet.
 
     Args:
-      options: of fsspec.
+      options: options of fsspec.
 
     Returns:
       A dictionary a release: url, name, version, subsets, episodes, complete, digest.

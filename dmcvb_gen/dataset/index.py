@@ -51,8 +51,8 @@ class Index(pydantic.BaseModel):
     """files.json: every file of a release but its manifest and itself.
 
     Attributes:
-      manifest_sha256: of the manifest's bytes.
-      files: in the order of their paths.
+      manifest_sha256: digest of the manifest's bytes.
+      files: files in the order of their paths.
       sha256: of this index's content; None in releases of version 1.
     """
 
@@ -106,7 +106,7 @@ def parse_index(text: bytes, where: str = INDEX) -> Index:
 
 
 def read_index(root: Path) -> Index | None:
-    """A local release's index; None where there is none (while it is made, and in releases of version 1).
+    """A local release's index; None if there is none (while it is made, and in releases of version 1).
 
     Raises:
       StoreError: it is damaged.
@@ -199,7 +199,7 @@ def write_release(root: Path, manifest: Manifest, commits: dict[str, dict[int, C
 
 
 def take_in_card(root: Path) -> None:
-    """List the card's files, as they are now, in a release's index (where it has one)."""
+    """List the card's files, as they are now, in a release's index (if it has one)."""
     index = read_index(root)
     if index is None or index.sha256 is None:
         return
@@ -231,8 +231,8 @@ def refuse_altered(listed: Iterable[FileRecord], digest: Callable[[str], str | N
     """Keep damage from becoming what is right: a release whose digests are to be made anew must have its old ones.
 
     Args:
-      listed: of the release as it is, see `metadata_files`.
-      digest: of a path in the release, None where nothing is.
+      listed: files of the release as it is, see `metadata_files`.
+      digest: digest of a path in the release, None if nothing is.
 
     Raises:
       StoreError: one of them is missing, or not what it was.

@@ -67,9 +67,9 @@ class CommitRecord(_Model):
     """A shard that is whole: which episodes, which files. A shard without its record does not exist.
 
     Attributes:
-      environment: what made it, see `environment`; empty in releases of version 1.
-      painted: whether its pictures are among the files.
-      pictures: files that its pictures had where they were painted, for whoever paints them again; empty where they
+      environment: environment that made it, see `environment`; empty in releases of version 1.
+      painted: True if its pictures are among the files.
+      pictures: files that its pictures had where they were painted, for whoever paints them again; empty if they
         are stored, or never were painted.
     """
 
@@ -104,16 +104,16 @@ class SubsetRecord(_Model):
     """One subset: what it was asked to be.
 
     Attributes:
-      family: of its task, "locomotion" or "ant-maze".
+      family: family of its task, "locomotion" or "ant-maze".
       views: names of the pictures of a frame, in the order in which policies see them.
-      hidden_goal: whether the pictures that the subset is about have no goal in them (both kinds may be stored).
+      hidden_goal: True if the pictures that the subset is about have no goal in them (both kinds may be stored).
       max_steps: transitions at which the time limit ends an episode.
       fixed_goals, episodes_per_goal: how many pairs of start and goal there are, and how many episodes each has; what
-        is at hand may be fewer. None where both are drawn for each episode.
+        is at hand may be fewer. None if both are drawn for each episode.
       split: the videos and styles that it was painted with, "train" or "val".
-      pixels: whether pictures are stored; without them, they can be painted from physics states and labels.
-      only_shown: whether only the pictures that the subset is about are stored; else, where the task has a goal, those
-        with it and those without it. Left out of the JSON where it is false, as it is in older releases.
+      pixels: True if pictures are stored; without them, they can be painted from physics states and labels.
+      only_shown: whether only the pictures that the subset is about are stored; else, if the task has a goal, those
+        with it and those without it. Left out of the JSON if it is false, as it is in older releases.
     """
 
     name: RelativePath
@@ -185,9 +185,9 @@ class VersionEntry(_Model):
     """One growth of a release.
 
     Attributes:
-      version: of the release since then.
+      version: version of the release since then.
       recipe: the resolved recipe that was added.
-      generator: what added it.
+      generator: program that added it.
       subsets: name -> (first, last + 1) of the episodes that it added.
     """
 
@@ -208,11 +208,11 @@ class Manifest(_Model):
 
     Attributes:
       recipe: the resolved recipe that made it, in its first version.
-      additions: what it was grown by since, in order.
+      additions: its growths since, in order.
       environments: versions and platform of every process that added to it, in order.
       lineage: for a release derived from another one (repaint, fetch, import): what from.
-      complete: whether every shard of every subset is committed; `digest`s are set then.
-      digest: of every file of the release, see `dmcvb_gen.dataset.index`; None while it is made.
+      complete: True if every shard of every subset is committed; `digest`s are set then.
+      digest: digest of every file of the release, see `dmcvb_gen.dataset.index`; None while it is made.
     """
 
     schema_version: int = SCHEMA_VERSION

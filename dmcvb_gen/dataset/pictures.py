@@ -38,8 +38,8 @@ class Pictures:
     """The pictures of a subset that somebody may look at.
 
     Attributes:
-      views: in the task's order; ("pixels",) for a task with one.
-      hide_goal: whether the goal is left out of them.
+      views: views in the task's order; ("pixels",) for a task with one.
+      hide_goal: True if the goal is left out of them.
     """
 
     views: tuple[str, ...]
@@ -51,7 +51,7 @@ class Pictures:
         return picture_arrays(self.views, self.hide_goal)
 
     def select(self, views: Sequence[str] | None) -> Pictures:
-        """The asked views alone, in the asked order; all where none are asked for (None).
+        """The asked views alone, in the asked order; all if none are asked for (None).
 
         Args:
           views: names of views ("top"), or of picture arrays ("pixels/top"), but of no array that shows what these
@@ -83,7 +83,7 @@ def stored_pictures(record: SubsetRecord, goal: bool) -> tuple[str, ...]:
     """Names of the picture arrays that a subset stores (once they are painted); none of a subset without pictures.
 
     Args:
-      goal: whether its task has a goal that can be left out of pictures.
+      goal: True if its task has a goal that can be left out of pictures.
     """
     if not record.pixels:
         return ()
@@ -102,10 +102,10 @@ def picture_of(array: str) -> tuple[str, bool] | None:
 
 def shown(subset: HasRecord | SubsetRecord, views: Sequence[str] | None = None) -> Pictures:
     """The pictures that a subset (or the subset of a record) shows: all its views, in the task's order, the goal
-    hidden where its setting says so; whether they are stored or not.
+    hidden if its setting says so; whether they are stored or not.
 
     Args:
-      views: of them, these alone, in this order.
+      views: only these views, in this order.
 
     Raises:
       UnknownNameError: no such view.

@@ -96,7 +96,7 @@ class Subset:
     """One subset of a release, read-only.
 
     Attributes:
-      record: what the manifest says of it.
+      record: its entry in the manifest.
       commits: shard -> commit record, of the committed shards.
     """
 

@@ -51,10 +51,10 @@ class ArraySpec:
     Attributes:
       name: path inside the group, e.g. "pixels" or "exogenous/camera_position".
       dtype: numpy name.
-      shape: shape of one step, or of one episode's entry where `steps` is false.
+      shape: shape of one step, or of one episode's entry if `steps` is false.
       dims: names of the axes of `shape`.
-      steps: whether the array has a step axis.
-      picture: whether it holds pictures (another chunking and codec).
+      steps: True if the array has a step axis.
+      picture: True if it holds pictures (another chunking and codec).
       attributes: stored with the array.
     """
 
@@ -73,7 +73,7 @@ class EpisodeShape:
 
     Attributes:
       views: names of the pictures of a frame, in their order; ("pixels",) for one.
-      goal: whether there are pictures with the goal hidden beside them.
+      goal: True if there are pictures with the goal hidden beside them.
       state_fields: name -> (first, last + 1) in the state.
       action_size, state_size, physics_size: entries of one step.
       materials: materials whose colors are labels.
@@ -223,7 +223,7 @@ def create_arrays(
       episodes: episodes the subset will have.
       rows: rows of the step axis, max_steps + 1.
       episodes_per_shard: episodes a shard file.
-      schema_version: of the release; a shard of an older one is made again where it lay.
+      schema_version: version of the release's schema; a shard of an older one is made again where it lay.
     """
     for spec in specs:
         if not spec.steps:

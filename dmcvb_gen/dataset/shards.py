@@ -56,7 +56,7 @@ NOTHING: Mapping[str, str] = {}
 def read_commit(
     root: Path, record: SubsetRecord, shard: int, known: Mapping[str, str] = NOTHING
 ) -> CommitRecord | None:
-    """The shard's commit record, None where it is missing, unreadable or another shard's.
+    """The shard's commit record, None if it is missing, unreadable or another shard's.
 
     Args:
       known: path in the release -> SHA-256 of files that are known; a record with another is as good as none.

@@ -1,7 +1,7 @@
 """Store equal files of a release once, as hard links.
 
 The settings of a task and level share their episodes by default, so their states, actions, rewards and physics are
-equal byte for byte. Where the file system has hard links, these take room once. Every subset stays complete by itself
+equal byte for byte. If the file system has hard links, these take room once. Every subset stays complete by itself
 and no reader notices. Writers put new files in the place of old ones and never write into a file, so linked files do
 not change each other.
 """

@@ -128,7 +128,7 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
     Data are never at risk: where shards are committed, only metadata that is missing is written.
 
     Args:
-      attributes: of the group; its "schema_version" decides where arrays lie.
+      attributes: attributes of the group; its "schema_version" decides where arrays lie.
 
     Raises:
       StoreError: the folder cannot be written.
@@ -179,8 +179,8 @@ def add_arrays(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], r
     """Give a subset that has shards already more arrays (metadata alone); its data, and labels a pixel, stay.
 
     Args:
-      specs: of all arrays that the subset then has.
-      attributes: of the group, see `create_subset`.
+      specs: specs of all arrays that the subset then has.
+      attributes: attributes of the group, see `create_subset`.
 
     Raises:
       StoreError: the folder cannot be written.
@@ -219,7 +219,7 @@ def write_shard(
       arrays: (name, values (episode of the shard, ...)) pairs, taken one after the other, so that a caller
         may make the big ones as they are asked for.
       lengths: (episode of the shard,) transitions of each episode.
-      environment: what made them, by default this machine's with pictures painted on the CPU.
+      environment: environment that made them; by default this machine's, with pictures painted on the CPU.
       written: arrays of the same shard of sibling subsets; equal ones become links to them.
 
     Raises:
@@ -260,7 +260,7 @@ def write_pictures(
     Args:
       commit: the shard's record.
       arrays: picture arrays, see `write_shard`.
-      environment: what painted them; kept where it is what made the rest.
+      environment: environment that painted them; kept if it is what made the rest.
 
     Returns:
       The new record.
@@ -288,7 +288,7 @@ def write_pictures(
 def _cannot_write(root: Path, subset: SubsetRecord, shard: int, error: OSError) -> StoreError:
     return StoreError(
         f"cannot write shard {shard} of {subset.name} to {root}: {error.strerror or error}; what was committed "
-        "is safe, make room and run the same command again"
+        "is safe, make room and rerun the same command"
     )
 
 
@@ -357,7 +357,7 @@ def _write_arrays(
         elif np.any(values):
             raise StoreError(
                 f"{file} vanished while it was written: another process writes the same release; let one of the "
-                "two go on, and run the same command again"
+                "two go on, and rerun the same command"
             )
     return files
 
@@ -417,7 +417,7 @@ def finish_release(
     """Write the digests: of every file, of the subsets that are whole; the manifest is complete when all are.
 
     Args:
-      known: subset -> shard -> record of the shards that are committed, where the shards are not in the folder.
+      known: subset -> shard -> record of the shards that are committed, if the shards are not in the folder.
     """
     subsets, complete, made, found = [], True, [], {}
     for subset in manifest.subsets:

@@ -49,8 +49,8 @@ class Backgrounds:
     Attributes:
       source: "builtin" or the folder.
       split: "train" or "val".
-      names: of the videos, in order.
-      files: of each video, in order: one, or a picture a frame.
+      names: names of the videos, in order.
+      files: files of each video, in order: one, or a picture a frame.
       lengths: frames of each video.
       digest: SHA-256 over the decoded frames of all videos.
 

@@ -25,7 +25,7 @@ class Scene:
     Attributes:
       task: the task that is shown.
       setting: kind and difficulty; ranges are multiples of its `scale`.
-      episodes, frames: how many episodes, and frames an episode at most.
+      episodes, frames: number of episodes, and of frames an episode at most.
       backgrounds: the videos; None if the setting is "none".
       split: "train" or "val", which maze styles.
     """
@@ -75,12 +75,12 @@ class DistractorPart(abc.ABC):
         Args:
           found: all labels by name, with a leading shape of (episode,) or (episode, frame).
           actions: (..., action), the action before each frame; zeros before the first one.
-          frames: as for `labels`.
+          frames: see `labels`.
         """
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
-        """The labels of the task as it is, where the setting leaves this distractor out; as `labels`."""
+        """The labels of the task as it is, if the setting leaves this distractor out; as `labels`."""
         raise NotImplementedError
 
 

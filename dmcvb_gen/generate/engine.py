@@ -51,7 +51,7 @@ class Episodes:
       physics: (episode, row, physics) float64.
       length: (episode,) int32, transitions of each.
       arrays: the values to store beside pictures and labels, by name.
-      labels: of the distractors, (episode, row up to the longest episode's last); None: drawn from the streams.
+      labels: labels of the distractors, (episode, row up to the longest episode's last); None: drawn from the streams.
       seconds: time spent so far, by part.
     """
 
@@ -82,7 +82,7 @@ def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobR
     """Take the states of a job's episodes, render them for each subset, and commit the shards.
 
     Args:
-      threads: of the physics.
+      threads: threads of the physics.
       tick: called with the number of frames rendered since the last call.
 
     Returns:
@@ -119,7 +119,7 @@ def simulated_episodes(
     """Simulate the episodes of a job.
 
     Args:
-      threads: of the physics.
+      threads: threads of the physics.
       episodes, max_steps: others than the job's, for estimates.
     """
     record = job.subsets[0]
@@ -145,7 +145,7 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
     """The policies of a subset (uniform random actions without files), read once in each process.
 
     Args:
-      digests: of the policies, so that a file that was replaced is read again.
+      digests: digests of the policies, so that a file that was replaced is read again.
     """
     task = get_task(task_name)
     loaded = [load_policy(path, task) for path in files]

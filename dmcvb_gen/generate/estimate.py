@@ -45,7 +45,7 @@ class Rate:
     """Measured on a few episodes of one task, level and setting.
 
     Attributes:
-      seconds_per_step: of one core, for simulating, painting and storing one setting.
+      seconds_per_step: seconds of one core that simulate, paint and store a step of one setting.
       bytes_per_step: stored.
       shared_bytes_per_step: the part of them that is equal in all subsets of a job, which links store once.
       steps_per_episode: mean length.

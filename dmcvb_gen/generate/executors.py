@@ -39,7 +39,7 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallba
         committed is safe.
     """
     check_memory(jobs, workers)
-    kept = "what was committed is safe: run the same command again (fewer --episodes-per-shard need less memory)"
+    kept = "finished shards are saved: rerun the same command (fewer --episodes-per-shard need less memory)"
     alone = workers == 1 or len(jobs) <= 1 and isinstance(workers, int)
     with open_pool(workers, tick=progress, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
         for job in jobs:

@@ -36,7 +36,7 @@ def release_inputs(root: Path, records: Iterable[SubsetRecord], backgrounds: str
 
     Args:
       root: the release's folder, which has copies of what the package does not bring.
-      backgrounds: where the videos are now, instead of where the manifest says.
+      backgrounds: folder of the videos, instead of the manifest's.
 
     Raises:
       StoreError: a policy or the videos are not there, or not those of the manifest.
@@ -84,7 +84,7 @@ def background_source(root: Path, record: SubsetRecord, moved: str | None = None
     """Find a subset's videos and compare them with the manifest's digest.
 
     Args:
-      moved: where they are now, instead of where the manifest says.
+      moved: folder of the videos, instead of the manifest's.
 
     Raises:
       StoreError: they are other videos, or not there.
@@ -108,7 +108,7 @@ def video_source(root: str | Path, record: SubsetRecord, moved: str | None = Non
 
     Args:
       root: the release's folder, which has copies of videos that the package does not bring.
-      moved: where they are now, instead of where the manifest says.
+      moved: folder of the videos, instead of the manifest's.
     """
     source = moved or (record.backgrounds or {}).get("source", BUILTIN)
     inside = not (moved or source == BUILTIN or Path(source).is_absolute())  # absolute: in releases of version 1

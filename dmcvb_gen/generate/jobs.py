@@ -47,7 +47,7 @@ class Job:
       inputs: policies and videos; None: the release's own copies.
       seed, names: the random streams of the episodes.
       device: renders the pictures, "cpu" or "cuda".
-      stored: where states are read from; None: they are simulated.
+      stored: source that states are read from; None: they are simulated.
       labels: "depth", "segmentation" and "flow", stored beside the pixels.
     """
 
@@ -89,9 +89,9 @@ def make_jobs(
 
     Args:
       target: the release that the jobs write to.
-      inputs: of each subset, by name; the release's own copies by default.
+      inputs: inputs of each subset, by name; the release's own copies by default.
       device: render there instead of on the manifest's device.
-      stored: where the states of each subset are read from, by name; by default they are simulated.
+      stored: source of the states of each subset, by name; by default they are simulated.
       labels: see `Job`.
 
     Raises:

@@ -116,11 +116,11 @@ class RenderResult:
     """The result of painting.
 
     Attributes:
-      manifest: of the release, with its digests.
-      shards: how many were painted.
-      known: how many of these had known digests.
+      manifest: manifest of the release, with its digests.
+      shards: number of painted shards.
+      known: number of these whose digests were known.
       differing: "<subset> shard <n>" of those whose pictures do not have the known digests.
-      drift: how this machine differs from the one that made the release, in words.
+      drift: differences between this machine and the one that made the release, in words.
     """
 
     manifest: Manifest
@@ -142,7 +142,7 @@ def paint_release(
       root: the release's folder.
       only: subset patterns, all by default.
       episodes: (first, last + 1) of each subset; the shards that hold any of them are painted.
-      config: how to render.
+      config: settings of the rendering.
 
     Raises:
       DmcvbError: nothing matches, a shard is damaged, the videos are not those of the manifest, the release has (or
@@ -170,8 +170,8 @@ class RenderSession:
     """A release that is ready to be painted: its manifest says which pictures it has, and the arrays exist.
 
     Attributes:
-      root, manifest: of the release.
-      backgrounds: of each subset to paint, "builtin" or the folder of its videos.
+      root, manifest: folder and manifest of the release.
+      backgrounds: videos of each subset to paint: "builtin" or their folder.
       known: subsets whose pictures must have the digests that are known.
       drift: see `RenderResult`.
     """
@@ -299,8 +299,8 @@ def render_differences(
     """List what may change pixels here compared with the release's origin: versions, processor, renderer.
 
     Args:
-      records: of the subsets to paint.
-      backgrounds: of each, by name.
+      records: records of the subsets to paint.
+      backgrounds: videos of each, by name.
     """
     found: dict[str, None] = {}
     records = list(records)
@@ -363,7 +363,7 @@ def _derived(
 
 
 def without_pictures(root: str | Path, out: str | Path) -> Manifest:
-    """A copy of a release that leaves its pictures behind, but keeps their digests; files are linked where they can be.
+    """A copy of a release that leaves its pictures behind, but keeps their digests; files are linked if they can be.
 
     Args:
       out: an empty or new folder.

@@ -60,12 +60,12 @@ class Plan:
     """Everything a rollout will do.
 
     Attributes:
-      target: where the release is made.
-      manifest: of the release as it will be.
-      inputs: of each subset, by name; None where the release's own copies serve.
-      jobs: what is still to do, settings that share trajectories together.
+      target: place of the release.
+      manifest: manifest of the release as it will be.
+      inputs: of each subset, by name; None if the release's own copies serve.
+      jobs: jobs that are still to do; settings that share trajectories are one job.
       done: committed shards that are there already.
-      growth: what the release that is there gains: "walker-walk/random/none" for a new subset, "walker-walk/random/none
+      growth: gains of the release that is there: "walker-walk/random/none" for a new subset, "walker-walk/random/none
         (40 episodes more)" for one that grows.
     """
 
@@ -100,7 +100,7 @@ def make_plan(
       recipe: None goes on with the release that is there, from its manifest alone.
       out: the release's folder or target; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
-      device: where pictures are painted; by default where the release that is there was begun, or on the CPU.
+      device: device that renders; by default that on which the release that is there was begun, or on the CPU.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
       part: (K, N): of all jobs, done or not, every N-th from the K-th on.
       pixels: paint pictures; without, `generate.paint` can do it later.
@@ -152,7 +152,7 @@ def _refuse_half_painted(
 
 
 def _check_goes_on(there: Manifest, target: Target, device: str | None, pixels: bool) -> None:
-    """Raises StoreError where a release that goes on from its manifest cannot be as the options want it."""
+    """Raises StoreError if a release that goes on from its manifest cannot be as the options want it."""
     painted = any(record.pixels for record in there.subsets)
     if not pixels and painted:
         raise StoreError(
@@ -301,7 +301,7 @@ def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False,
 
 
 def check_versions(manifest: Manifest) -> None:
-    """Raises StoreError where a package has another version here than where a release was begun."""
+    """Raises StoreError if a package has another version here than where a release was begun."""
     begun, here = manifest.environments[0] if manifest.environments else {}, environment()
     for name, version in here.items():
         if name not in ("system", "cpu", "device") and begun.get(name, version) != version:
@@ -351,7 +351,7 @@ def _prepare_bucket(plan: Plan, target: Target) -> Manifest:
         return plan.manifest
     first = target.manifest()
     if first is None:
-        raise StoreError(f"the manifest of {target.place} vanished; run the same command again")
+        raise StoreError(f"the manifest of {target.place} vanished; rerun the same command")
     return _grow_bucket(plan, target, first)
 
 
@@ -398,7 +398,7 @@ def _grow_bucket(plan: Plan, target: Target, there: Manifest) -> Manifest:
             target.storage.write(MANIFEST, json_bytes(manifest))
             return manifest
     if now is None:
-        raise StoreError(f"the manifest of {target.place} vanished; run the same command again")
+        raise StoreError(f"the manifest of {target.place} vanished; rerun the same command")
     return _grow_bucket(plan, target, now)  # another process changed it meanwhile
 
 
@@ -461,7 +461,7 @@ def _copy_videos(source: str, target: Path) -> None:
 
 
 def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord]) -> None:
-    """Create the (empty) Zarr groups of subsets, where they are not there already.
+    """Create the (empty) Zarr groups of subsets, if they are not there already.
 
     Raises:
       StoreError: the folder cannot be written.
@@ -542,5 +542,5 @@ def _finish_bucket(target: Target, there: Manifest) -> Manifest:
                     target.storage.write(name, (mirror / name).read_bytes())
                 return manifest
     if now is None:
-        raise StoreError(f"the manifest of {target.place} vanished; run the same command again")
+        raise StoreError(f"the manifest of {target.place} vanished; rerun the same command")
     return _finish_bucket(target, now)

@@ -37,10 +37,10 @@ class ReleaseProgress:
       done, total: shards.
       late: shards that are not there although a job that was handed out later is through: in flight, or lost.
       steps: transitions committed.
-      steps_per_second: of the last hour in which something was committed; None before the second commit.
+      steps_per_second: rate of the last hour in which something was committed; None before the second commit.
       silence: seconds since the last commit; None before the first.
-      seconds_left: at that rate; None where it is not known.
-      complete: whether the release is finished.
+      seconds_left: time left at that rate; None if it is not known.
+      complete: True if the release is finished.
     """
 
     name: str

@@ -72,11 +72,11 @@ class SubsetPattern(_Model):
     Attributes:
       settings: distractors for locomotion ("none", "static", "dynamic_hard", ...), goal settings for mazes
         ("visible", "hidden", "fixed").
-      episodes, steps: how much of each subset; give one. Steps are for tasks of fixed length.
-      policies: level -> policy file or run folder, where not the bundled ones.
+      episodes, steps: size of each subset; give one. Steps are for tasks of fixed length.
+      policies: level -> policy file or run folder, if not the bundled ones.
       deterministic: take the policies' mean actions, as DMC-VB does; false draws samples. Level random is always drawn.
-      max_steps: steps at which the time limit ends an episode, where not the task's own (500, mazes 600).
-      fixed_goals, episodes_per_goal: for the setting "fixed" (benchmark B3).
+      max_steps: steps at which the time limit ends an episode, if not the task's own (500, mazes 600).
+      fixed_goals, episodes_per_goal: size of a subset with the setting "fixed" (benchmark B3).
     """
 
     tasks: Names
@@ -96,7 +96,7 @@ class Recipe(_Model):
     """A recipe: everything that a release is made from.
 
     Attributes:
-      seed: of every random stream.
+      seed: seed of every random stream.
       size: pixels a side.
       trajectories: "shared": the settings of a task and level show the same episodes; "independent": each its own.
       backgrounds: "builtin" or a folder of videos.
@@ -122,7 +122,7 @@ class SubsetRequest(_Model):
 
     Attributes:
       name: "<task>/<level>/<setting>".
-      policy: where its policy comes from, None for the bundled ones (or random).
+      policy: its policy's file or run folder; None for the bundled ones (or random).
     """
 
     name: str
@@ -211,7 +211,7 @@ def narrow(
     """The recipe of the subsets that have one of the tasks, one of the levels and one of the settings.
 
     Args:
-      tasks, levels, settings: all that the recipe has where nothing is given.
+      tasks, levels, settings: all that the recipe has if nothing is given.
 
     Raises:
       UnknownNameError: the recipe has no such task, level or setting.
@@ -311,10 +311,10 @@ def single_recipe(
     """The recipe of a command line without --recipe: every task x level x setting.
 
     Args:
-      settings: of the tasks' families; by default "none", and "visible" for mazes.
-      goals: fixed_goals and episodes_per_goal, where they are not the pattern's own.
-      subset_fields: of each `SubsetPattern`.
-      fields: of the `Recipe`.
+      settings: settings of the tasks' families; by default "none", and "visible" for mazes.
+      goals: fixed_goals and episodes_per_goal, if they are not the pattern's own.
+      subset_fields: fields of each `SubsetPattern`.
+      fields: fields of the `Recipe`.
 
     Raises:
       RecipeError: --behaviour with several tasks or levels, or with random.
@@ -332,7 +332,7 @@ def single_recipe(
 
 
 def check_heard(recipe: Recipe, given: Collection[str]) -> None:
-    """Raises RecipeError where an option was given that changes nothing in any subset of a recipe.
+    """Raises RecipeError if an option was given that changes nothing in any subset of a recipe.
 
     Args:
       given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".

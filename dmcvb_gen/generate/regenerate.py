@@ -70,11 +70,11 @@ class ShardOutcome:
     """The result for one shard.
 
     Attributes:
-      was: what was wrong with the released files, None if nothing.
-      equal: whether the new shard has the promised bytes; None if the manifest promises none.
-      repaired: whether it was put into the release.
-      differences: of the values, if the bytes differ; empty if only the compression differs.
-      compared: whether both shards could be read.
+      was: fault of the released files, None if there was none.
+      equal: True if the new shard has the promised bytes; None if the manifest promises none.
+      repaired: True if it was put into the release.
+      differences: differences of the values, if the bytes differ; empty if only the compression differs.
+      compared: True if both shards could be read.
     """
 
     subset: str
@@ -518,5 +518,5 @@ def _replace_shard(root: Path, folder: Path, commit: CommitRecord) -> None:
     except OSError as error:
         raise StoreError(
             f"cannot put shard {commit.shard} of {commit.subset} into {root}: {error.strerror or error}; "
-            "make room and run the same command again"
+            "make room and rerun the same command"
         ) from None

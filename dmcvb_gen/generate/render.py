@@ -95,7 +95,7 @@ class RendererCache:
 
 
 renderers = RendererCache()
-"""Of this process."""
+"""The renderers of this process."""
 
 
 def distractor_state_of(
@@ -111,7 +111,7 @@ def distractor_state_of(
     """Distractor labels of episodes, leading shape (episode, row); rows past an episode's end are zero.
 
     Args:
-      seed, names: of the episodes' streams.
+      seed, names: seed and names of the episodes' streams.
       episodes: (episode,) indices in the subset.
       physics: (episode, row, physics) float64.
       length: (episode,) transitions of each.
@@ -215,7 +215,7 @@ def _spans_of_one_background(
 ) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
     """Frames that need no picture of their own with the goal hidden.
 
-    Where the camera stands still, and nothing that moves is near the goal, what is behind the goal is the same in
+    If the camera stands still, and nothing that moves is near the goal, what is behind the goal is the same in
     every frame of an episode: one hidden picture tells it for all.
 
     Returns:

@@ -47,12 +47,12 @@ class Repainting:
       only: subset patterns, all by default.
       distractor, difficulty: the new setting.
       size: pixels a side.
-      renderer, samples: as for a rollout.
+      renderer, samples: see `rollout`.
       backgrounds: "builtin" or a folder of videos.
       split: "train" or "val": the videos of locomotion, the styles of mazes.
-      device: where pictures are painted.
+      device: device that renders.
       labels: "depth", "segmentation" and "flow", stored beside the pixels.
-      name: of the new release.
+      name: name of the new release.
     """
 
     root: str | Path

@@ -46,7 +46,7 @@ def make_request(
     Args:
       tasks: names; with a recipe, those that are taken of it.
       recipe: a YAML file or the name of a shipped recipe.
-      device: that renders; other devices have another default renderer.
+      device: device that renders; other devices have another default renderer.
       given: options of `RECIPE_OPTIONS` that somebody gave, and no defaults.
 
     Raises:
@@ -180,7 +180,7 @@ def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
     """Refuse options of mazes that nothing in a request without a recipe takes up, and those not for mazes.
 
     Args:
-      tasks: of one family.
+      tasks: tasks of one family.
       given: the options that somebody gave.
 
     Raises:

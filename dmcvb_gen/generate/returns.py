@@ -51,7 +51,7 @@ def evaluate_behaviour(
     chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
     chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
     if pictures and not any(map(is_maze, chosen)):
-        raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(chosen)} is none; leave it out")
+        raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(chosen)} is not a maze; remove it")
     rows = []
     for task_id in chosen:
         task, panels = get_task(task_id), {}

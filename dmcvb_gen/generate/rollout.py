@@ -28,10 +28,10 @@ class RolloutResult:
     """The result of running a plan.
 
     Attributes:
-      manifest: of the release; of a part, as it was when the part began.
+      manifest: manifest of the release; of a part, as it was when the part began.
       steps: transitions that were made now.
       seconds: on the clock.
-      seconds_by_part: of all workers together: "physics", "policy", "rendering" and "storage".
+      seconds_by_part: seconds of all workers together, by part: "physics", "policy", "rendering" and "storage".
     """
 
     manifest: Manifest

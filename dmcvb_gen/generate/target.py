@@ -61,9 +61,9 @@ class Target:
     """A release in the making; travels to workers by pickle.
 
     Attributes:
-      storage: of the release's files.
+      storage: storage of the release's files.
       scratch: folder on this machine for the staging folders: the release's own, if it is here.
-      scratch_bytes: what this worker's shards may take there: the one that is made and those that are being sent.
+      scratch_bytes: bytes that this worker's shards may take there: the one that is made and those that are being sent.
     """
 
     storage: Storage
@@ -82,7 +82,7 @@ class Target:
         """The target of a folder or URL.
 
         Args:
-          options: of fsspec, for a URL.
+          options: options of fsspec, for a URL.
           scratch, scratch_bytes: where shards of a URL are made before they are sent, and how much room they may take,
             over all `workers`; half of what is free by default.
         """
@@ -256,7 +256,7 @@ class StagingFolder:
             except OSError as error:
                 raise StoreError(
                     f"cannot write {record.name} to {self.folder.parent}: {error.strerror or error}; "
-                    "what was committed is safe, make room and run the same command again"
+                    "finished shards are saved; make room and rerun the same command"
                 ) from None
         return self.folder
 

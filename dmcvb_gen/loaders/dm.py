@@ -16,7 +16,7 @@ class DmEnv(dm_env.Environment):
 
     Args:
       seed: decides initial states and distractors of all episodes.
-      options: of `DistractedEnv` (size, renderer, split, ...).
+      options: options of `DistractedEnv` (size, renderer, split, ...).
     """
 
     def __init__(self, task: str, distractor: str = "none", *, seed: int | None = None, **options: Any):

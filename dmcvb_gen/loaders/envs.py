@@ -64,11 +64,11 @@ class Scene:
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
       modalities: "depth" (meters, 0: sky) and "segmentation" (geom id, -1: sky), which observations have besides.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
-      fixed_goals: of "fixed": how many pairs of start and goal there are; an episode takes the next one.
+      fixed_goals: number of pairs of start and goal under "fixed"; an episode takes the next one.
       goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
-      goal_pair: of "fixed": this pair in all episodes.
-      goal_seed: of "fixed": the seed that the pairs are drawn from, as a recipe's seed.
-      threads: of the simulation; the result does not depend on them.
+      goal_pair: under "fixed": this pair in all episodes.
+      goal_seed: under "fixed": the seed that the pairs are drawn from, as a recipe's seed.
+      threads: threads of the simulation; the result does not depend on them.
     """
 
     task: str
@@ -109,7 +109,7 @@ class Scene:
             if value not in known:
                 raise UnknownNameError(field, str(value), [name for name in known if name])
         if maze and self.difficulty:
-            raise DmcvbError(f"{self.task} has no difficulty: mazes differ in style alone; leave difficulty away")
+            raise DmcvbError(f"{self.task} has no difficulty: mazes only differ in style; remove difficulty")
         if self.own_videos and self.backgrounds == "builtin":
             raise DmcvbError(
                 f"the data show videos of their own (digest {self.own_videos[:12]}), not the built-in ones: give their "
@@ -117,11 +117,11 @@ class Scene:
             )
         for modality in self.modalities:
             if modality == "flow":
-                raise DmcvbError("an environment has no flow: the next frame is not known yet; leave flow away")
+                raise DmcvbError("an environment has no flow: the next frame is not known yet; remove flow")
             if modality not in ENVIRONMENT_MODALITIES:
                 raise UnknownNameError("modality", modality, ENVIRONMENT_MODALITIES)
         if self.goal and not maze:
-            raise DmcvbError(f"{self.task} has no goal in its pictures; leave goal away")
+            raise DmcvbError(f"{self.task} has no goal in its pictures; remove goal")
 
 
 class _Stage:

@@ -48,7 +48,7 @@ class Painting:
       distractors: "stored" or "resample".
       size: pixels a side, None for the subset's own.
       backgrounds: "builtin" or a folder of videos, None for the release's own.
-      cache_bytes: of painted episodes, kept while there is room.
+      cache_bytes: bytes of painted episodes that are kept.
     """
 
     distractors: str = STORED
@@ -87,7 +87,7 @@ class PaintedSubset(SubsetReader):
     """A subset whose pictures are rendered when they are read. With fresh distractors, each epoch shows others.
 
     Attributes:
-      epoch: of the distractors; 0 at the start.
+      epoch: epoch of the distractors; 0 at the start.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class PaintedSubset(SubsetReader):
         )
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw the distractors of another epoch from now on (where they are fresh)."""
+        """Draw the distractors of another epoch from now on (if they are fresh)."""
         self.epoch = epoch
 
     @property
@@ -143,7 +143,7 @@ class PaintedSubset(SubsetReader):
 
     @property
     def shown_epoch(self) -> int:
-        """The epoch whose distractors the pictures show; 0 where they are those of the data."""
+        """The epoch whose distractors the pictures show; 0 if they are those of the data."""
         return self.epoch if self.fresh else 0
 
     @property

@@ -29,7 +29,7 @@ class SubsetReader(Subset):
           store's names with "/" as "_" ("exogenous_camera_position"); read when used.
 
         Raises:
-          StoreError: an episode is not there, or has not been painted where others have; also where values are used
+          StoreError: an episode is not there, or has not been painted although others have; also if values are used
             that are damaged or cannot be read.
         """
         from dmcvb_gen.loaders.lazy import lazy_dataset
@@ -45,7 +45,7 @@ class SubsetReader(Subset):
         Args:
           kind: "steps" (`StepDataset`: frame stacks with their action), "transitions" (the same, with what comes
             next), "episodes" (`EpisodeDataset`), "stream" (`StreamDataset`, the quick way through a large subset).
-          options: of that class.
+          options: options of that class.
 
         Raises:
           UnknownNameError: no such kind.

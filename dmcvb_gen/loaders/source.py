@@ -20,7 +20,7 @@ from dmcvb_gen.loaders.stream import Steps, check_count
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
 SHARE_OF_MEMORY = 0.25
-"""Of the free memory: what is held at most, if nobody says."""
+"""Share of the free memory that is held at most, by default."""
 
 
 class StepSource:
@@ -37,7 +37,7 @@ class StepSource:
       stack: frames a stack; the first frame of an episode is repeated before it (paper, section 4).
       next_step: give what comes next, too.
       in_memory: hold all steps (they are read at the first use, and once again in each process that the source is
-        sent to); else each step is read from the store, some hundred times slower. By default held where they take
+        sent to); else each step is read from the store, some hundred times slower. By default held if they take
         up to a quarter of the free memory.
 
     Raises:
@@ -93,7 +93,7 @@ class StepSource:
 
     @property
     def table(self) -> StepTable:
-        """All steps, in memory; read again where the subset's distractors have become those of another epoch."""
+        """All steps, in memory; read again if the subset's distractors have become those of another epoch."""
         with self._reading:
             epoch = getattr(self.subset, "shown_epoch", 0)
             if self._held is None or self._held[0] != epoch:

@@ -26,7 +26,7 @@ class _OfEpoch:
     """Data of an epoch that a loader's persistent workers see too: in shared memory, as they keep the data they have.
 
     Attributes:
-      subset: that is read.
+      subset: subset that is read.
       epoch: 0 at the start.
     """
 
@@ -57,11 +57,11 @@ class _OfEpoch:
 class StepDataset(_OfEpoch, Dataset):
     """Any step at random: frame stack, state, action, reward, discount (see `source.StepSource`), as tensors.
 
-    A `DataLoader` takes whole batches from it at once. Held in memory, as by default where it fits, it is as fast as
+    A `DataLoader` takes whole batches from it at once. Held in memory, as by default if it fits, it is as fast as
     a `StreamDataset`; larger subsets are better streamed.
 
     Args:
-      options: of `StepSource`: episodes, pictures, stack, next_step, in_memory.
+      options: options of `StepSource`: episodes, pictures, stack, next_step, in_memory.
     """
 
     def __init__(self, subset: Subset, **options: Any):
@@ -84,10 +84,10 @@ class StepDataset(_OfEpoch, Dataset):
 
 class EpisodeDataset(_OfEpoch, Dataset):
     """Whole episodes: "pixels" (L + 1, view * 3, height, width) uint8, "state" (L + 1, state), "action" (L, action),
-    "reward", "discount" (L,), "episode"; episodes differ in length L where a task can end early.
+    "reward", "discount" (L,), "episode"; episodes differ in length L if a task can end early.
 
     Args:
-      episodes, pictures: as for `StepSource`.
+      episodes, pictures: see `StepSource`.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class StreamDataset(_OfEpoch, IterableDataset):
 
     Args:
       batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `stream.stream`.
-      rank, world: this process's share; those of torch.distributed by default, where it runs.
+      rank, world: this process's share; those of torch.distributed by default, if it runs.
     """
 
     def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options: Any):

@@ -65,7 +65,7 @@ def open_pool(
     """A pool of `workers`; with one worker, the work is done in this process (on its own threads).
 
     Args:
-      threads: of a worker process's libraries.
+      threads: threads of a worker process's libraries.
       tick, kept: see `processes.ProcessPool`.
       needs: of a piece of work, where it is placed on a cluster.
       most: how many pieces of work there will be at most; no more processes are of use.

@@ -20,7 +20,7 @@ POLL_SECONDS = 0.2
 """How often progress is passed on while no result comes."""
 TIDY: list[Callable[[], None]] = []
 """What a worker that outlives the command (a cluster's) does after each piece of work: nobody tells it of the end."""
-KEPT = "what was committed is safe: run the same command again"
+KEPT = "finished shards are saved: rerun the same command"
 
 
 def ignore(*_) -> None:
@@ -65,7 +65,7 @@ class Pool(abc.ABC):
         """
 
     def memory_each(self) -> int | None:
-        """Bytes of memory for each piece of work at a time, where the pool places work by it; else None."""
+        """Bytes of memory for each piece of work at a time, if the pool places work by it; else None."""
         return None
 
     def close(self, at_once: bool = False) -> None:  # noqa: B027 (nothing to end by default)

@@ -28,9 +28,9 @@ class ProcessPool(Pool):
 
     Args:
       workers: processes, started as they are needed.
-      threads: of a worker's own libraries.
-      tick: told what the functions tell.
-      kept: what to say of the work done so far when a worker was killed.
+      threads: threads of a worker's own libraries.
+      tick: called with what the functions report.
+      kept: words for the work done so far, for the message about a killed worker.
     """
 
     def __init__(self, workers: int, threads: int = 1, tick: ProgressCallback = ignore, kept: str = KEPT):

@@ -33,9 +33,9 @@ class RayPool(Pool):
 
     Args:
       address: of the cluster ("ray://host:10001", "auto"); by default what RAY_ADDRESS says, else one on this machine.
-      needs: of a piece of work, for Ray to place it.
-      tick: told what the functions tell, when their result comes.
-      threads: of the libraries that a piece of work uses.
+      needs: resources of a piece of work, by which Ray places it.
+      tick: called with what the functions report, when their result comes.
+      threads: threads of the libraries that a piece of work uses.
 
     Raises:
       DmcvbError: ray is not installed, or nobody answers at the address.
@@ -111,7 +111,7 @@ def share_of_node(nodes: Sequence[Mapping[str, Any]], needs: Needs) -> int | Non
       needs: the cores and the share of a GPU that it takes.
 
     Returns:
-      The least share of all nodes where it can be placed; None where there is no such node yet.
+      The least share of all nodes where it can be placed; None if there is no such node yet.
     """
     shares = []
     for resources in (node["Resources"] for node in nodes if node["Alive"]):
@@ -124,7 +124,7 @@ def share_of_node(nodes: Sequence[Mapping[str, Any]], needs: Needs) -> int | Non
 
 
 def _check_answers(address: str | None) -> None:
-    """Raises DmcvbError where nobody listens at "host:port": Ray itself would try for minutes."""
+    """Raises DmcvbError if nobody listens at "host:port": Ray itself would try for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if not colon or not port.isdigit():
         return

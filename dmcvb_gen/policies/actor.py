@@ -76,7 +76,7 @@ class Policy:
     """A behaviour policy, which gives the actions of a whole batch of observations in one call.
 
     Attributes:
-      header: where it comes from; None for uniform random actions.
+      header: its origin; None for uniform random actions.
       weights: name -> float32, see `header.weight_shapes`.
       digest: SHA-256 of its file ("random" for uniform random actions).
     """

@@ -16,7 +16,7 @@ CONVERTED = (".zip", ".pt", ".pth")
 
 
 def level_files(folder: Path, level: str) -> list[Path]:
-    """The policy files of a level in a folder, in order; empty where there are none."""
+    """The policy files of a level in a folder, in order; empty if there are none."""
     if level == "mixed":
         return sorted(folder.glob("mixed_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
     path = folder / f"{level}.safetensors"

@@ -51,8 +51,8 @@ class Layout:
     """Parameter names under which a program keeps the parts of an actor.
 
     Attributes:
-      algorithm: for the header.
-      body: what the names of the hidden layers begin with, before their numbers.
+      algorithm: algorithm that the header names.
+      body: beginning of the names of the hidden layers, before their numbers.
       mean: the layer that gives the mean; None: the last numbered one.
       log_std: the layer of log standard deviations, or a vector of them.
       activation: None: must be given.
@@ -106,8 +106,8 @@ def convert(
 
     Args:
       hidden: widths that its hidden layers must have.
-      activation: of the hidden layers, where it is not the program's own: "relu", "tanh", "elu" or "gelu".
-      distribution: for a plain network: "deterministic" (tanh of the output) or "gaussian" (clipped output).
+      activation: activation of the hidden layers, if it is not the program's own: "relu", "tanh", "elu" or "gelu".
+      distribution: of a plain network, "deterministic" (tanh of the output) or "gaussian" (clipped output).
       statistics: .npz file with "mean" and "std" of the observations that it was trained on, if it normalized them.
 
     Raises:
@@ -226,7 +226,9 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
             strange = [name for name in state if name.startswith(("features_extractor.", "pi_features_extractor."))]
             strange += [f"{layout.body}{number}" for number in numbers if _weight(state, layout, number).ndim != 2]
             if strange:
-                raise PolicyFileError(f"{path} has {strange[0]!r}, which is no dense layer; only plain MLPs convert")
+                raise PolicyFileError(
+                    f"{path} has {strange[0]!r}, which is no dense layer; only plain MLPs can be converted"
+                )
             return layout, [f"{layout.body}{number}" for number in numbers]
     raise PolicyFileError(
         f"{path} has none of the actors that are known (it has {', '.join(list(state)[:3]) or 'nothing'}, ...); save "

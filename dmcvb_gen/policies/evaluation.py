@@ -50,7 +50,7 @@ def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float
     """Share of episodes that reached the goal, and their mean speed towards it.
 
     Speed is the straight distance to the goal at the start over the time it took, in m/s, as in the benchmarks;
-    None where no episode got there, both None for a task without a goal.
+    None if no episode got there, both None for a task without a goal.
     """
     part = task.state_slices.get("target_vector")
     if part is None:

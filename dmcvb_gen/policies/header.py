@@ -70,17 +70,17 @@ class PolicyHeader(_Model):
     Attributes:
       task: the task's id.
       observation: the name of what it sees, `task.observation`.
-      algorithm: what trained it, e.g. "sac"; `origin` says it in words.
+      algorithm: algorithm that trained it, e.g. "sac"; `origin` says it in words.
       agent_step: environment steps (at action repeat 2) it was trained for.
       hidden: widths of the hidden layers.
-      layer_norm: whether each hidden layer is normalized before its activation.
+      layer_norm: True if each hidden layer is normalized before its activation.
       distribution: "squashed_gaussian": tanh(mean + std * noise); "gaussian": clipped to [-1, 1];
         "deterministic": the mean, with fixed `noise` added when sampling.
       way: widths of the hidden layers of the network that says where to head in a maze (`policies.way`); None: the
         policy heads for its goal.
       clip_observation: normalized observations are clipped to +- this.
       training: settings, seed, wall time, versions.
-      command: what trains it again.
+      command: command that trains it again.
     """
 
     format: Literal["dmcvb-gen policy"] = "dmcvb-gen policy"
@@ -147,7 +147,7 @@ def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
 
     `body.<i>` are hidden layers (numbered with their norms and activations), `mean` and `log_std` the heads (for
     "gaussian" a free vector `log_std_vector`); `observation_mean` and `observation_std` normalize what comes in.
-    `way.<i>` are the layers of the network that knows the way, where there is one.
+    `way.<i>` are the layers of the network that knows the way, if there is one.
     """
     shapes: dict[str, tuple[int, ...]] = {}
     if header.way is not None:

@@ -31,13 +31,13 @@ def paper_task(task_id: str) -> str:
 
 
 def paper_returns(task_id: str, level: str) -> dict[str, float] | None:
-    """Steps, mean, std, min, p25, median, p75, max of the paper's episode returns; None where it has no row."""
+    """Steps, mean, std, min, p25, median, p75, max of the paper's episode returns; None if it has no row."""
     row = _table().get((paper_task(task_id), level))
     return dict(row) if row else None
 
 
 def medium_return(task_id: str) -> float | None:
-    """The mean return that a maze's medium policy is to have; None where medium is half of the way to convergence.
+    """The mean return that a maze's medium policy is to have; None if medium is half of the way to convergence.
 
     The paper says of medium that it has half of the expert's return, which negative returns leave without a meaning;
     its table of the data's episode rewards (appendix "Reward Distribution"; our data/paper_episode_returns.csv) has a

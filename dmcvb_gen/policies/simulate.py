@@ -32,7 +32,7 @@ class Simulation:
       terminated: (episode,) bool, ended by the task.
       seed: (episode,) uint64, label of the episode's streams.
       behaviour: (episode,) int16, index of the policy.
-      goal_pair: (episode,) int16, index of the fixed start and goal, -1 where they are random.
+      goal_pair: (episode,) int16, index of the fixed start and goal, -1 if they are random.
       seconds: time spent, by part.
     """
 
@@ -69,7 +69,7 @@ def _actions(
     action_size: int,
     deterministic: bool,
 ) -> np.ndarray:
-    """Actions of a batch of episodes, each from its own policy; zeros where an episode is over.
+    """Actions of a batch of episodes, each from its own policy; zeros once an episode is over.
 
     Returns:
       (size, action) float32.

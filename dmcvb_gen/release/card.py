@@ -60,7 +60,7 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
 
     Args:
       out: folder of these files; the release by default.
-      url: where the release is (or will be) published; by default the place that the existing card names.
+      url: URL at which the release is (or will be) published; by default the one that the existing card names.
 
     Raises:
       StoreError: there is no release, it has no episodes, or the folder cannot be written.

@@ -33,7 +33,7 @@ def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[I
     """All that can be checked of a subset.
 
     Args:
-      backgrounds: where the manifest's videos are now, if they moved.
+      backgrounds: present place of the manifest's videos, if they moved.
 
     Raises:
       StoreError: something cannot be read.

@@ -95,7 +95,7 @@ def croissant(
     """The JSON-LD document.
 
     Args:
-      facts: of `describe_release`.
+      facts: result of `describe_release`.
       summary: the description.
       citation: BibTeX.
       limits: known limits, a sentence each.

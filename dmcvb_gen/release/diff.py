@@ -30,7 +30,7 @@ def diff(one: str | Path, other: str | Path, options: dict | None = None) -> lis
 
     Args:
       one, other: folders or URLs.
-      options: of fsspec, for URLs.
+      options: options of fsspec, for URLs.
 
     Raises:
       StoreError: one of them is no release, or cannot be read.

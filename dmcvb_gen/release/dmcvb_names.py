@@ -35,7 +35,7 @@ def state_feature(task: str, field: str) -> str:
 
 
 def parse_folder(parts: tuple[str, ...]) -> tuple[str, str, str, int | None] | None:
-    """(task, level, setting, seed of fixed goals) of a data set's folder, None where its path does not say it.
+    """(task, level, setting, seed of fixed goals) of a data set's folder, None if its path does not say it.
 
     `locomotion/<task>/<level>/<setting>`, `antmaze_random_<visible|hidden>_goal/<layout>/<level>` and
     `antmaze_fixed_hidden_goal/<layout>/<seed>`.

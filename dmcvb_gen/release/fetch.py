@@ -79,8 +79,8 @@ def fetch(
     Args:
       out: its folder here.
       only, episodes: subset patterns and (first, last + 1); all by default.
-      options: of fsspec.
-      tick: told the bytes of each file.
+      options: options of fsspec.
+      tick: called with the bytes of each file.
 
     Raises:
       StoreError: no release is there; a file has other bytes than its digest says; `out` holds something else;
@@ -221,9 +221,9 @@ class Download:
 
     Attributes:
       out: the folder, which is locked.
-      shards: what is asked for.
+      shards: shards that are asked for.
       commits: (bytes, record) of each shard, as published.
-      moved: what was asked for and moved, once it is here.
+      moved: shards that were asked for and moved, once they are here.
       stop: set to have no more files asked for.
     """
 
@@ -330,7 +330,7 @@ class Download:
         """Bring the shards, in their order; each is there once its commit record is, and that is after its files.
 
         Args:
-          arrived: told each shard that is here and has no pictures.
+          arrived: called with each shard that is here and has no pictures.
 
         Raises:
           StoreError: see `fetch`.
@@ -345,7 +345,7 @@ class Download:
         def work(item: tuple[ShardKey | None, FileRecord]) -> tuple[ShardKey | None, bool, int]:
             key, file = item
             if self.stop.is_set():
-                raise StoreError("stopped; what was moved stays, run the same command again")
+                raise StoreError("Interrupted. Transferred files are kept, rerun the same command")
             if link_known(self.out, file, self._equal.get(file.path, ())):
                 return key, True, file.bytes
             return key, self.source.storage.download(file, self.out), file.bytes
@@ -365,7 +365,7 @@ class Download:
         in_parallel(work, items, self._workers, done)
 
     def finish(self) -> Manifest:
-        """The release's own manifest and index where everything is here, as it was published; else digests."""
+        """The release's own manifest and index if everything is here, as it was published; else digests."""
         out, source = self.out, self.source
         manifest = local_manifest(out)
         commits = {record.name: read_commits(out, record) for record in source.manifest.subsets}

@@ -109,8 +109,8 @@ def import_tfds(
     Args:
       folder: a TFDS folder (with features.json), or a tree of DMC-VB's folders that hold such (see `parse_folder`).
       out: folder of the new release.
-      task, level, setting: what a single folder holds, where its path does not say it.
-      name: of the new release.
+      task, level, setting: content of a single folder, if its path does not say it.
+      name: name of the new release.
       partial: take the files that are there, though their names say that there are more (`-00003-of-00100`).
       progress: called with 1 for each episode.
 
@@ -289,7 +289,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _refuse_missing(path: Path) -> None:
-    """Raises StoreError where the files' names say that there are more."""
+    """Raises StoreError if the files' names say that there are more."""
     there: dict[tuple[str, int], set[int]] = {}
     for file in _files(path):
         if named := re.fullmatch(r"(.*\.tfrecord.*)-(\d{5,})-of-(\d{5,})", file.name):
@@ -309,7 +309,7 @@ def _fingerprint(files: list[str]) -> dict[str, Any]:
 
 
 def _refuse_other_files(sources: list[_Source], out: Path) -> None:
-    """Raises StoreError where subsets of `out` were made from files that are not the first ones of those here."""
+    """Raises StoreError if subsets of `out` were made from files that are not the first ones of those here."""
     if not (out / MANIFEST).exists():
         return
     old = local_manifest(out)

@@ -86,7 +86,7 @@ def publish_folder(
       url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL.
       pixels: False leaves the images out; `paint` renders them again.
       take_over: publish even if another upload has claimed the URL.
-      options: of fsspec; credentials belong into the environment.
+      options: options of fsspec; credentials belong in the environment.
       workers: parallel transfers.
       tick: called with 1 for each file.
 
@@ -134,9 +134,9 @@ def publish(
 
     Args:
       url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL; it becomes the release's folder.
-      options: of fsspec (endpoint_url, ...); credentials belong into the environment.
+      options: options of fsspec (endpoint_url, ...); credentials belong in the environment.
       take_over: go on although another publisher's claim is there (it crashed, and its release was another).
-      tick: told 1 for each file.
+      tick: called with 1 for each file.
 
     Raises:
       StoreError: the release is not complete or damaged; another version or publisher is there; access is refused;
@@ -195,7 +195,7 @@ def _published(storage: Storage, index: Index, manifest: Manifest) -> tuple[tupl
     """The files that are listed there, and whether the manifest there is this one, not one that it has grown from.
 
     Returns:
-      (files, same); (None, False) where no release is.
+      (files, same); (None, False) if no release is.
 
     Raises:
       StoreError: another release is there.

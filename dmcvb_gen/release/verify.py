@@ -46,11 +46,11 @@ class Verification:
     """Result of a verification: what was checked, and the issues.
 
     Attributes:
-      checked: how many subsets, episodes and steps.
-      findings: what is wrong.
+      checked: number of subsets, episodes and steps.
+      findings: faults that were found.
       incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
       digest: the release's root digest, None while it is made (and of version 1).
-      finished: whether its digests were written once everything was there.
+      finished: True if its digests were written once everything was there.
     """
 
     checked: dict[str, int]
@@ -118,7 +118,7 @@ def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]
     if sha256_file(root / MANIFEST) != index.manifest_sha256:
         yield Issue("files", MANIFEST, f"does not have the digest that {INDEX} says")
     elif manifest.digest is not None and root_digest(index.files, manifest) != manifest.digest:
-        yield Issue("files", MANIFEST, f"its root digest is not that of the files in {INDEX}")
+        yield Issue("files", MANIFEST, f"its root digest does not fit the files in {INDEX}")
 
 
 def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue]:
@@ -129,12 +129,12 @@ def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue
             name = path.relative_to(root).as_posix()
             ours = name.startswith(PREVIEWS) or any(part.startswith(".") for part in name.split("/"))
             if not ours and name not in listed and path.is_file():
-                text = f"{name} is listed nowhere: no part of the release; move it elsewhere"
+                text = f"{name} is not part of the release; move it elsewhere"
                 yield Issue("files", subset_of(manifest, name), text)
 
 
 def subset_of(manifest: Manifest, path: str) -> str:
-    """The subset that a file belongs to; the file itself where it belongs to none."""
+    """The subset that a file belongs to; the file itself if it belongs to none."""
     for record in manifest.subsets:
         if path.startswith((f"{subset_path(record.name)}/", f"commits/{record.name}/")):
             return record.name
@@ -211,7 +211,7 @@ def verify(
     """Check a release.
 
     Args:
-      backgrounds: where the manifest's videos are now, if they moved.
+      backgrounds: present place of the manifest's videos, if they moved.
       names: the subsets whose values are looked at; all by default. Bytes are checked everywhere.
       tick: told the subset's name for each few shards whose bytes, and each subset whose values, are looked at.
       workers: processes, a Ray cluster that sees the folder, or an open pool (whose tick is told): bytes are checked a

@@ -24,7 +24,7 @@ from dmcvb_gen.release.verify import Verification, subset_of
 from dmcvb_gen.storage.base import in_parallel
 
 SAMPLE_FILES = 40
-"""Files that are read where not all are asked for; spread evenly over the release."""
+"""Files that are read if not all are asked for; spread evenly over the release."""
 WORKERS = 8
 
 
@@ -38,9 +38,9 @@ def verify_url(
     """Check a published release where it is.
 
     Args:
-      options: of fsspec.
+      options: options of fsspec.
       everything: read all files, not a sample.
-      tick: told 1 for each file.
+      tick: called with 1 for each file.
       workers: files at once.
 
     Raises:
@@ -109,7 +109,7 @@ def _disagreements(subset: Subset, listed: Mapping[str, FileRecord]) -> list[Iss
     """List where the commit records of a subset disagree with the index or the manifest.
 
     Args:
-      listed: of the index, by path; shards that it does not know yet were made since.
+      listed: files of the index, by path; shards that it does not know yet were made since.
     """
     found = []
     for shard, commit in subset.commits.items():

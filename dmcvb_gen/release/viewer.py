@@ -50,7 +50,7 @@ class Written:
 
     Attributes:
       path, bytes: the file and its size.
-      episodes: how many episodes it shows, of how many subsets.
+      episodes: number of episodes that it shows. subsets: number of their subsets.
       stride: every how many-th picture it has; 1 if all are there.
     """
 
@@ -82,7 +82,7 @@ def view(
       size: paint the pictures at so many pixels a side, instead of taking the stored ones.
       max_bytes: largest file; pictures are left out evenly until it is small enough.
       storage_options: passed to fsspec for a URL.
-      progress: told 1 for each episode.
+      progress: called with 1 for each episode.
 
     Raises:
       StoreError: the release has no episodes yet, its pictures cannot be painted, or the file cannot be written.

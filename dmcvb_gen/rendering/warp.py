@@ -86,7 +86,7 @@ class WarpRenderer(Renderer):
         return None if installed("mujoco_warp") else "mujoco-warp is not installed: pip install mujoco-warp==3.17.0"
 
     worlds = WORLDS
-    """Frames a launch; may be lowered before the first picture, where few frames are painted at a time."""
+    """Frames a launch; may be lowered before the first picture, if few frames are painted at a time."""
 
     def __init__(
         self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None

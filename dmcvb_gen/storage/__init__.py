@@ -14,7 +14,7 @@ def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) ->
     """The storage at a folder or URL; nothing is read or made there.
 
     Args:
-      options: of fsspec, for a URL, e.g. {"endpoint_url": ...}.
+      options: options of fsspec, for a URL, e.g. {"endpoint_url": ...}.
 
     Raises:
       StoreError: the URL's protocol is unknown or not installed, or it names no bucket.

@@ -326,7 +326,7 @@ def retry(place: str, path: str, attempt: Callable[[], Result], doing: str) -> R
     Raises:
       StoreError: access is refused, the disk is full, or it never succeeded.
     """
-    import tenacity  # only where something is sent or fetched
+    import tenacity  # only if something is sent or fetched
 
     def said(state: tenacity.RetryCallState) -> None:
         error = state.outcome and state.outcome.exception()
@@ -348,12 +348,11 @@ def retry(place: str, path: str, attempt: Callable[[], Result], doing: str) -> R
             raise refused(place, error) from None
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             raise StoreError(
-                f"no room for {path} ({error.strerror}); what was moved stays, make room and run the same command again"
+                f"no room for {path} ({error.strerror}); transferred files are kept; make room and rerun the command"
             ) from None
-        cure = "check the place and the network" if doing == "read" else "what was moved stays"
+        cure = "check the place and the network" if doing == "read" else "transferred files are kept"
         raise StoreError(
-            f"cannot {doing} {path} of {place} after {ATTEMPTS} tries ({reason(error)}); {cure}, run the same command "
-            "again"
+            f"cannot {doing} {path} of {place} after {ATTEMPTS} tries ({reason(error)}); {cure}; rerun the same command"
         ) from None
 
 

@@ -54,7 +54,7 @@ def newest_of(url: str) -> tuple[dict[str, str], str]:
     """
     repository, folder, revision = parse_hub_url(url)
     if revision:
-        raise StoreError(f"{url} names a revision, and what is published is the newest; leave @{revision} away")
+        raise StoreError(f"{url} names a revision, but publishing always writes the newest one; remove @{revision}")
     return {"repo_id": repository, "repo_type": "dataset"}, folder
 
 
@@ -81,7 +81,7 @@ def client_errors(url: str) -> Iterator[None]:
     except Exception as error:
         if is_refusal(error) or getattr(getattr(error, "response", None), "status_code", 0) in (401, 403):
             raise refused(url, error) from None
-        raise StoreError(f"cannot publish to {url} ({reason(error)}); run the same command again") from None
+        raise StoreError(f"cannot publish to {url} ({reason(error)}); rerun the same command") from None
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class ObjectStorage(Storage):
     """Files at a URL of fsspec.
 
     Attributes:
-      options: of fsspec, as sorted pairs; they may hold secrets.
+      options: options of fsspec, as sorted pairs; they may hold secrets.
     """
 
     url: str = field(repr=False)

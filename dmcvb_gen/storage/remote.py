@@ -129,7 +129,7 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
         return f"{name.split('.')[0]} is needed for {place} and not installed: pip install {name.split('.')[0]}"
     number = error.errno if isinstance(error, OSError) else None
     if isinstance(error, OSError) and number in NO_ROOM:
-        return f"no room to {doing} {place} ({error.strerror}); make room and run the same command again"
+        return f"no room to {doing} {place} ({error.strerror}); make room and rerun the same command"
     if writing and not remote and isinstance(error, OSError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}; choose a writable --out"
     if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError) or "NotFound" in _kind(error):
@@ -138,7 +138,7 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
     if not remote and isinstance(error, PermissionError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}; change its rights"
     if remote and (isinstance(error, OSError | asyncio.TimeoutError) or _kind(error).split(".")[0] in CLIENTS):
-        return f"cannot {doing} {place} ({reason(error)}); check the URL and the network, and run the command again"
+        return f"cannot {doing} {place} ({reason(error)}); check the URL and the network, and rerun the command"
     if isinstance(error, OSError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}"
     return f"{place} is damaged ({reason(error)}); repair it with `dmcvb-gen regenerate`, or fetch it again"

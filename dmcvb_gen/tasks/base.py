@@ -64,7 +64,7 @@ class Task(abc.ABC):
       views: the names of the pictures made of each frame; ("pixels",) for a task with one.
       return_range: (lowest, highest) return an episode of data can have.
       observation: the name of what behaviour policies see, `EpisodeBatch.behaviour_observation`; policy files hold it.
-      behaviour_size: how many numbers that are.
+      behaviour_size: how many numbers these are.
     """
 
     id: str
@@ -97,15 +97,15 @@ class Task(abc.ABC):
         return self.model
 
     def styles(self, split: str) -> tuple[int, ...]:
-        """The visual styles of data ("train") or of evaluation ("val"); none where a task has no styles."""
+        """The visual styles of data ("train") or of evaluation ("val"); none if a task has no styles."""
         return ()
 
     def looks(self, style: int) -> tuple[int, ...]:
-        """The visual looks of a style (labels `style`), all as likely; none where a task has no styles."""
+        """The visual looks of a style (labels `style`), all as likely; none if a task has no styles."""
         return ()
 
     def style_geom_matid(self, look: int) -> np.ndarray | None:
-        """(geom,) int: material of every geom under a visual look; None where a task has no styles."""
+        """(geom,) int: material of every geom under a visual look; None if a task has no styles."""
         return None
 
     @property

@@ -17,7 +17,7 @@ class TrainedRun:
     """A run that is trained to its end.
 
     Attributes:
-      folder: of the run. curve: picture of its evaluations.
+      folder: folder of the run. curve: picture of its evaluations.
       steps: agent steps. seconds: of training, on the clock.
     """
 

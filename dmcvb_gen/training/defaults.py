@@ -25,7 +25,7 @@ def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
     """{"steps", "evaluate_every", "evaluate_sparse", "settings"} of a task's run.
 
     `settings` of the file are sac's; another algorithm's are under `algorithms: {<name>: {...}}` of "all" and of
-    the task, on top of that algorithm's own defaults; its budget, where it differs, under the task's `runs`.
+    the task, on top of that algorithm's own defaults; its budget, if it differs, under the task's `runs`.
     """
     family = ANT_MAZE if is_maze(task_id) else task_id
     general, own = _all()["all"], _all().get(family, {})
@@ -71,9 +71,9 @@ def run_config(
 
     Args:
       settings: given settings, checked.
-      found: the configuration of the run to go on with. Where `given` differs from it the result does too, and
+      found: the configuration of the run to go on with. If `given` differs from it the result does too, and
         `open_run` refuses it.
-      given: steps, seed, evaluate_every, init_from; None where not given.
+      given: steps, seed, evaluate_every, init_from; None if not given.
     """
     given = {name: value for name, value in given.items() if value is not None}
     if found and found.algorithm == algorithm:

@@ -88,7 +88,7 @@ class Episodes:
         return terminated | (self.elapsed + 1 >= self._limit)
 
     def restart_ended(self, observation: np.ndarray, terminated: np.ndarray) -> np.ndarray:
-        """Count a step; begin anew where the task, or the limit, ended an episode."""
+        """Count a step; begin anew if the task, or the limit, ended an episode."""
         ended = np.flatnonzero(self.ending(terminated))
         self.elapsed += 1
         if len(ended):

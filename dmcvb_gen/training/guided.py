@@ -34,7 +34,7 @@ from dmcvb_gen.training.sac import RowBuffer
 from dmcvb_gen.training.settings import Count, Natural, NonNegative, Positive, Share
 
 GUIDE = "ant-maze-empty7x7"
-"""The task whose bundled expert walks where --init-from names none."""
+"""The task whose bundled expert walks if --init-from names none."""
 
 MOST_CELLS = 15
 """Rows or columns of the largest maze that is learned: an ant runs about twenty cells in an episode (1.6 m/s, 30 s)."""
@@ -61,7 +61,7 @@ class GuidedSettings:
       ramp: agent steps in which the learning rate rises to `learning_rate`: so that there are checkpoints on the way to
         an expert, which medium is picked from.
       half_life: agent steps in which the learning rate halves.
-      ahead: how far down the way the guide points, meters.
+      ahead: meters down the way at which the guide points.
       mean_share: share of the simulations in which the student acts by its mean, as data are made.
       drawn_share: share of a batch that lies at places drawn anew all over the maze; the rest is where students were.
       sunken_starts: share of training episodes that start deep in the floor, see sac's.
@@ -239,7 +239,7 @@ class Student:
         """
         if state["walker"] != self.run.walker.digest:
             raise DmcvbError(
-                f"{self.run.folder} walks as another policy than the one that is here now; choose another --out"
+                f"{self.run.folder} was begun with another walking policy than the one here; choose another --out"
             )
         self.way.load_state_dict(state["way"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -40,9 +40,9 @@ class MpoSettings:
       action_samples: actions drawn from the target policy for each state.
       epsilon: bound on the KL divergence of the weighted actions from the target policy (E-step).
       epsilon_mean, epsilon_std: bounds on the M-step's KL divergences, through the mean and through the deviation.
-      dual_learning_rate: of temperature and multipliers.
+      dual_learning_rate: learning rate of temperature and multipliers.
       target_period: updates after which the target networks become copies of policy and critics.
-      critics: how many critics; their mean is used.
+      critics: number of critics; their mean is used.
       reward_scale: multiplies rewards before learning.
       n_step, shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
       compile: compile the update. Without a C++ compiler a warning says that it runs uncompiled.

@@ -9,18 +9,18 @@ import numpy as np
 
 
 def rows_in(path: Path, shape: tuple[int, ...]) -> int:
-    """Whole rows of `shape` that a file holds; 0 where there is none."""
+    """Whole rows of `shape` that a file holds; 0 if there is none."""
     return path.stat().st_size // (4 * int(np.prod(shape))) if path.exists() else 0
 
 
 def map_rows(path: Path, rows: int, shape: tuple[int, ...]) -> np.memmap:
-    """Open a file of rows, keeping what it holds; it grows to `rows` where it has fewer, with zeros.
+    """Open a file of rows, keeping what it holds; it grows to `rows` if it has fewer, with zeros.
 
     The file takes its whole room on the disk at once: a disk that fills up later would kill the process at a
     write to the mapping (SIGBUS), where nothing can be said about it.
 
     Args:
-      shape: of one row.
+      shape: shape of one row.
 
     Returns:
       (rows or more, *shape) float32.

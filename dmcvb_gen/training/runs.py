@@ -3,7 +3,7 @@
 A run folder holds
 
     run.json                              what is trained, never changed
-    checkpoints/<agent step>.safetensors  a policy file an evaluation, thinned where there are many
+    checkpoints/<agent step>.safetensors  a policy file an evaluation, thinned if there are many
     progress.csv, tensorboard/            a row, a point an evaluation
     resume/                               learner, replay buffer, simulations, random states: a killed run goes on
     selected/, selection.json, curve.png  written by the selection
@@ -81,7 +81,7 @@ class RunConfig:
         mixed checkpoints are picked from.
       evaluate_sparse: the same once a fifth of the way from the paper's medium return to its expert's is behind.
       init_from: policy file or run whose actor, critics and normalization it starts from.
-      init_sha256: of that file as it was when the run began, where it is a file.
+      init_sha256: of that file as it was when the run began, if it is a file.
     """
 
     task: str
@@ -166,9 +166,9 @@ class Run(abc.ABC):
 
     Attributes:
       settings: the algorithm's checked settings.
-      header: of its policy files, without evaluation and agent step.
+      header: header of its policy files, without evaluation and agent step.
       step: agent steps so far.
-      seconds: of training so far, evaluations left out.
+      seconds: seconds of training so far, without evaluations.
       warmup_setting: the setting that says how long nothing is learned.
     """
 
@@ -223,11 +223,11 @@ class Run(abc.ABC):
         return EVALUATION_EPISODES
 
     def problem(self) -> str | None:
-        """Why a run with these settings would come to nothing, and the cure; None where nothing is wrong."""
+        """Why a run with these settings would come to nothing, and the cure; None if nothing is wrong."""
         return None
 
     def too_few_updates(self, warmup: int, needed: int = 1) -> str | None:
-        """A problem where the updates of all steps come to less than the policy needs to change once.
+        """A problem if the updates of all steps come to less than the policy needs to change once.
 
         Args:
           warmup: agent steps before the first update; `updates_per_step` come for every one after.
@@ -244,7 +244,7 @@ class Run(abc.ABC):
 
     @abc.abstractmethod
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
-        """Train until `config.steps`, from a saved state where there is one."""
+        """Train until `config.steps`, from a saved state if there is one."""
 
     # -- what callers use -------------------------------------------------------------------
 
@@ -281,7 +281,7 @@ class Run(abc.ABC):
                     self._log.close()
 
     def saved(self) -> dict[str, Any] | None:
-        """The state to resume from (tensors, numbers and texts only), None where nothing is saved yet."""
+        """The state to resume from (tensors, numbers and texts only), None if nothing is saved yet."""
         return read_state(self.folder)
 
     # -- what algorithms use ----------------------------------------------------------------
@@ -312,7 +312,7 @@ class Run(abc.ABC):
         return int(np.clip(affordable, 1, self.most_evaluation_episodes()))
 
     def next_evaluation(self, evaluation: Evaluation, planned: int) -> int:
-        """The agent step of the evaluation after this one: the planned one, where the run ended before it."""
+        """The agent step of the evaluation after this one: the planned one, if the run ended before it."""
         if self.step < planned:
             return planned
         config = self.config

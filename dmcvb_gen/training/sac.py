@@ -1,7 +1,7 @@
 """Soft actor-critic on batched simulations, with a squashed Gaussian actor.
 
 SAC (Haarnoja et al. 2018) with what makes humanoids learnable and CPUs fast: running observation
-normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products where the
+normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products if the
 processor has them, compiled updates. scripts/bench_training.py sets it beside Stable-Baselines3's SAC.
 """
 
@@ -60,10 +60,10 @@ class SacSettings:
       mean_share: share of the simulations that act by the mean, as data are made: a policy that only ever collects
         with noise never sees the places where its mean stands still.
       train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
-      critics: how many critics.
+      critics: number of critics.
       clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
         tasks want).
-      weight_decay: of AdamW, on actor and critics.
+      weight_decay: weight decay of AdamW, on actor and critics.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
       compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
@@ -222,7 +222,7 @@ class RowBuffer:
     Args:
       size: rows kept.
       shapes: name -> shape of one row of the field.
-      folder: where the files are; None keeps them in memory.
+      folder: folder of the files; None keeps them in memory.
     """
 
     def __init__(self, size: int, shapes: Mapping[str, tuple[int, ...]], folder: Path | None = None):

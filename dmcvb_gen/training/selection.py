@@ -61,7 +61,7 @@ class Convergence:
     Attributes:
       value: return at convergence, the mean of the last quarter of the smoothed curve.
       error: its standard error.
-      converged: whether the last quarter lies within 5 % of the way of the quarter before.
+      converged: True if the last quarter lies within 5 % of the way of the quarter before.
       reason: why not.
     """
 
@@ -143,7 +143,7 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
 
 
 Point = tuple[int, float, Path | None]
-"""Agent step, return, policy file; None where the file was thinned away."""
+"""Agent step, return, policy file; None if the file was thinned away."""
 
 
 def read_curve(folder: Path) -> list[Point]:
@@ -179,7 +179,7 @@ def pick_checkpoints(
       curve: (agent step, return, policy file), in order of steps.
       base: return at 0 % of the way.
       measure: evaluates a policy file on fresh episodes.
-      levels: what to pick, of `TRAINED_LEVELS`.
+      levels: levels to pick, out of `TRAINED_LEVELS`.
       medium: return that medium is to have; None: half of the way.
     """
     way, check = convergence.value - base, functools.cache(measure)

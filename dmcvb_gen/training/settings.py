@@ -59,7 +59,7 @@ class OffPolicySettings(Sb3Settings):
       buffer_size, learning_starts: agent steps.
       train_freq: steps of all simulations together (`simulations` agent steps) between updates.
       gradient_steps: updates each time.
-      tau: how far the target networks move an update.
+      tau: share by which an update moves the target networks.
     """
 
     buffer_size: Count = 1_000_000

@@ -31,7 +31,7 @@ class TaskVecEnv(VecEnv):
 
     Observations are (size, behaviour_size) float32, rewards (size,) float32 summed over the control steps.
     At an episode's end `infos[i]["terminal_observation"]` is its last observation (the one returned belongs to
-    the next episode), and `infos[i]["TimeLimit.truncated"]` is true where only the time limit ended it, so that
+    the next episode), and `infos[i]["TimeLimit.truncated"]` is true if only the time limit ended it, so that
     a learner bootstraps there and nowhere else. `infos[i]["episode"]` has its return "r" and length "l".
 
     Args:

@@ -126,7 +126,7 @@ def test_shipped_recipes_and_manifests_by_name(tmp_path):
         (lambda out: dmcvb_gen.rollout("walker-walk", episodes=2, steps=9, out=out), "not both"),
         (lambda out: dmcvb_gen.rollout("walker-walk", sample=True, out=out), "level random is always drawn"),
         (lambda out: dmcvb_gen.regenerate(manifest="quickstart"), "out=FOLDER"),
-        (lambda out: dmcvb_gen.verify(out, everything=True), "no URL"),
+        (lambda out: dmcvb_gen.verify(out, everything=True), "always read whole"),
         (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
         (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
     ],

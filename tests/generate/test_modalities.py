@@ -65,7 +65,8 @@ def check_lerobot(folder, file, flow, video):
     for modality in MODALITIES:
         name = flow.replace("flow", modality)
         feature = info["features"][f"observation.images.{name}"]
-        assert feature["dtype"] == ("video" if video else "image") and feature["info"]["encoding"] == ENCODINGS[modality]
+        assert feature["dtype"] == ("video" if video else "image")
+        assert feature["info"]["encoding"] == ENCODINGS[modality]
         wanted = color(modality, file[name][:length])
         if video:
             [path] = (folder / "lerobotTrue").rglob(f"observation.images.{name}/**/*.mp4")

@@ -167,7 +167,7 @@ def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, 
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))  # every longer file fails to be written
-        with pytest.raises(StoreError, match="what was committed is safe"):
+        with pytest.raises(StoreError, match="finished shards are saved"):
             list(run_jobs(plan.jobs))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)

@@ -228,9 +228,9 @@ def test_mistakes_are_answered():
     for task in ("walker-walk", "ant-maze-empty7x7"):
         with pytest.raises(DmcvbError, match="split 'test'.*train, val"):
             DistractedEnv(task, split="test")
-    with pytest.raises(DmcvbError, match="leave difficulty away"):
+    with pytest.raises(DmcvbError, match="remove difficulty"):
         DistractedEnv("ant-maze-empty7x7", "visible", difficulty="hard")
-    with pytest.raises(DmcvbError, match="leave goal away"):
+    with pytest.raises(DmcvbError, match="remove goal"):
         DistractedEnv("walker-walk", goal="hidden")
     with pytest.raises(DmcvbError, match="goal 'seen'.*hidden, visible"):
         DistractedEnv("ant-maze-empty7x7", "visible", goal="seen")

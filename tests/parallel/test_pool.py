@@ -107,7 +107,7 @@ def test_a_worker_that_dies_while_the_next_one_starts_is_said(monkeypatch):
 
 
 def test_a_killed_worker_is_one_line_with_a_cure():
-    with pytest.raises(StoreError, match="killed .*; what was committed is safe.* fewer --workers than 2") as caught:
+    with pytest.raises(StoreError, match="killed .*; finished shards are saved.* fewer --workers than 2") as caught:
         list(run_all(die, [1, 2], 2))
     assert "\n" not in str(caught.value)
 

@@ -445,7 +445,7 @@ def test_a_full_disk_is_said_and_what_came_stays(s3, tmp_path, small_release):
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest - 1000, limit[1]))
-        with pytest.raises(StoreError, match="make room and run the same command again"):
+        with pytest.raises(StoreError, match="make room and rerun the command"):
             fetch("s3://bucket/small", tmp_path / "r", [NAME], options=s3.options, workers=1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -458,7 +458,7 @@ def test_the_hub_gets_the_manifest_in_the_last_commit_and_goes_on_after_a_cut(ti
     monkeypatch.setattr("dmcvb_gen.storage.hub.BATCH", 20)
     hub, url = fake_hub(tmp_path / "hub", monkeypatch), "hf://datasets/me/tiny"
     hub.fail = 1
-    with pytest.raises(StoreError, match="run the same command again") as caught:
+    with pytest.raises(StoreError, match="rerun the same command") as caught:
         publish(tiny, url)
     assert "hf_secret123" not in str(caught.value) and MANIFEST not in hub.files
     hub.fail = None
@@ -486,7 +486,7 @@ def test_of_two_publishers_to_the_hub_one_is_told(tiny, monkeypatch, tmp_path):
         hub.create_commit("me/tiny", [], "of another", "dataset", str(len(hub.commits)))
         return moved
 
-    with monkeypatch.context() as patch, pytest.raises(StoreError, match="a commit has happened since.* run the same"):
+    with monkeypatch.context() as patch, pytest.raises(StoreError, match="a commit has happened since.* rerun the same"):
         patch.setattr(HubStorage, "upload_all", another_between)
         publish(tiny, url)
     assert MANIFEST not in hub.files

@@ -118,7 +118,7 @@ class StorageTests:
     @pytest.mark.parametrize("data", [b"x" * 1000, b"short", b"x" * 2000])
     def test_what_arrives_with_other_bytes_is_not_kept(self, storage, tmp_path, data):
         storage.write("a/b", data)
-        with pytest.raises(StoreError, match="cannot move a/b of .* run the same command again"):
+        with pytest.raises(StoreError, match="cannot move a/b of .* rerun the same command"):
             storage.download(record("a/b", b"y" * 1000), tmp_path)
         assert not (tmp_path / "a/b").exists()
 
@@ -213,7 +213,7 @@ class TestHub(StorageTests):
     def test_a_commit_between_is_refused(self, storage, hub):
         storage.begin()
         open_storage("hf://datasets/me/tiny/data").write("manifest.json", b"of another")
-        with pytest.raises(StoreError, match="a commit has happened since.*run the same command again"):
+        with pytest.raises(StoreError, match="a commit has happened since.*rerun the same command"):
             storage.write_last({"manifest.json": b"mine"})
         assert storage.read("manifest.json") == b"of another"
 

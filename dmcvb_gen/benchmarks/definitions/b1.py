@@ -11,7 +11,7 @@ from dmcvb_gen.benchmarks.suites import Benchmark, Cell, SubsetFinder, register_
 from dmcvb_gen.spec import DISTRACTOR_KINDS, MAZE_TRAINED_LEVELS, VISIBLE, is_maze
 
 POLICY_SETS = (("expert",), ("medium",), ("expert", "medium"), ("mixed",), ("random",))
-"""Levels of the data that a policy learns from; mazes have the first two, and others where a release has them."""
+"""Levels of the data that a policy learns from; mazes have the first two, and others if a release has them."""
 
 
 @register_benchmark("b1")

@@ -24,7 +24,7 @@ def color(modality: str, values: np.ndarray) -> np.ndarray:
     """Show values of a modality as RGB.
 
     Args:
-      modality: of `spec.LABEL_TYPES`.
+      modality: a name out of `spec.LABEL_TYPES`.
       values: (..., height, width) or, of flow, (..., height, width, 2), see `spec.LABEL_TYPES`.
 
     Returns:

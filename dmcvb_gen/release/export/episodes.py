@@ -19,7 +19,7 @@ class ExportEpisode:
     """An episode of L transitions.
 
     Attributes:
-      index: in the subset. seed: label of its random streams.
+      index: index in the subset. seed: label of its random streams.
       pixels: view -> (L + 1, height, width, 3) uint8.
       state: (L + 1, state) float32.
       action, reward, discount: (L, action), (L,), (L,) float32.

@@ -38,9 +38,9 @@ def publish_export(
     """Put an export at a URL; run again after an interruption, it goes on.
 
     Args:
-      folder: what `export` wrote: a subset's folder, or a folder of several (except for LeRobot on the Hub).
+      folder: folder that `export` wrote: a subset's, or a folder of several (except for LeRobot on the Hub).
       url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL.
-      options: of fsspec. api: a `huggingface_hub.HfApi`, for tests.
+      options: options of fsspec. api: a `huggingface_hub.HfApi`, for tests.
       tick: called with 1 for each file.
 
     Raises:

@@ -33,7 +33,7 @@ class Format:
     """One export format.
 
     Attributes:
-      name: what `--to` takes.
+      name: name for `--to`.
       write: writes a subset (`Source`) to an empty folder; with the option "merge", a list of subsets.
       reader: the program that reads it.
       keeps, drops: which parts of a subset it contains and which it leaves out, in words.

@@ -20,7 +20,7 @@ def _entry(factory: Callable):
 
 
 def call(factory: Callable, *arguments) -> None:
-    """Call an entry point; say so where it is compiled first."""
+    """Call an entry point; say so if it is compiled first."""
     entry = _entry(factory)
     if entry.signatures:
         entry(*arguments)

@@ -704,7 +704,7 @@ def paint_frames(
     stays, shown, hidden,
 ):  # fmt: skip
     """Paint frames into `shown`, and without the goal into `hidden`, each (frame, pixels, pixels, 3) uint8, or of no
-    frames where it is not wanted; arguments as `Still`, `Frames` and `Work` name them.
+    frames if it is not wanted; arguments as `Still`, `Frames` and `Work` name them.
 
     Args:
       stays: no plane, shadow or mirror image ever moves.

@@ -111,7 +111,7 @@ def lamp_light(s, n, k, lamp, exponent):
     """Compute LAMP_DIFFUSE and LIGHT at points with normals, and CONE_FACTOR and LAMP_SHINE before they are raised.
 
     Args:
-      lamp: where its place and direction are in k.
+      lamp: index of its place and direction in k.
     """
     distinct()
     ox, oy, oz = f4(k[lamp]), f4(k[lamp + 1]), f4(k[lamp + 2])
@@ -188,7 +188,7 @@ def aim_shadows(k, rec):
 @part
 def ways_from_lamp(s, n, k):
     """Points and LIGHT in; ways from the lamp to them out, none (the lamp is seen) outside the shadow map's square
-    or where there is no light. Gives the extent of the others in the map: least and greatest right and up, grains.
+    or if there is no light. Gives the extent of the others in the map: least and greatest right and up, grains.
     """
     distinct()
     ox, oy, oz = f4(k[LAMP]), f4(k[LAMP + 1]), f4(k[LAMP + 2])

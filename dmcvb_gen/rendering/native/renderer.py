@@ -113,7 +113,7 @@ class NativeRenderer(Renderer):
     def _paint(
         self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None, shown: bool, hidden: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Frames with and without the goal; none where they are not asked for."""
+        """Frames with and without the goal; none if they are not asked for."""
         indices = check_frames(self.task, physics, exogenous, views)
         shape = (len(indices), self.size, self.size, 3)
         out = [np.empty((len(physics) * asked, *shape), np.uint8) for asked in (shown, hidden)]

@@ -64,7 +64,7 @@ class Scene:
       moving: (geom,) bool; the others never move.
       goal: (geom,) bool, left out of the hidden-goal pictures.
       mirror: the geom that mirrors (the first reflective plane), or -1.
-      reflectance: of that plane.
+      reflectance: reflectance of that plane.
       headlight: (9,) float64, ambient, diffuse and specular RGB; zeros when off.
       lamps: indices of the lamps in the model.
       shine: (lamp, 12) float64, the same of each lamp, then the cosine of its cut-off angle, its exponent, and the

@@ -188,7 +188,7 @@ def cover_plane(s, n, k, rec, g, veil, further, tint):
     """Lay plane g over the base colors; with `veil` below 1 blended with them.
 
     Args:
-      veil: how much of the base colors is hidden.
+      veil: share of the base colors that is hidden.
       tint: dims its color, but no highlight.
       further: the first lamp has been laid over them already, and this is the light of another one.
     """

@@ -12,7 +12,7 @@ from dmcvb_gen.rendering.native.lanes import distinct, get, leaf, part, put
 
 f4, i4 = np.float32, np.int32
 BITS = 22
-"""Of Pillow's weights below the point."""
+"""Bits of Pillow's weights below the point."""
 
 
 def taps(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:

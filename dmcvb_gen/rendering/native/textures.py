@@ -120,7 +120,7 @@ class Textures:
     Attributes:
       texels: (texel,) int32, the table, then all levels of all textures.
       table: (texture, column) int32, where they are: see `records.FIRST`. Backgrounds come after the model's own.
-      slots: how many backgrounds there is room for.
+      slots: number of backgrounds that there is room for.
     """
 
     def __init__(self, model: mujoco.MjModel, backgrounds, finest: int):

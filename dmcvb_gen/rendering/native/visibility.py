@@ -41,7 +41,7 @@ def sample_rays(size: int, step: float, centers: bool = False) -> np.ndarray:
     First x of (4 * column + sample), then, in the same order, y below the upper edge of a row, then y of these edges.
 
     Args:
-      step: of x and y from pixel to pixel.
+      step: change of x and y from pixel to pixel.
       centers: all samples in the middle of their pixels.
     """
     right, down = np.full((2, 4), 0.5) if centers else np.array(SAMPLES).T

@@ -88,7 +88,7 @@ class Layout:
         )
 
     def check_cell(self, cell: tuple[int, int], what: str) -> None:
-        """Raises LayoutError where a start or a goal is not on the floor."""
+        """Raises LayoutError if a start or a goal is not on the floor."""
         if tuple(cell) not in self.free:
             raise LayoutError(
                 f"{what} {tuple(cell)} is no floor cell of layout {self.name!r}; "

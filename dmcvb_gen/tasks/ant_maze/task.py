@@ -298,7 +298,7 @@ class AntMaze(Task):
 
     Args:
       layout: the maze.
-      reward: how distance is measured, "saturated" (DMC-VB's) or "geodesic" (the shortest path).
+      reward: measure of distance, "saturated" (DMC-VB's) or "geodesic" (the shortest path).
       id: the task's name.
     """
 

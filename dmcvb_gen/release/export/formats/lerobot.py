@@ -45,8 +45,8 @@ def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
 
     Several subsets are the tasks of one data set. Depth, segmentation and flow that are stored become images of their
-    own, "observation.images.depth", by `coloring.color`; info.json says how their values are read back. The last observation of an episode has no action and is left out,
-    as LeRobot's frames all have one.
+    own, "observation.images.depth", by `coloring.color`; info.json says how their values are read back. The last
+    observation of an episode has no action and is left out, as LeRobot's frames all have one.
 
     Raises:
       StoreError: the subsets do not fit into one data set, or pictures of this size into a video.
@@ -128,7 +128,7 @@ class _Layout:
       tasks: their texts; `task_index` counts them. robot: what they have in common.
       keys: view -> feature of its pictures.
       modalities: array of depth, segmentation or flow -> feature of its pictures.
-      features: as info.json says them.
+      features: features as in info.json.
     """
 
     def __init__(self, sources: Sequence[Source], video: bool):
@@ -136,8 +136,8 @@ class _Layout:
         for source in sources:
             if _shape(source) != _shape(first):
                 raise StoreError(
-                    f"{source.subset.name} and {first.subset.name} differ in views, size, state, action or modalities, so they "
-                    "do not fit into one data set; merge fewer with --only"
+                    f"{source.subset.name} and {first.subset.name} differ in views, size, state, action or "
+                    "modalities, so they do not fit into one data set; merge fewer with --only"
                 )
         self.sources, self.video, self.size = sources, video, first.subset.record.size
         if video and self.size % 2:

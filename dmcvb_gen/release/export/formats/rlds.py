@@ -30,7 +30,7 @@ def write(source: Source, folder: Path) -> None:
 
     A step has observation/<view>, observation/state, action, reward, discount, is_first, is_last, is_terminal, and
     the state's parts once more under the names and types of DMC-VB's own data set (observation/velocity, ...;
-    float64, numbers without an axis where dm_control gives such); the views of mazes have its names alone
+    float64, numbers without an axis if dm_control gives such); the views of mazes have its names alone
     (observation/lowres_top_camera, ...). So its loader takes the folder. The last step of an episode holds the last
     observation; its action is zeros and means nothing (RLDS). An episode has its `episode_index` and, of fixed goals,
     its `goal_pair`.
