@@ -411,7 +411,7 @@ def repair(history: History) -> None:
         path.write_bytes(rng.choice(others))
     history.steps.append(f"{name}: {kind}")
     history.struck += 1
-    history.damaged = {name}
+    history.damaged = {name} | {other for other in tree(root) if path.exists() and path.samefile(root / other)}
     history.world.table.add("release", kind, "times")
     checked = Command(["verify", str(root)], history.folder).finish()
     history.steps.append(f"verify -> {checked.code}: {checked.said.strip()[:300]}")

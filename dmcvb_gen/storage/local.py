@@ -30,6 +30,8 @@ class LocalStorage(Storage):
     url: str = ""
     _sent: dict[tuple, str] = field(default_factory=dict, compare=False, repr=False)
     """Local files with several names that were sent -> their path here; their other names become links."""
+    _tidied: set[Path] = field(default_factory=set, compare=False, repr=False)
+    """Folders without files that killed processes left in the making."""
 
     @property
     def place(self) -> str:
@@ -52,7 +54,15 @@ class LocalStorage(Storage):
             return file.read(end - start)
 
     def _write(self, path: str, data: bytes) -> None:
+        self._tidy(path)
         files.write_bytes(self.folder / path, data)
+
+    def _tidy(self, path: str) -> None:
+        """Delete what killed processes left beside a file that is about to be written, once for each folder."""
+        parent = (self.folder / path).parent
+        if parent not in self._tidied:
+            self._tidied.add(parent)
+            files.remove_partial(parent, below=False)
 
     def _create(self, path: str, data: bytes) -> None:
         target = self.folder / path
@@ -78,6 +88,7 @@ class LocalStorage(Storage):
         return (self.folder / path).stat().st_size
 
     def _send(self, local: Path, path: str) -> None:
+        self._tidy(path)
         node = local.stat()
         if node.st_nlink == 1:
             return files.copy_file(local, self.folder / path)

@@ -486,7 +486,10 @@ def test_of_two_publishers_to_the_hub_one_is_told(tiny, monkeypatch, tmp_path):
         hub.create_commit("me/tiny", [], "of another", "dataset", str(len(hub.commits)))
         return moved
 
-    with monkeypatch.context() as patch, pytest.raises(StoreError, match="a commit has happened since.* rerun the same"):
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(StoreError, match="a commit has happened since.* rerun the same"),
+    ):
         patch.setattr(HubStorage, "upload_all", another_between)
         publish(tiny, url)
     assert MANIFEST not in hub.files

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import errno
 import pickle
+import subprocess
+import sys
 import threading
 import uuid
 
 import pytest
 
+from dmcvb_gen import files
 from dmcvb_gen.dataset.manifest import FileRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
@@ -159,6 +162,19 @@ class TestFolder(StorageTests):
             patch.setattr("os.fsync", full)
             storage.write("a", b"2")
         assert storage.read("a") == b"1" and [path.name for path in storage.folder.iterdir()] == ["a"]
+
+    @pytest.mark.parametrize("sent", [True, False])
+    def test_what_a_killed_process_left_beside_a_file_goes_and_what_a_running_one_makes_stays(
+        self, storage, tmp_path, sent
+    ):
+        code = "import os, sys; from dmcvb_gen import files\nwith files.replacing(sys.argv[1]): os.kill(os.getpid(), 9)"
+        subprocess.run([sys.executable, "-c", code, str(storage.folder / "a/b")])
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a/b").write_bytes(b"1")
+        assert len(list((storage.folder / "a").iterdir())) == 1
+        with files.replacing(storage.folder / "a/c") as temporary:
+            storage.upload(tmp_path, record("a/b", b"1")) if sent else storage.write("a/b", b"1")
+            assert set((storage.folder / "a").iterdir()) == {storage.folder / "a/b", temporary}
 
 
 class TestFileUrl(StorageTests):
