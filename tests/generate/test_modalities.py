@@ -18,7 +18,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.repaint import Repainting, repaint
-from dmcvb_gen.release.export.coloring import ENCODINGS, FLOW_STEP, color, uncolor
+from dmcvb_gen.release.export.coloring import DEPTH_SCALE, ENCODINGS, FLOW_STEP, color, uncolor
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
@@ -87,7 +87,9 @@ def test_colors_are_read_back(geoms, numbers):
     assert np.abs(uncolor("flow", color("flow", flow)) - flow).max() <= FLOW_STEP / 2
     depth = np.abs(flow[..., 0])
     near = (depth > 0.01) & (depth < 10)
-    assert (np.abs(uncolor("depth", color("depth", depth)) - depth) <= (1 + depth) ** 2 / 400)[near].all()
+    assert (
+        np.abs(uncolor("depth", color("depth", depth)) - depth) <= DEPTH_SCALE * (1 + depth / DEPTH_SCALE) ** 2 / 400
+    )[near].all()
     assert not color("depth", np.zeros((1, 2, 2), np.float32)).any()
 
 

@@ -47,3 +47,10 @@ for one in mazes:
         start += len(stored[f"action_{index}"])
 assert start == len(dataset)
 print(f"lerobot: {len(mazes)} subsets in one data set, {len(dataset)} frames", flush=True)
+
+dataset, stored = LeRobotDataset("local/causes", root=work / "causes_export"), np.load(work / "causes.npz")
+for step in (0, 7):
+    for name in stored:
+        found = np.rint(dataset[step][f"observation.images.{name}"].numpy().transpose(1, 2, 0) * 255)
+        np.testing.assert_array_equal(found, stored[name][step])
+print(f"lerobot: images of {', '.join(stored)} as stored", flush=True)
