@@ -28,7 +28,6 @@ from dmcvb_gen.options import (
     Split,
 )
 from dmcvb_gen.parallel import Workers, ignore
-from dmcvb_gen.spec import LABEL_TYPES
 from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
@@ -197,7 +196,7 @@ def repaint(
     samples: Samples | None = None,
     backgrounds: Location | None = None,
     split: Split | None = None,
-    labels: Annotated[Names, tuple(LABEL_TYPES)] = (),
+    labels: Names = (),
     device: str = "cpu",
     name: str | None = None,
     out: Local,
@@ -216,7 +215,7 @@ def repaint(
       samples: Samples per pixel: 1, 2, 4 or 8.
       backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
       split: Background videos and maze styles. [default: the recipe's]
-      labels: Also store depth, segmentation or flow (optical flow to the next frame).
+      labels: Also store a modality: depth, segmentation, parts, flow (optical flow to the next frame) or your own.
       device: Device that renders: cpu, or cuda with warp.
       name: Name of the new release. [default: NAME-repainted]
       out (FOLDER): Folder of the new release.

@@ -95,12 +95,6 @@ REWARDS = ("saturated", "geodesic")
 SPLITS = ("train", "val")
 """Which videos and maze styles: for data, or kept for evaluation."""
 
-LABEL_TYPES = {"depth": "float32", "segmentation": "int16", "flow": "float32"}
-"""Labels that can be painted a pixel each -> dtype: depth in meters (0: sky), segmentation by geom id (-1: sky), flow
-to the next frame in pixels (right, down; zero in an episode's last frame)."""
-LABEL_SHAPES: dict[str, tuple[int, ...]] = {"flow": (2,)}
-"""Numbers of a pixel, of labels that have more than one."""
-
 _MAZE_ID = re.compile(rf"{ANT_MAZE}-(?P<layout>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?(@(?P<reward>\w+))?")
 
 

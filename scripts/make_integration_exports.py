@@ -17,10 +17,9 @@ sys.path.insert(0, str(ROOT))
 
 from dmcvb_gen.dataset import open_release  # noqa: E402
 from dmcvb_gen.dataset.pictures import shown  # noqa: E402
+from dmcvb_gen.generate.modalities import all_modalities  # noqa: E402
 from dmcvb_gen.generate.repaint import Repainting, repaint  # noqa: E402
 from dmcvb_gen.release.export import export  # noqa: E402
-from dmcvb_gen.release.export.coloring import color  # noqa: E402
-from dmcvb_gen.spec import LABEL_TYPES  # noqa: E402
 from tests.conftest import TINY_MAZE, roll_out, small_recipe  # noqa: E402
 
 FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer",)}
@@ -28,10 +27,10 @@ FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer"
 
 def export_modalities(work: Path) -> None:
     """The walker with depth, segmentation and flow for LeRobot, and the images of the first episode beside."""
-    repaint(Repainting(work / "walker", work / "causes", labels=list(LABEL_TYPES)))
+    repaint(Repainting(work / "walker", work / "causes", labels=list(all_modalities())))
     [subset] = open_release(work / "causes").subsets.values()
-    values = subset.episode(0, list(LABEL_TYPES))
-    np.savez(work / "causes.npz", **{name: color(name, values[name]) for name in LABEL_TYPES})
+    values = subset.episode(0, list(all_modalities()))
+    np.savez(work / "causes.npz", **{name: one.color(values[name]) for name, one in all_modalities().items()})
     export(str(work / "causes"), "lerobot", work / "causes_export", merge=True)
 
 

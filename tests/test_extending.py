@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -52,6 +53,24 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
     assert (subset.read("exogenous/background_video") == -1).all()  # what it does not give is the task's own
     run("card", tmp_path / "r")
     assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
+
+
+@pytest.mark.parametrize("family", ["small_release", "small_mazes"])
+def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request, tmp_path):
+    load("modality")
+    run("repaint", request.getfixturevalue(family), "--only", "*/random/*", "--label", "near", "--out", tmp_path / "r")
+    run("verify", tmp_path / "r")
+    subset = next(iter(open_release(tmp_path / "r").subsets.values()))
+    name = next(array for array in subset.arrays if array.split("/")[0] == "near")
+    near = subset.episode(0, [name])[name]
+    assert near.dtype == np.uint8 and set(np.unique(near)) <= {0, 1}
+    run("export", tmp_path / "r", "--to", "lerobot", "--out", tmp_path / "x")
+    assert any("observation.images.near" in path.read_text() for path in (tmp_path / "x").rglob("info.json"))
+    name = "walker-walk-none" if family == "small_release" else "ant-maze-empty7x7-visible"
+    env = gymnasium.make(f"dmcvb_gen/{name}-v0", size=16, modalities=["near"])
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation) and set(np.unique(observation["near"])) <= {0, 1}
+    env.close()
 
 
 def validated(release, tmp_path, *options) -> dict:

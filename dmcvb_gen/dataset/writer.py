@@ -37,7 +37,6 @@ from dmcvb_gen.dataset.manifest import environment as this_environment
 from dmcvb_gen.dataset.schema import SCHEMA_VERSION, ArraySpec, create_arrays, picture_layout_for, stored_name
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import PARTIAL, copy_file, parse_json, remove_partial, sha256_file
-from dmcvb_gen.spec import LABEL_TYPES
 from dmcvb_gen.storage.remote import storage_errors
 
 LOCK, LOCK_SECONDS = ".lock", 60.0
@@ -176,7 +175,7 @@ def _put_metadata(folder: Path, path: Path, keep: bool = False) -> None:
 
 
 def add_arrays(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
-    """Give a subset that has shards already more arrays (metadata alone); its data, and labels a pixel, stay.
+    """Give a subset that has shards already more arrays (metadata alone); its data, and its modalities, stay.
 
     Args:
       specs: specs of all arrays that the subset then has.
@@ -198,9 +197,9 @@ def _write_metadata(path: Path, specs: tuple[ArraySpec, ...], attributes: dict, 
         group = zarr.create_group(folder, attributes=attributes, overwrite=True)
         version = attributes.get("schema_version", SCHEMA_VERSION)
         create_arrays(group, specs, *shape, schema_version=version)  # type: ignore[misc]
-        for label in LABEL_TYPES:
-            for there in path.glob(f"{label}*/**/{ZARR_JSON}"):
-                copy_file(there, Path(folder) / there.relative_to(path))
+        for there in (*path.glob(f"*/{ZARR_JSON}"), *path.glob(f"*/*/{ZARR_JSON}")):
+            if not (target := Path(folder) / there.relative_to(path)).exists():  # a modality's
+                copy_file(there, target)
         _put_metadata(Path(folder), path, keep)
 
 

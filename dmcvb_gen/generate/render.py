@@ -6,7 +6,7 @@ The engine, the checks and the readers that render on demand share it.
 from __future__ import annotations
 
 import atexit
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,11 @@ from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError, UnknownNameError
-from dmcvb_gen.generate.flow import render_flow
+from dmcvb_gen.generate.modalities import Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import LABEL_SHAPES, LABEL_TYPES
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -252,6 +251,28 @@ def label_arrays(exogenous: DistractorState, length: np.ndarray, rows: int) -> I
         yield f"exogenous/{name}", full
 
 
+def look(
+    renderer: Renderer,
+    physics: np.ndarray,
+    labels: DistractorState,
+    views: Sequence[str],
+    hide_goal: bool = False,
+    next_physics: np.ndarray | None = None,
+    next_labels: DistractorState | None = None,
+) -> list[Seen]:
+    """Frames as modalities are computed from them, one for each view; see `Seen` for the arguments.
+
+    Raises:
+      RenderingError: the renderer has no depth and segmentation.
+    """
+    found = renderer.render_labels(physics, labels, views, hide_goal)
+    after, depth, geom = (next_physics, next_labels), found["depth"], found["segmentation"]
+    return [
+        Seen(renderer.task, view, renderer.size, depth[:, place], geom[:, place], physics, labels, *after)
+        for place, view in enumerate(views)
+    ]
+
+
 def paint_labels(
     task: Task,
     renderer: Renderer,
@@ -262,25 +283,23 @@ def paint_labels(
     label: str,
     hide_goal: bool,
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Depth, segmentation or flow of what the subset's pictures show, one array a view.
+    """A modality of what the subset's pictures show, one array a view.
 
     Args:
-      label: one of `LABEL_TYPES`.
+      label: name of the modality.
 
     Yields:
       (name, (episode, rows, size, size, ...)); rows past an episode's end stay zero.
     """
-    last = length[:, None] - (label == "flow")  # whose next frame is there
+    modality = get_modality(label)
+    last = length[:, None] - modality.needs_next  # whose next frame is there
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= last)
     for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
-        size = (renderer.size, renderer.size, *LABEL_SHAPES.get(label, ()))
-        out = np.zeros((len(physics), rows, *size), LABEL_TYPES[label])
+        size = (renderer.size, renderer.size, *modality.shape)
+        out = np.zeros((len(physics), rows, *size), modality.dtype)
         for first in range(0, len(episode), LABEL_FRAMES):
             e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
-            frames = (physics[e, r], exogenous[e, r])
-            if label == "flow":
-                after = (physics[e, r + 1], exogenous[e, r + 1])
-                out[e, r] = render_flow(renderer, *frames, *after, view, hide_goal)
-            else:
-                out[e, r] = renderer.render_labels(*frames, [view], hide_goal)[label][:, 0]
+            after = (physics[e, r + 1], exogenous[e, r + 1]) if modality.needs_next else (None, None)
+            [seen] = look(renderer, physics[e, r], exogenous[e, r], [view], hide_goal, *after)
+            out[e, r] = modality.compute(seen)
         yield name, out

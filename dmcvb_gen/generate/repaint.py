@@ -19,11 +19,12 @@ from dmcvb_gen.dataset.pictures import view_arrays
 from dmcvb_gen.dataset.reader import Subset, load_manifest
 from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, subset_specs
 from dmcvb_gen.dataset.writer import create_subset, finish_together, read_commits, start_release
-from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
+from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.inputs import BUILTIN, Inputs, policy_files, video_source
 from dmcvb_gen.generate.jobs import Stored, make_jobs, recipe_of, stream_names
+from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
 from dmcvb_gen.generate.recipe import Recipe, make_recipe
 from dmcvb_gen.generate.render import (
@@ -32,7 +33,7 @@ from dmcvb_gen.generate.render import (
 from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
-from dmcvb_gen.spec import LABEL_SHAPES, LABEL_TYPES, Distractor, is_maze, select
+from dmcvb_gen.spec import Distractor, is_maze, select
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -88,12 +89,13 @@ class Repainted:
 
 
 def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
-    """Specs of depth, segmentation and flow: "depth", or "depth/<view>" if a task has several views."""
+    """Specs of modalities: "depth", or "depth/<view>" if a task has several views."""
     specs = []
-    for label in labels:
-        shape, dims = (size, size, *LABEL_SHAPES.get(label, ())), ("height", "width", "direction")
+    for modality in map(get_modality, labels):
+        shape, dims = (size, size, *modality.shape), ("height", "width", "direction")
         specs += [
-            ArraySpec(name, LABEL_TYPES[label], shape, dims[: len(shape)]) for name in view_arrays(label, task.views)
+            ArraySpec(name, modality.dtype, shape, dims[: len(shape)])
+            for name in view_arrays(modality.name, task.views)
         ]
     return tuple(specs)
 
@@ -167,9 +169,8 @@ def _source(request: Repainting) -> Release:
     release = open_release(request.root)
     if Path(request.out).resolve() == release.path.resolve():
         raise StoreError(f"--out {request.out} is the release itself; give another folder")
-    unknown = [label for label in request.labels if label not in LABEL_TYPES]
-    if unknown:
-        raise DmcvbError(f"unknown label {unknown[0]!r}; known: {', '.join(LABEL_TYPES)}")
+    for label in request.labels:
+        get_modality(label)
     if not release.subsets:
         raise StoreError(f"{request.root} has no committed episodes yet; run the rollout first")
     if request.size is not None:

@@ -22,14 +22,14 @@ from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import Distractor, DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.generate.render import check_renderer
+from dmcvb_gen.generate.modalities import get_modality
+from dmcvb_gen.generate.render import check_renderer, look
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
     GOAL_PICTURES,
     HIDDEN,
-    LABEL_TYPES,
     SPLITS,
     VISIBLE,
     GoalMode,
@@ -43,9 +43,6 @@ PURPOSE = "evaluation"
 """Names the random streams: no episode here has those of released data."""
 FIXED_GOALS = 5
 """Pairs of start and goal that "fixed" episodes go round by default (benchmark B3)."""
-
-ENVIRONMENT_MODALITIES = {"depth": (0, np.inf), "segmentation": (-1, np.iinfo(np.int16).max)}
-"""Labels a pixel that observations may have -> their smallest and largest value."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,7 @@ class Scene:
       backgrounds: "builtin" or a folder of videos.
       own_videos: digest of the videos of the data, if these are not the built-in ones; then give `backgrounds`.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
-      modalities: "depth" (meters, 0: sky) and "segmentation" (geom id, -1: sky), which observations have besides.
+      modalities: names of modalities that observations have too, e.g. "depth" and "parts"; see `generate.modalities`.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
       fixed_goals: number of pairs of start and goal under "fixed"; an episode takes the next one.
       goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
@@ -116,10 +113,10 @@ class Scene:
                 "folder with backgrounds=FOLDER"
             )
         for modality in self.modalities:
-            if modality == "flow":
-                raise DmcvbError("an environment has no flow: the next frame is not known yet; remove flow")
-            if modality not in ENVIRONMENT_MODALITIES:
-                raise UnknownNameError("modality", modality, ENVIRONMENT_MODALITIES)
+            if get_modality(modality).needs_next:
+                raise DmcvbError(
+                    f"an environment has no {modality}: the next frame is not known yet; remove {modality}"
+                )
         if self.goal and not maze:
             raise DmcvbError(f"{self.task} has no goal in its pictures; remove goal")
 
@@ -167,10 +164,9 @@ class _Stage:
             "pixels": spaces.Box(0, 255, shape, np.uint8),
             "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
         }
-        shape = (self.size, self.size, len(self.pictures.views))
-        for name in self.modalities:
-            low, high = ENVIRONMENT_MODALITIES[name]
-            observation[name] = spaces.Box(low, high, shape, np.dtype(LABEL_TYPES[name]).type)
+        for modality in map(get_modality, self.modalities):
+            values, (low, high) = (self.size, self.size, len(self.pictures.views), *modality.shape), modality.bounds
+            observation[modality.name] = spaces.Box(low, high, values, np.dtype(modality.dtype).type)
         return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
 
     def start(self, places: Iterable[int], seeds: Sequence[int]) -> None:
@@ -215,8 +211,9 @@ class _Stage:
         pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
         observation = {"pixels": pixels, "state": self.state.astype(np.float32)}
         if self.modalities:
-            found = self.renderer.render_labels(physics, labels, shown.views, shown.hide_goal)
-            observation |= {name: np.moveaxis(found[name], 1, 3) for name in self.modalities}
+            seen = look(self.renderer, physics, labels, shown.views, shown.hide_goal)
+            for modality in map(get_modality, self.modalities):
+                observation[modality.name] = np.stack([modality.compute(view) for view in seen], axis=3)
         return observation
 
     def step(self, actions: ArrayLike, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

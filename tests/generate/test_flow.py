@@ -6,12 +6,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from dmcvb_gen.generate.flow import render_flow
+from dmcvb_gen.generate.modalities import get_modality
+from dmcvb_gen.generate.render import look
 from dmcvb_gen.tasks import PHYSICS_SPEC, get_task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 from tests.rendering.test_rendering import frames_of, renderer_of
 
 SIZE = 64
+
+
+def render_flow(renderer, physics, labels, next_physics, next_labels, view):
+    [seen] = look(renderer, physics, labels, [view], False, next_physics, next_labels)
+    return get_modality("flow").compute(seen)
 
 
 def pose(model, physics):

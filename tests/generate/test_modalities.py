@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import gymnasium
 import imageio.v3 as iio
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,14 +15,16 @@ from hypothesis import strategies as st
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.modalities import get_modality
+from dmcvb_gen.generate.modalities.depth import SCALE
+from dmcvb_gen.generate.modalities.flow import STEP
+from dmcvb_gen.generate.modalities.parts import AGENT, BACKGROUND, COLORS, FLOOR, GOAL, WALL
 from dmcvb_gen.generate.repaint import Repainting, repaint
-from dmcvb_gen.release.export.coloring import DEPTH_SCALE, ENCODINGS, FLOW_STEP, color, uncolor
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
 
-MODALITIES = ["depth", "segmentation", "flow"]
+MODALITIES = ["depth", "segmentation", "flow", "parts"]
 
 
 @pytest.mark.slow
@@ -51,6 +52,8 @@ def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_releas
     key = "flow" if len(views) == 1 else f"flow_{views[0]}"
     np.testing.assert_array_equal(file[key], flow)
     assert file[key.replace("flow", "segmentation")].dtype == np.int16
+    parts = {BACKGROUND, AGENT, FLOOR} | ({WALL} if family == "maze" else set())
+    assert parts <= set(np.unique(np.concatenate([file[k].ravel() for k in file if k.startswith("parts")]))) | {GOAL}
     check_lerobot(tmp_path, file, key, video=False)
     check_lerobot(tmp_path, file, key, video=True)
 
@@ -66,8 +69,8 @@ def check_lerobot(folder, file, flow, video):
         name = flow.replace("flow", modality)
         feature = info["features"][f"observation.images.{name}"]
         assert feature["dtype"] == ("video" if video else "image")
-        assert feature["info"]["encoding"] == ENCODINGS[modality]
-        wanted = color(modality, file[name][:length])
+        assert feature["info"]["encoding"] == get_modality(modality).encoding
+        wanted = get_modality(modality).color(file[name][:length])
         if video:
             [path] = (folder / "lerobotTrue").rglob(f"observation.images.{name}/**/*.mp4")
             found = iio.imread(path, plugin="FFMPEG")[-length:]
@@ -81,32 +84,14 @@ def check_lerobot(folder, file, flow, video):
 
 @given(geoms=st.lists(st.integers(-1, 2**15 - 1), min_size=1), numbers=st.lists(st.floats(-15, 15), min_size=2))
 def test_colors_are_read_back(geoms, numbers):
-    segmentation = np.array(geoms, np.int16)[:, None]
-    np.testing.assert_array_equal(uncolor("segmentation", color("segmentation", segmentation)), segmentation)
+    segmentation, (depth_of, geom_of, flow_of) = np.array(geoms, np.int16)[:, None], map(get_modality, MODALITIES[:3])
+    np.testing.assert_array_equal(geom_of.uncolor(geom_of.color(segmentation)), segmentation)
     flow = np.float32(numbers)[:, None, None].repeat(2, axis=-1)
-    assert np.abs(uncolor("flow", color("flow", flow)) - flow).max() <= FLOW_STEP / 2
+    assert np.abs(flow_of.uncolor(flow_of.color(flow)) - flow).max() <= STEP / 2
     depth = np.abs(flow[..., 0])
     near = (depth > 0.01) & (depth < 10)
-    assert (
-        np.abs(uncolor("depth", color("depth", depth)) - depth) <= DEPTH_SCALE * (1 + depth / DEPTH_SCALE) ** 2 / 400
-    )[near].all()
-    assert not color("depth", np.zeros((1, 2, 2), np.float32)).any()
-
-
-@pytest.mark.parametrize("task", ["walker-walk", "cartpole-swingup", "ant-maze-empty7x7"])
-def test_environments_give_depth_and_segmentation(task):
-    setting = "visible" if task.startswith("ant") else "dynamic"
-    name, options = f"dmcvb_gen/{task}-{setting}-v0", dict(size=16, modalities=["depth", "segmentation"])
-    env = gymnasium.make(name, **options)
-    observation, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-    assert ((observation["depth"] > 0) == (observation["segmentation"] >= 0)).mean() > 0.9
-    env.close()
-    many = gymnasium.make_vec(name, num_envs=2, **options)
-    observations, _ = many.reset(seed=0)
-    assert many.observation_space.contains(observations)
-    many.close()
-    with pytest.raises(DmcvbError, match="has no flow"):
-        gymnasium.make(name, modalities=["flow"])
-    with pytest.raises(UnknownNameError, match="depht"):
-        gymnasium.make(name, modalities=["depht"])
+    assert (np.abs(depth_of.uncolor(depth_of.color(depth)) - depth) <= SCALE * (1 + depth / SCALE) ** 2 / 400)[
+        near
+    ].all()
+    np.testing.assert_array_equal(get_modality("parts").uncolor(COLORS[None]), [range(len(COLORS))])
+    assert not depth_of.color(np.zeros((1, 2, 2), np.float32)).any()

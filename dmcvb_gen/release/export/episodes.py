@@ -10,8 +10,8 @@ import numpy as np
 
 from dmcvb_gen.dataset import Manifest
 from dmcvb_gen.dataset.pictures import Pictures, shown
+from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
-from dmcvb_gen.spec import LABEL_TYPES
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class ExportEpisode:
       action, reward, discount: (L, action), (L,), (L,) float32.
       terminated: the task ended it; else the time limit did.
       modalities: "depth", "segmentation", "flow" that the subset stores, "depth/top" if it has several views ->
-        (L + 1, height, width, ...), see `spec.LABEL_TYPES`.
+        (L + 1, height, width, ...), see `generate.modalities`.
     """
 
     index: int
@@ -98,7 +98,7 @@ class Source:
     @property
     def modalities(self) -> tuple[str, ...]:
         """Stored arrays of depth, segmentation and flow: "depth", or "depth/top", ..."""
-        return tuple(name for name in self.subset.arrays if name.partition("/")[0] in LABEL_TYPES)
+        return stored_in(self.subset.arrays)
 
     @property
     def description(self) -> str:

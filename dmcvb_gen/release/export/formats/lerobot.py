@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.release.export.coloring import ENCODINGS, color
+from dmcvb_gen.generate.modalities import modality_of
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
 
@@ -45,7 +45,7 @@ def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
 
     Several subsets are the tasks of one data set. Depth, segmentation and flow that are stored become images of their
-    own, "observation.images.depth", by `coloring.color`; info.json says how their values are read back. The last
+    own, "observation.images.depth", by `Modality.color`; info.json says how their values are read back. The last
     observation of an episode has no action and is left out, as LeRobot's frames all have one.
 
     Raises:
@@ -178,7 +178,7 @@ class _Layout:
         }
 
     def _modality(self, picture: dict[str, Any], name: str) -> dict[str, Any]:
-        info = picture.get("info", {}) | {"encoding": ENCODINGS[name.partition("/")[0]]}
+        info = picture.get("info", {}) | {"encoding": modality_of(name).encoding}
         return picture | {"info": info}
 
     def _video_info(self) -> dict[str, Any]:
@@ -190,7 +190,7 @@ class _Layout:
         """Feature -> (L, size, size, 3)."""
         pictures = {key: episode.pixels[view][: episode.length] for view, key in self.keys.items()}
         for name, key in self.modalities.items():
-            pictures[key] = color(name.partition("/")[0], episode.modalities[name][: episode.length])
+            pictures[key] = modality_of(name).color(episode.modalities[name][: episode.length])
         return pictures
 
     def frames(self, episode: ExportEpisode, number: int, index: int, task: int) -> dict[str, np.ndarray]:

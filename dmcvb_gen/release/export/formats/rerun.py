@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.release.export.coloring import color
+from dmcvb_gen.generate.modalities import modality_of
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
 
@@ -22,7 +22,7 @@ from dmcvb_gen.release.export.registry import register_exporter
 def write(source: Source, folder: Path) -> None:
     """Write `episode_<index>.rrd` with the entities `image/<view>`, `state/<field>`, `action`, `reward` and `discount`.
 
-    Depth, segmentation and flow that are stored are images as well, "depth" or "depth/<view>", by `coloring.color`.
+    Depth, segmentation and flow that are stored are images as well, "depth" or "depth/<view>", by `Modality.color`.
 
     Both timelines, `step` (a number) and `time` (simulated seconds), have a row for each observation; the last
     observation of an episode has no action, reward or discount.
@@ -60,7 +60,7 @@ def _write_episode(recording, episode: ExportEpisode, fields: dict[str, slice], 
 
     shown = {"image" if view == "pixels" else f"image/{view}": frames for view, frames in episode.pixels.items()}
     for name, values in episode.modalities.items():
-        shown[name] = color(name.partition("/")[0], values)
+        shown[name] = modality_of(name).color(values)
     for entity, frames in shown.items():
         images = rerun.EncodedImage.columns(
             blob=[png(frame) for frame in frames], media_type=["image/png"] * len(frames)
