@@ -18,13 +18,13 @@ import numpy as np
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.recipe import RendererChoice
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import GoalMode, SubsetSpec, parse_setting
+from dmcvb_gen.spec import SPLITS, GoalMode, SubsetSpec, parse_setting
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -118,6 +118,7 @@ class EvaluationScene:
       size: pixels a side.
       renderer, samples: its name; samples a pixel, None for the renderer's default.
       backgrounds: "builtin" or a folder of videos.
+      split: "val" shows videos and maze styles that are in no data, "train" those of the data.
     """
 
     task: str
@@ -127,6 +128,7 @@ class EvaluationScene:
     renderer: str = RendererChoice().backend
     samples: int | None = None
     backgrounds: str = "builtin"
+    split: str = SPLIT
 
     @classmethod
     def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
@@ -208,7 +210,7 @@ class Evaluator:
         self.pair, self.renderer, self._videos = pair, None, None
         if pixels:
             if self.setting.kind != "none":
-                self._videos = load_backgrounds(scene.backgrounds, SPLIT)
+                self._videos = load_backgrounds(scene.backgrounds, scene.split)
             self.renderer = make_renderer(
                 scene.renderer,
                 self.task,
@@ -294,7 +296,8 @@ class Evaluator:
         if self.renderer is None:
             return None
         generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
-        return DistractorSampler(self.task, self.setting, self.steps + 1, generators, self._videos, split=SPLIT)
+        frames, split = self.steps + 1, self.scene.split
+        return DistractorSampler(self.task, self.setting, frames, generators, self._videos, split=split)
 
     def _see(self, stack, physics, walk: DistractorSampler, step: int, active, action=None) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
@@ -348,6 +351,7 @@ def evaluate(
     size: int = 64,
     renderer: str = RendererChoice().backend,
     backgrounds: str = "builtin",
+    split: str = SPLIT,
     max_steps: int | None = None,
     threads: int = 1,
 ) -> Score:
@@ -364,17 +368,21 @@ def evaluate(
       stack: frames an observation; the first one of an episode is repeated.
       pixels: give pictures; without them an evaluation takes seconds.
       size: pixels a side. renderer: its name. backgrounds: "builtin" or a folder of videos.
+      split: videos and maze styles to show: "val", as `validate` does, or "train", those of the data. The difference of
+        the two scores is what a policy loses on distractors that it has not seen.
       max_steps: cut episodes short.
 
     Returns:
       A `Score`: mean, stderr and returns; of mazes also success and speed.
 
     Raises:
-      DmcvbError: no such task or setting, or actions that have another shape, are no numbers or leave [-1, 1].
+      DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave [-1, 1].
     """
     if episodes < 1 or stack < 1:
         raise DmcvbError(f"episodes={episodes}, stack={stack}: give at least 1 of each")
-    scene = EvaluationScene.parse(where, size=size, renderer=renderer, backgrounds=backgrounds)
+    if split not in SPLITS:
+        raise UnknownNameError("split", split, SPLITS)
+    scene = EvaluationScene.parse(where, size=size, renderer=renderer, backgrounds=backgrounds, split=split)
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
     evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
     try:

@@ -16,7 +16,7 @@ import dmcvb_gen
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.tasks import get_task
 
 ROOT = Path(__file__).parents[2]
@@ -40,6 +40,22 @@ def test_a_policy_sees_stacks_and_states_of_all_episodes_at_once(where, channels
     assert score.mean == pytest.approx(np.mean(score.returns))
     again = dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=3, size=16, seed=4, pixels=False)
     assert again.returns == score.returns and set(seen[-1]) == {"state"}
+
+
+@pytest.mark.parametrize("where", ["walker-walk/dynamic", "ant-maze-empty7x7/visible"])
+def test_the_split_changes_what_is_seen_and_nothing_else(where):
+    seen = {}
+
+    def policy(observation):
+        seen[split] = observation
+        return np.zeros((2, get_task(where.split("/")[0]).action_size))
+
+    for split in ("val", "train"):
+        dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=1, size=16, split=split)
+    np.testing.assert_array_equal(seen["val"]["state"], seen["train"]["state"])
+    assert (seen["val"]["pixels"] != seen["train"]["pixels"]).any()
+    with pytest.raises(UnknownNameError, match="train"):
+        dmcvb_gen.evaluate(policy, where, split="trian")
 
 
 def test_it_is_the_evaluation_of_validate(small_release):
