@@ -71,7 +71,7 @@ class Setup:
 
 
 def open_data(setup: Setup) -> Release:
-    """The release of a run; pictures that it travelled without are painted when they are read.
+    """The release of a run; images that it does not store are rendered when they are read.
 
     Raises:
       StoreError: there is no release, or it is damaged.

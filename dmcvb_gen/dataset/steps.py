@@ -1,4 +1,4 @@
-"""The step table: episodes of one or several subsets in; any of their steps, with the frames before them, out.
+"""The step table: read episodes of one or several subsets, and gather any of their steps with the frames before them.
 
 All that reads for training stands on it: numpy batches, `StepSource`, the torch data sets and the agents' data. An
 episode of L transitions has L + 1 rows, and episodes lie one after the other::

@@ -17,7 +17,7 @@ from dmcvb_gen.spec import DIFFICULTY_SCALES, FIXED, Distractor, MazeName, diffi
 from dmcvb_gen.text import as_names
 
 EPISODES = 20
-"""Episodes of a subset if nobody says how many."""
+"""Default number of episodes of a subset."""
 _OVERRIDES = {"episodes", "steps", "max_steps", "episodes_per_shard"}
 _OVERRIDES |= {"fixed_goals", "episodes_per_goal", "seed", "size", "split"}
 _NOT_WITH_RECIPE = {

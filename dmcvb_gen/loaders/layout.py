@@ -1,4 +1,4 @@
-"""Environments that show what the data show: any of ours in; its pictures as stacks of frames, channels first, out.
+"""Environments that show what the data show: stacks of frames, channels first.
 
 A policy trained on `stream.stream` or a `StepSource` sees the same layout here: the last `stack` frames, oldest first,
 each with its views in their order, and the first frame of an episode repeated before it.

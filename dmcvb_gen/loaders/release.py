@@ -1,4 +1,4 @@
-"""`dmcvb_gen.open`: a folder or URL in; subsets that give episodes, xarray, torch and numpy out."""
+"""`dmcvb_gen.open`: read subsets at a folder or URL as episodes, xarray, torch or numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps at random: a subset in; frame stacks with their state, action and reward out, by index, numpy alone.
+"""Read any step of a subset by its index: frame stack, state, action and reward, with numpy alone.
 
 A `StepSource` has `__len__` and `__getitem__`, which is what Grain (`grain.MapDataset.source`), tf.data
 (`from_generator`) and torch's samplers ask of a random-access source.

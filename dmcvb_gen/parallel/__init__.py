@@ -1,4 +1,4 @@
-"""Work done side by side: functions and arguments in, results as they come; in this process or in fresh ones.
+"""Run functions side by side, in this process or in fresh ones, and give their results as they come.
 
 ::
 

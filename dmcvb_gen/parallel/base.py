@@ -124,7 +124,7 @@ class Ray:
 
 
 Workers = int | Ray
-"""Who works: so many processes (1: this one), or a Ray cluster."""
+"""Executor of the work: so many processes (1: this one), or a Ray cluster."""
 
 
 def limit_threads(threads: int) -> None:

@@ -1,4 +1,4 @@
-"""Work done in fresh processes of this machine: functions and arguments in, results as they come."""
+"""Run functions in fresh processes of this machine, and give their results as they come."""
 
 from __future__ import annotations
 

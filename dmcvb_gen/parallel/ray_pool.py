@@ -1,4 +1,4 @@
-"""Work done on a Ray cluster: functions and arguments in, results as they come; nodes may be lost and added meanwhile.
+"""Run functions on a Ray cluster, and give their results as they come; nodes may be lost and added meanwhile.
 
 Only the results travel back (commit records, not data), so the work must leave its data where all nodes can write.
 """

@@ -1,4 +1,4 @@
-"""Simulating episodes: task, policies and streams in; actions, rewards, states and physics out. No pixels here.
+"""Simulate episodes: actions, rewards, states and physics of policies in a task. No pixels here.
 
 An episode depends on its index alone, never on which episodes are simulated beside it: physics does not
 mix simulations, every random number comes from the episode's own streams, and a policy adds up in a fixed order,

@@ -1,4 +1,4 @@
-"""A published release to a folder: `fetch` brings it, or the shards that hold some episodes; run again, it adds.
+"""Download a published release, or the shards that hold some episodes; another call resumes or adds.
 
 Shards come one after the other, each with its commit record last, so what is here at any moment is a release: a part of
 one, which says so in its lineage, until everything is here. What was painted here stays painted. With a painter, a
@@ -74,7 +74,7 @@ def fetch(
     workers: int = 8,
     tick: ProgressCallback = ignore,
 ) -> Moved:
-    """Bring a published release, or the shards of it that hold some episodes; run again, it goes on or adds.
+    """Download a published release, or the shards of it that hold some episodes; another call resumes or adds.
 
     Args:
       out: its folder here.
@@ -104,7 +104,7 @@ def fetch_and_paint(
     workers: int = 8,
     tick: ProgressCallback = ignore,
 ) -> tuple[Moved, Any]:
-    """`fetch`, and paint the pictures that travelled without; a shard is painted while the next ones come.
+    """`fetch`, and render the images that are not stored; a shard is rendered while the next ones come.
 
     Args:
       painter: a `generate.paint.RenderConfig`.

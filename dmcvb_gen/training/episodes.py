@@ -1,4 +1,4 @@
-"""Training episodes side by side: a run's task and settings in; observations, restarts and what resumes them out."""
+"""Training episodes side by side, with their restarts and the state that resumes them."""
 
 from __future__ import annotations
 

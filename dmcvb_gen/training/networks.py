@@ -1,4 +1,4 @@
-"""The actor as a torch module that learns: a policy header in; means and standard deviations, and weights, out."""
+"""The actor as a torch module that learns, from a policy's header and back to its weights."""
 
 from __future__ import annotations
 

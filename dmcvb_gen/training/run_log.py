@@ -1,4 +1,4 @@
-"""The log of a run: evaluations in; progress.csv and TensorBoard events out.
+"""The log of a run: it writes evaluations to progress.csv and TensorBoard.
 
 `progress.csv` has a row an evaluation. It outlives the checkpoints, which are thinned, so it is what the learning
 curve is read from.

@@ -1,4 +1,4 @@
-"""Picking behaviour policies from a run, as the paper does: a learning curve in; expert, medium and mixed out.
+"""Pick the expert, medium and mixed policies from a run's learning curve, as the paper does.
 
 Paper, section 3.1: expert is the first checkpoint with 95 % of the return at convergence, medium the one with 50 %,
 mixed eight checkpoints evenly spaced, in training steps, from the start to medium. Mean actions are judged, as the data

@@ -1,4 +1,4 @@
-"""A task as reinforcement-learning environments: actions in; observations, rewards and episode ends out.
+"""A task as vectorized reinforcement-learning environments.
 
 `TaskVecEnv` is a Stable-Baselines3 VecEnv over one batch of simulations, for any SB3 or sb3-contrib algorithm;
 `TaskEnv` is one episode at a time as a Gymnasium environment.
