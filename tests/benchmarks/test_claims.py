@@ -129,10 +129,10 @@ def test_command(tmp_path):
     elsewhere = write(tmp_path / "elsewhere", "quick", result("bc", "none", near(1)), release="cheetahs")
     assert len(read_reports([*both, elsewhere])) == 3
     data = write(tmp_path / "data", "quick", result("state-bc", "none", near(97), seed=2), release="cheetahs")
-    with pytest.raises(DmcvbError, match="different data are no two seeds: cheetahs 1.0.0, 3 episodes; walkers 1.0.0"):
+    with pytest.raises(DmcvbError, match="cannot be pooled: cheetahs 1.0.0, 3 episodes; walkers 1.0.0"):
         read_reports([*both, data])
     grown = write(tmp_path / "grown", "quick", result("state-bc", "none", near(97), seed=2, digests={"one": "d2"}))
-    with pytest.raises(DmcvbError, match="no two seeds: walkers 1.0.0, digest d1; walkers 1.0.0, digest d2"):
+    with pytest.raises(DmcvbError, match="cannot be pooled: walkers 1.0.0, digest d1; walkers 1.0.0, digest d2"):
         read_reports([*both, grown])
     again = write(tmp_path / "again", "quick", result("state-bc", "none", near(97), seed=1))
     with pytest.raises(DmcvbError, match=r"walker-walk expert, none twice with seed 1, in .*1, .*again; a second"):

@@ -154,7 +154,7 @@ def test_a_run_does_not_go_on_with_another_walker(tmp_path, monkeypatch):
     open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000, evaluate_sparse=10_000), False).train()
     longer = open_run(tmp_path / "run", config(steps=128, evaluate_every=10_000, evaluate_sparse=10_000), True)
     longer.walker.digest = "another"
-    with pytest.raises(DmcvbError, match="another policy"):
+    with pytest.raises(DmcvbError, match="another walking policy"):
         longer.train()
 
 
