@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-LOG_SECONDS = 60.0  # between two lines of progress if nobody watches a bar
+LOG_SECONDS = 60.0  # between two lines of progress in a log, which has no bar
 
 
 class ProgressBar(tqdm):

@@ -63,7 +63,7 @@ class Row(BaseModel):
 
     Attributes:
       agent: e.g. "state-bc". trained: profile of its training. seed: of its training.
-      task, setting: evaluation's. data: data that it learned from, e.g. "expert". data_episodes: their number.
+      task, setting: those of the evaluation. data: level that it learned from. data_episodes: their number.
       data_return: their mean return. paper: the paper's mean score of that agent on a million steps, if it has one.
       command: that made the score, run beside the release. made: date. generator: version. processor, precision: that
         trained it.

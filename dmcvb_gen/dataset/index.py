@@ -231,7 +231,7 @@ def refuse_altered(listed: Iterable[FileRecord], digest: Callable[[str], str | N
     """Keep damage from becoming what is right: a release whose digests are to be made anew must have its old ones.
 
     Args:
-      listed: files of the release as it is, see `metadata_files`.
+      listed: the release's present files, see `metadata_files`.
       digest: digest of a path in the release, None if nothing is.
 
     Raises:

@@ -80,7 +80,7 @@ class DistractorPart(abc.ABC):
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
-        """The labels of the task as it is, if the setting leaves this distractor out; as `labels`."""
+        """The task's own labels, which are shown if the setting leaves this distractor out; see `labels`."""
         raise NotImplementedError
 
 

@@ -124,7 +124,7 @@ def share_of_node(nodes: Sequence[Mapping[str, Any]], needs: Needs) -> int | Non
 
 
 def _check_answers(address: str | None) -> None:
-    """Raises DmcvbError if nobody listens at "host:port": Ray itself would try for minutes."""
+    """Raise DmcvbError if no program listens at "host:port". Ray itself would try for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if not colon or not port.isdigit():
         return

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 BACKGROUND, AGENT, FLOOR, WALL, GOAL = range(5)
 COLORS = np.array([[0, 0, 0], [230, 159, 0], [86, 180, 233], [204, 121, 167], [0, 158, 115]], np.uint8)
-"""Of the parts in their order; colors that color-blind people can tell apart."""
+"""Colors of the parts in their order. Color-blind people can tell them apart."""
 
 
 @register_modality
