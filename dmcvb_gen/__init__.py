@@ -43,7 +43,7 @@ def open(path: str, storage_options: dict | None = None, *, paint: bool = False,
 
     Raises:
       StoreError: there is no release, it cannot be read, or the URL needs a package that is not installed.
-      DmcvbError: a way of painting that there is not.
+      DmcvbError: `painting` has an unknown field or value.
     """
     if paint or painting:
         from dmcvb_gen.loaders.painted import open_painted

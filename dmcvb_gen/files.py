@@ -1,4 +1,4 @@
-"""Files that are whole or not there: bytes, text or JSON in, a file put in place at once, flushed to the disk.
+"""Write files atomically: bytes, text or JSON become a whole file, flushed to the disk, or none.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
 disturb each other. The name says who makes it (machine, process namespace and process), so that files of a killed

@@ -1,4 +1,4 @@
-"""Registries: tables of named things that this package, its users and installed packages add to.
+"""Registries: tables of named things, to which this package, its users and other packages add.
 
 A thing enters its table when its module is imported, by a decorator. A registry imports the modules of one folder of
 this package, and those that installed packages name in a group of entry points, when it is first asked.

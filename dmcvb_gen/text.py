@@ -1,4 +1,4 @@
-"""Words of messages."""
+"""Format numbers and names for messages."""
 
 from __future__ import annotations
 

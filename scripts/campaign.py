@@ -536,21 +536,22 @@ REFERENCE: dict[str, str] = {"fetched": "release", "parted": "release", "direct"
 def warm() -> None:
     """Import what commands import, compile the models and decode the backgrounds, once for all children."""
     import importlib
+    import pkgutil
 
-    from dmcvb_gen.cli import COMMANDS
+    import dmcvb_gen
     from dmcvb_gen.distractors import load_backgrounds
-    from dmcvb_gen.rendering import available_renderers
+    from dmcvb_gen.rendering import available_renderers, default_renderer
     from dmcvb_gen.tasks import get_task
 
-    for module in {place.split(":")[0] for place, _ in COMMANDS.values()}:
-        importlib.import_module(f"dmcvb_gen.cli.{module}")
-    for name in ("release.publish", "generate.repaint", "release.verify", "generate.regenerate", "release.export"):
-        importlib.import_module(f"dmcvb_gen.{name}")
-    for name in ("export.formats.vd4rl", "export.formats.replay_buffer"):
-        importlib.import_module(f"dmcvb_gen.release.{name}")
+    for module in pkgutil.walk_packages(dmcvb_gen.__path__, "dmcvb_gen."):
+        if not module.name.endswith("__main__"):
+            with contextlib.suppress(ImportError):  # of packages that are not installed
+                importlib.import_module(module.name)
     importlib.import_module("s3fs")
     for kind in KINDS.values():
-        get_task(kind[0])
+        task = get_task(kind[0])
+        default_renderer(task)
+        _ = task.picture_model  # which compiles it
     load_backgrounds("builtin", "train")
     available_renderers()
 

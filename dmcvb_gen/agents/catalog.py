@@ -156,7 +156,7 @@ def _with_options(agent: Agent, text: str) -> Agent:
     for option in filter(None, text.split(",")):
         key, _, value = option.partition("=")
         if key not in defaults:
-            raise DmcvbError(_not_heard(option, key, defaults))
+            raise DmcvbError(_refusal(option, key, defaults))
         if isinstance(defaults[key], bool) and not value:
             values[key] = True
         elif not isinstance(defaults[key], bool) and value.isdigit() and 1 <= int(value) <= MOST:
@@ -172,7 +172,7 @@ def _with_options(agent: Agent, text: str) -> Agent:
     return agent
 
 
-def _not_heard(option: str, key: str, defaults: dict[str, int | bool]) -> str:
+def _refusal(option: str, key: str, defaults: dict[str, int | bool]) -> str:
     """Why an option is refused: nothing knows it, or others do."""
     owners = [name for name, part in PARTS.all().items() if key in part.options]
     takes = f"it takes {_listed(defaults)}" if defaults else "it takes none"

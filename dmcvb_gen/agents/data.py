@@ -111,7 +111,7 @@ def normalize_pixels(
 ) -> torch.Tensor:
     """(batch, channel, size, size) uint8 -> [-0.5, 0.5], written over `out` if given; channels lie last in memory.
 
-    So convolutions want them; else these would turn them over again, forward and backward. In this order bfloat16
+    Convolutions want that layout; otherwise they would convert it forward and backward. In this order bfloat16
     rounds once, as autocast would: 127.5 less is exact in 8 bits.
     """
     values = pictures.to(dtype).sub_(127.5).mul_(1 / 255)  # as they lie, and turned last: a quarter faster

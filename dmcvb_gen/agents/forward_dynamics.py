@@ -1,4 +1,4 @@
-"""LFD: an encoder that foretells its own average of the next observation (paper, section 4.2)."""
+"""LFD: an encoder that predicts its own average's latent of the next observation (paper, section 4.2)."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class Learner(nn.Module, abc.ABC):
         """Refuse options that do not go together.
 
         Raises:
-          DmcvbError: they do not.
+          DmcvbError: two of them exclude each other, or one needs another.
         """
 
     @abc.abstractmethod

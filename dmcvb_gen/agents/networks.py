@@ -91,7 +91,7 @@ class Trunk(nn.Sequential):
 
 
 class _SameLayout(torch.autograd.Function):
-    """Pictures as they are; their gradient with the channels last in memory as they are.
+    """Pass pictures through; lay out their gradient as they lie, with the channels last in memory.
 
     An activation's gradient costs five times as much where the two lie differently, as behind a flattening they do.
     """

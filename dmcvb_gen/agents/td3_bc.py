@@ -32,7 +32,7 @@ class _ActorCritic(nn.Module):
 
     @staticmethod
     def value(critic: nn.Module, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """(batch,): a critic's, in float32 throughout. Half precision knows whole numbers alone where a return lies."""
+        """(batch,): one critic's value, in float32 throughout: half precision is too coarse for returns."""
         with torch.autocast(latent.device.type, enabled=False):
             return critic(torch.cat([latent.float(), action.float()], dim=1))[:, 0]
 

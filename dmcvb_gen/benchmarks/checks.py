@@ -185,7 +185,7 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
 
 
 class _Longer:
-    """A tick that is told of more than it expects to be told of by whom it is given to."""
+    """A tick whose expected total is higher than its callee announces, because more work follows."""
 
     def __init__(self, tick: ProgressCallback, more: int):
         self._tick, self._more = tick, more

@@ -22,7 +22,7 @@ from dmcvb_gen.errors import DmcvbError
 ERRORS = 2.0
 """Standard errors from which on a difference counts."""
 NEAR = 0.05
-"""Of the data's return: how near BC(state) is to it (the paper underlines what lies within 5 % of BC(state))."""
+"""BC(state) is near its data within this share of their return. The paper underlines scores within 5 % of BC(state)."""
 YES, NO, OPEN = "yes", "no", "open"
 
 

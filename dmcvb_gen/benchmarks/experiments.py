@@ -40,7 +40,7 @@ from dmcvb_gen.tasks import Task, get_task
 from dmcvb_gen.version import __version__
 
 ProgressCallback = Callable[[str, int], None]
-"""Told what is being done and how many Adam steps were made since the last call."""
+"""Callback that is told what is being done and how many Adam steps were made since the last call."""
 
 
 def _source(release: Release, part: Part) -> Source:

@@ -235,7 +235,7 @@ def check_writable(folder: str | Path) -> None:
     """Make the report's folder and see that it takes files, before any work.
 
     Raises:
-      DmcvbError: it does not.
+      DmcvbError: the folder cannot be made or written.
     """
     folder = local_path(folder)
     try:

@@ -34,7 +34,7 @@ def taken_up(root: Path, asked: Manifest) -> Manifest:
 
 
 def merged(old: Manifest, asked: Manifest, place: str) -> Manifest:
-    """`old`, grown by what `asked` has more; `old` itself if that is nothing.
+    """Add to `old` what only `asked` has; return `old` itself if that is nothing.
 
     Raises:
       StoreError: a subset is there in another form, or cannot grow.
@@ -85,7 +85,7 @@ def _check_same(old: Manifest, there: SubsetRecord, asked: Manifest, record: Sub
 
 
 def _value(record: SubsetRecord, field: str) -> Any:
-    """A field as releases are compared by it: of policies, what they are; a copy of the header may leave places out."""
+    """The value of a field in comparisons; of policies name, digest and path, as headers may lack local paths."""
     if field == "policies":
         return tuple((policy.name, policy.digest, policy.path) for policy in record.policies)
     return getattr(record, field)

@@ -228,7 +228,7 @@ def metadata_files(index: Index) -> list[FileRecord]:
 
 
 def refuse_altered(listed: Iterable[FileRecord], digest: Callable[[str], str | None], place: str) -> None:
-    """Keep damage from becoming what is right: a release whose digests are to be made anew must have its old ones.
+    """Refuse a release whose files differ from its old digests: new digests would declare the damage right.
 
     Args:
       listed: the release's present files, see `metadata_files`.

@@ -1,6 +1,6 @@
 """Name the picture arrays of a subset, in their order, from its setting and views.
 
-The one place that knows. A task with one view stores `pixels`; one with several stores a pair of arrays a view::
+A task with one view stores `pixels`; one with several stores a pair of arrays a view::
 
     pixels/<view>               the goal seen
     pixels_hidden_goal/<view>   the goal left out

@@ -281,7 +281,7 @@ class Subset:
         return chosen
 
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
-        """Take notice that rows of these episodes will be read, part by part; does nothing for stored pictures."""
+        """Prepare to read rows of these episodes part by part; does nothing for stored pictures."""
 
     def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
         """Rows of episodes, one episode after the other.

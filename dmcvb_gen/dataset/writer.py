@@ -1,7 +1,7 @@
-"""Writing a release: a manifest starts it, shards are committed one by one, a last look completes it.
+"""Write a release: first the manifest, then shards one by one, at last the digests.
 
 A shard is written whole, file by file, each file atomically; only then its commit record. So a crash at
-any moment leaves committed shards and rubbish without a record, which the next run writes over.
+any moment leaves committed shards and files without a record, which the next run overwrites.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CREATED = ".created"
 
 @contextlib.contextmanager
 def write_lock(root: Path, wait: float = 0) -> Iterator[None]:
-    """Keep other writers out of a release's folder while the block runs; shards may be written beside it.
+    """Keep other writers out of a release's folder while the block runs; shards may still be written.
 
     Args:
       wait: seconds to wait for another writer.
@@ -70,7 +70,7 @@ def mark_created(root: Path, subset: SubsetRecord) -> None:
 
 
 def start_release(root: Path, manifest: Manifest) -> Manifest:
-    """Create a release folder, or take up the one that is there, grown by what is new.
+    """Create a release folder, or continue with the one that is there, and add what is new.
 
     Raises:
       StoreError: the folder holds something else, or what contradicts this release, or cannot be written.

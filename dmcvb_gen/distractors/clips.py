@@ -1,7 +1,7 @@
 """Make clips of objects that fall and collide, like Kubric's MOVi-D, from a seed.
 
 Each clip is a MuJoCo simulation of its own: 13 to 23 objects of many shapes with procedural textures, some
-lying in a heap, some thrown into it one after the other, filmed by a fixed camera for 24 frames of 256 x 256.
+lying in a heap, some thrown into it one after another, filmed by a fixed camera for 24 frames of 256 x 256.
 """
 
 from __future__ import annotations

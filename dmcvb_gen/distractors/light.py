@@ -1,4 +1,4 @@
-"""Lamps that wander: light and shadows come from other places, on top of what else varies."""
+"""Light that moves: lamps wander, so light and shadows come from other places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The style of mazes: an episode draws textures of walls and floor from its own stream, under every setting."""
+"""The style of mazes: each episode draws textures of walls and floor, under every setting."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def _trajectory(record: SubsetRecord) -> tuple:
 
 
 def _alike(record: SubsetRecord) -> tuple:
-    """Whose episodes' lengths are taken together: those of the level's mazes."""
+    """Key of the mean length of episodes; all mazes share one for each level."""
     return _trajectory(record) if record.goal_mode is None else (ANT_MAZE, *_trajectory(record)[1:])
 
 

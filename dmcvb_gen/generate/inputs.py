@@ -1,4 +1,4 @@
-"""The policies and videos that a subset is made from: found in the release or the package, checked by digest."""
+"""Find the policies and videos that a subset is made from, in the release or the package, by digest."""
 
 from __future__ import annotations
 

@@ -339,7 +339,7 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
 
 def _prepare_bucket(plan: Plan, target: Target) -> Manifest:
     """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
-    with _desk(target) as folder:
+    with _temporary_folder(target) as folder:
         begun = _begun(folder, plan, plan.manifest, plan.manifest.subsets)
         strange = set(target.storage.list()) - set(begun) - {MANIFEST}
         if strange and target.manifest() is None:
@@ -356,8 +356,8 @@ def _prepare_bucket(plan: Plan, target: Target) -> Manifest:
 
 
 @contextlib.contextmanager
-def _desk(target: Target) -> Iterator[Path]:
-    """A folder of one's own in a target's scratch, for a moment; no room there is one line."""
+def _temporary_folder(target: Target) -> Iterator[Path]:
+    """A temporary folder in a target's scratch; a full disk is an error of one line."""
     with storage_errors(target.scratch, "write to"), tempfile.TemporaryDirectory(dir=target.scratch) as folder:
         yield Path(folder)
 
@@ -382,7 +382,7 @@ def _grow_bucket(plan: Plan, target: Target, there: Manifest) -> Manifest:
         return there
     old = {record.name: record for record in there.subsets}
     changed = [record for record in manifest.subsets if record != old.get(record.name)]
-    with _desk(target) as root:
+    with _temporary_folder(target) as root:
         listed = target.storage.list()
         for record in changed:
             if record.name in old:  # its arrays are there, and get room for more episodes
@@ -524,7 +524,7 @@ def _finish_bucket(target: Target, there: Manifest) -> Manifest:
     if there.complete and there.digest and target.storage.read(INDEX):
         return there
     commits = target.commits(there.subsets)
-    with _desk(target) as mirror:
+    with _temporary_folder(target) as mirror:
         shards = {file.path for found in commits.values() for commit in found.values() for file in commit.files}
         small = [path for path in target.storage.list() if path not in shards | {MANIFEST, INDEX}]
 

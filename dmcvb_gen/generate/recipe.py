@@ -331,8 +331,8 @@ def single_recipe(
     return override(made, behaviour=behaviour) if behaviour else made
 
 
-def check_heard(recipe: Recipe, given: Collection[str]) -> None:
-    """Raises RecipeError if an option was given that changes nothing in any subset of a recipe.
+def check_options_used(recipe: Recipe, given: Collection[str]) -> None:
+    """Raise RecipeError for an option that changes nothing in any subset of a recipe.
 
     Args:
       given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".

@@ -127,7 +127,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
             )
     if not pairs:
         raise StoreError(f"{request.root} was imported and has no physics states to paint from")
-    _check_heard(request, [pair.record for pair in pairs.values()])
+    _check_options_used(request, [pair.record for pair in pairs.values()])
     new = _new_manifest(release, pairs, request)
     _check_out(out, new)
     manifest = start_release(out, new)
@@ -147,7 +147,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
     return finish_together(out)
 
 
-def _check_heard(request: Repainting, records: Sequence[SubsetRecord]) -> None:
+def _check_options_used(request: Repainting, records: Sequence[SubsetRecord]) -> None:
     """Refuse options of distractors that none of the new subsets has."""
     kinds = {record.distractor.kind for record in records}
     for name in ("difficulty", "backgrounds"):

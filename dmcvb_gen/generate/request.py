@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import RecipeError
-from dmcvb_gen.generate.recipe import Recipe, check_heard, load_recipe, narrow, override, single_recipe
+from dmcvb_gen.generate.recipe import Recipe, check_options_used, load_recipe, narrow, override, single_recipe
 from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
 from dmcvb_gen.spec import DIFFICULTY_SCALES, FIXED, Distractor, MazeName, difficulty_of, is_maze, task_folder
 from dmcvb_gen.text import as_names
@@ -63,7 +63,7 @@ def make_request(
         made = _changed_recipe(load_recipe(recipe), tasks, given)
     else:
         made = _recipe_from_options(tasks, given | {"renderer": given.get("renderer") or renderer_of(tasks, device)})
-    check_heard(made, given)
+    check_options_used(made, given)
     if given.get("sample") and is_own(str(given.get("behaviour") or "")):
         raise RecipeError("--sample has no effect here: a function of your own draws by itself; remove it")
     return made

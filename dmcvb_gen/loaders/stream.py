@@ -1,4 +1,4 @@
-"""Steps for training: a few whole episodes are read at a time and their steps mixed; batches of numpy arrays out.
+"""Stream steps for training: read a few whole episodes at a time, mix their steps, and give batches.
 
 Reading whole episodes costs a tenth of reading single frame stacks from the store, so a stream draws episodes in a
 shuffled order, holds `buffer` of them in memory, and mixes their steps.
@@ -21,7 +21,7 @@ Steps = dict[str, np.ndarray]
 
 
 def check_count(name: str, value: int) -> int:
-    """`value`.
+    """Return `value` if it is at least 1.
 
     Raises:
       DmcvbError: it is below 1.

@@ -79,7 +79,7 @@ class Pool(abc.ABC):
 
 
 class SerialPool(Pool):
-    """One after the other, in this process, when the result is asked for."""
+    """Pool that runs its work in this process, one piece after another, when results are asked for."""
 
     def __init__(self, tick: ProgressCallback = ignore):
         self._tick = tick

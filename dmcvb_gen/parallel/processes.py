@@ -22,7 +22,7 @@ from dmcvb_gen.parallel.base import IN_FLIGHT, KEPT, POLL_SECONDS, Future, Pool,
 
 
 class ProcessPool(Pool):
-    """In processes that are started fresh (never forked: MuJoCo, torch and OpenGL do not survive that).
+    """Pool of fresh processes, which are never forked: MuJoCo, torch and OpenGL do not survive that.
 
     Workers leave Ctrl-C to the process that started them, end on SIGTERM, and end when that process is gone.
 

@@ -29,7 +29,7 @@ from dmcvb_gen.parallel.base import (
 
 
 class RayPool(Pool):
-    """One task a piece of work, tried again without end when its node is lost, and `IN_FLIGHT` handed out a CPU.
+    """One Ray task for each piece of work, repeated if its node is lost; each CPU has `IN_FLIGHT` of them.
 
     Args:
       address: of the cluster ("ray://host:10001", "auto"); by default what RAY_ADDRESS says, else one on this machine.

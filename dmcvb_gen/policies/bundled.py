@@ -1,4 +1,4 @@
-"""Which policy files a level means: the package's own by default, a file's or a run's on request."""
+"""Find the policy files of a level: the package's own by default, or those of a file or run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulate episodes: actions, rewards, states and physics of policies in a task. No pixels here.
+"""Simulate episodes of policies in a task: actions, rewards, states and physics, without images.
 
 An episode depends on its index alone, never on which episodes are simulated beside it: physics does not
 mix simulations, every random number comes from the episode's own streams, and a policy adds up in a fixed order,

@@ -292,7 +292,7 @@ class Download:
         return {key[0] for key, (_, commit) in self.commits.items() if commit.painted or key in self._kept}
 
     def _keep_painted(self) -> None:
-        """See which subsets were painted here: their metadata and the records of painted shards stay."""
+        """Find the subsets that were painted here; their metadata and the records of painted shards stay."""
         records = {record.name: record for record in self.source.manifest.subsets}
         local = self.local.subsets if self.local else ()
         here = {r.name: r for r in local if r.pixels and _bare(r) != _bare(records[r.name])}

@@ -1,4 +1,4 @@
-"""A release to a URL: `publish` puts every file there, the manifest last; see `release.fetch` for the way back.
+"""Publish a release at a URL: every file, the manifest last. `release.fetch` downloads it.
 
 What lies at the URL is the release's folder and two files more: `files.json` (every file with its digest, and the
 digest of the manifest that it belongs to) and, while a publisher is at work, `publishing.json` (its claim). A folder
@@ -228,7 +228,7 @@ def _claim(storage: Storage, digest: str, manifest: Manifest, take_over: bool) -
     """Say that this release is being published there; True if nobody had begun to.
 
     Raises:
-      StoreError: another release is.
+      StoreError: another release is being published there.
     """
     mine = {"name": manifest.name, "version": manifest.version, "manifest_sha256": digest}
     data = json.dumps(mine).encode()

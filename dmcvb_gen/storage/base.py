@@ -308,7 +308,7 @@ def checked(root: Path, file: Digested) -> Path:
     """A local file that has its digest.
 
     Raises:
-      StoreError: it has not, or cannot be read.
+      StoreError: its bytes have another digest, or it cannot be read.
     """
     local = root / file.path
     with storage_errors(local):

@@ -19,7 +19,7 @@ def own_task(task_id: str) -> SuiteTask:
     Raises:
       DmcvbError: its code may not run, cannot be found, fails, or gives no usable environment.
     """
-    import_suite()  # before the task's own import of it, whose warnings nobody needs
+    import_suite()  # before the task imports it, to hide its warnings
     make = find_function(task_id, TASKS, "task")
     return SuiteTask(task_id, make)
 

@@ -16,7 +16,7 @@ from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
 from dmcvb_gen.training.runs import Run
 
 HURRY = 0.1
-"""What a step in a maze costs, lying on the back costs 1 more: the reward itself is 0 in the whole goal cell."""
+"""Cost of a step in a maze, as the reward is 0 in the whole goal cell; lying on the back costs 1 more."""
 
 
 def shaping_of(task: Task) -> Callable[[np.ndarray], np.ndarray]:
@@ -97,12 +97,12 @@ class Episodes:
         return observation
 
     def saved(self, observation: np.ndarray) -> dict[str, torch.Tensor]:
-        """The episodes where they are; what is seen too, as touch sensors do not follow from the physics."""
+        """State of the episodes; with observations, because touch sensors do not follow from the physics."""
         parts = {"physics": self.batch.physics(), "elapsed": self.elapsed, "observation": observation}
         return {name: torch.from_numpy(part.copy()) for name, part in parts.items()}
 
     def restore(self, saved: dict[str, torch.Tensor]) -> np.ndarray:
-        """Put the episodes where they were; gives what policies see."""
+        """Restore the saved episodes; return what policies see."""
         self.elapsed = saved["elapsed"].numpy().copy()
         self.batch.set_physics(saved["physics"].numpy())
         return saved["observation"].numpy().copy()

@@ -90,7 +90,7 @@ class GuidedRun(Run):
 
     @functools.cached_property
     def walker(self) -> Policy:
-        """The policy that knows how to walk, not where."""
+        """The policy that walks; it does not know where to."""
         if not is_maze(self.task.id):
             raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
         source = self.config.init_from
@@ -219,7 +219,7 @@ class Student:
         return float(loss.detach())
 
     def state(self) -> dict[str, Any]:
-        """Everything that learning goes on from."""
+        """Everything that learning continues from."""
         self.buffer.flush()
         return {
             "walker": self.run.walker.digest,
@@ -232,7 +232,7 @@ class Student:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`.
+        """Continue from `state()`.
 
         Raises:
           DmcvbError: it walked as another policy.

@@ -223,7 +223,7 @@ class Run(abc.ABC):
         return EVALUATION_EPISODES
 
     def problem(self) -> str | None:
-        """Why a run with these settings would come to nothing, and the cure; None if nothing is wrong."""
+        """Say why a run with these settings would learn nothing, and the cure; None if nothing is wrong."""
         return None
 
     def too_few_updates(self, warmup: int, needed: int = 1) -> str | None:

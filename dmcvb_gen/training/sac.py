@@ -239,7 +239,7 @@ class RowBuffer:
         self.size = size
 
     def restore(self, position: int, full: bool, rows: int | None = None) -> None:
-        """Go on where a run was saved, whose buffer had `rows` rows (as many as the files held, if not known)."""
+        """Continue where a run was saved, whose buffer had `rows` rows (as many as the files held, if not known)."""
         rows = rows or self.found
         # A full buffer that has grown since is not full any more: what is new lies behind the old rows.
         self.position, self.full = (rows, False) if full and self.size > rows else (position, full)

@@ -104,7 +104,7 @@ class ReplayLoop:
     """Loop of a run: episodes fill the buffer and the learner learns from it; its state can be saved.
 
     Args:
-      saved: `state()` to go on from; None at the start.
+      saved: `state()` to continue from; None at the start.
     """
 
     def __init__(self, run: ReplayRun, saved: dict[str, Any] | None):
@@ -132,7 +132,7 @@ class ReplayLoop:
             self.observation = self.episodes.start(np.arange(settings.simulations))
 
     def state(self) -> dict[str, Any]:
-        """Everything that the run goes on from."""
+        """Everything that the run continues from."""
         buffer = self.buffer
         buffer.flush()
         return {
@@ -175,7 +175,7 @@ class ReplayLoop:
         self.observation = self.episodes.restart_ended(reached, result.terminated)
 
     def learn(self) -> None:
-        """The updates that the steps so far are owed."""
+        """Make the updates that are due after the steps so far."""
         settings = self.run.settings
         self.learner.begin_round(self.run.step)
         if len(self.buffer) < settings.warmup_steps:

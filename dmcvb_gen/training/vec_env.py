@@ -88,12 +88,12 @@ class TaskVecEnv(VecEnv):
         return observation, result.reward.astype(np.float32), done, infos
 
     def saved(self) -> dict[str, Any]:
-        """All that decides how the episodes go on: tensors and numbers."""
+        """The state that decides all later episodes: tensors and numbers."""
         parts = {"physics": self.batch.physics(), "length": self._length, "return": self._return}
         return {name: torch.from_numpy(part.copy()) for name, part in parts.items()} | {"started": self._started}
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Go on from `saved()`, bit for bit."""
+        """Continue from `saved()`, bit for bit."""
         self.batch.set_physics(saved["physics"].numpy())
         self._length, self._return = saved["length"].numpy().copy(), saved["return"].numpy().copy()
         self._started = saved["started"]

@@ -207,3 +207,23 @@ main(["verify", "."])
 def test_nothing_that_was_half_begun_prints_a_traceback_when_a_command_is_stopped():
     ended = subprocess.run([sys.executable, "-c", HALF_BEGUN], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr.strip()) == (1, "", "Aborted!")
+
+
+PROCESSES = """
+import sys
+started = []
+sys.addaudithook(lambda event, facts: event == "subprocess.Popen" and started.append(str(facts[1])))
+from dmcvb_gen.cli import main
+try:
+    main(["rollout", "walker-walk", "--episodes", "1", "--max-steps", "2", "--out", sys.argv[1]])
+finally:
+    print(sum("glfw" in words for words in started), "glfw" in sys.modules, file=sys.stderr)
+"""
+
+
+def test_glfw_looks_for_its_library_without_a_process_that_ctrl_c_would_make_print(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYGLFW_LIBRARY")}
+    command = [sys.executable, "-c", PROCESSES, str(tmp_path / "out")]
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr.split()[-2:] == ["0", "True"]

@@ -36,7 +36,7 @@ class _Work:
 
     @property
     def done(self) -> bool:
-        """Return True if an earlier call wrote this very export. Raises StoreError if something else is there."""
+        """Return True if an earlier call wrote this very export; raise StoreError if something else is there."""
         if not self.folder.exists():
             return False
         with contextlib.suppress(OSError, ValueError):

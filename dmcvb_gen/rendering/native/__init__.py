@@ -1,9 +1,9 @@
-"""The painter of our own: a tracer in numba for dm_control's scenes; physics states and labels become pictures.
+"""The package's own renderer: a ray tracer in numba for dm_control's scenes.
 
 It follows MuJoCo's OpenGL pipeline term by term, as a CPU runs it: four visibility samples a pixel, one shading
 a pixel and surface, light computed at the floor's vertices, textures from the same mip levels.
 
-A map for who comes after. One frame goes through these kernels (`frame.paint_frames`):
+A map for new developers. One frame goes through these kernels (`frame.paint_frames`):
 
     pose_geoms, choose_lamp    records of geoms and lamps, in the camera's frame          frame.py, records.py
     light_frame                the lamp's light at the floor's vertices, its shadow map   lighting.py

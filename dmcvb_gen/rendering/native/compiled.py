@@ -1,4 +1,4 @@
-"""An entry point's factory and arguments in, the call made: compiled code is kept on disk, and made once a machine."""
+"""Call compiled entry points. Their code is kept on disk and compiled once on each machine."""
 
 from __future__ import annotations
 

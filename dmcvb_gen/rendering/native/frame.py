@@ -534,7 +534,7 @@ def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, m
 
 
 @part
-def shade_heaven(s, k, texels, width, jobs, color, pixels, first, total):
+def shade_sky_jobs(s, k, texels, width, jobs, color, pixels, first, total):
     """Colors of `total` jobs of the sky, listed from `first` on."""
     room = room_for(pixels)
     for at in range(first, first + total, CHUNK):
@@ -545,7 +545,7 @@ def shade_heaven(s, k, texels, width, jobs, color, pixels, first, total):
 
 
 @part
-def keep_heaven(s, k, texels, width, jobs, color, pixels, geoms):
+def keep_sky(s, k, texels, width, jobs, color, pixels, geoms):
     """Fill the last part of `color` with the sky in every pixel."""
     room, total = room_for(pixels), pixels * pixels
     at = lists_at(room, geoms, 0, 0)
@@ -553,15 +553,15 @@ def keep_heaven(s, k, texels, width, jobs, color, pixels, geoms):
         n = min(CHUNK, total - first)
         for i in range(n):
             jobs[i], jobs[room + i], jobs[at + i] = (first + i) // pixels, (first + i) % pixels, i
-        shade_heaven(s, k, texels, width, jobs, color, pixels, at, n)
+        shade_sky_jobs(s, k, texels, width, jobs, color, pixels, at, n)
         for c in range(3):
             for i in range(n):
                 put(color, 3 * room + c * total + first + i, get(color, c * room + i))
 
 
 @part
-def take_heaven(jobs, color, room, pixels, first, total):
-    """Do as `shade_heaven`, with the colors that `keep_heaven` has stored."""
+def take_sky(jobs, color, room, pixels, first, total):
+    """Do as `shade_sky_jobs`, with the colors that `keep_sky` has stored."""
     for i in range(first, first + total):
         job = get(jobs, i)
         pixel = 3 * room + get(jobs, job) * pixels + get(jobs, room + job)
@@ -591,9 +591,9 @@ def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, kno
         if further:
             continue
         if layer == 1 and known:
-            take_heaven(jobs, color, room, pixels, first, total)
+            take_sky(jobs, color, room, pixels, first, total)
         elif layer == 1:
-            shade_heaven(s, k, texels, width, jobs, color, pixels, first, total)
+            shade_sky_jobs(s, k, texels, width, jobs, color, pixels, first, total)
 
 
 # -- pictures --------------------------------------------------------------------------------------
@@ -720,7 +720,7 @@ def paint_frames(
         inside = in_a_box(boxes, eye, f)
         known = known and same_sky(axes, sky, f)
         if not known and same_sky(axes, sky, f + 1):
-            keep_heaven(s, k, texels, width, jobs, color, pixels, rec.shape[0])
+            keep_sky(s, k, texels, width, jobs, color, pixels, rec.shape[0])
             known = True
         still = (
             stays

@@ -187,7 +187,7 @@ def aim_shadows(k, rec):
 
 @part
 def ways_from_lamp(s, n, k):
-    """Points and LIGHT in; ways from the lamp to them out, none (the lamp is seen) outside the shadow map's square
+    """Compute the ways from the lamp to points with LIGHT; none (the lamp is seen) outside the shadow map's square
     or if there is no light. Gives the extent of the others in the map: least and greatest right and up, grains.
     """
     distinct()
@@ -397,7 +397,7 @@ def raise_lights(s, n, k, exponent):
 
 @part
 def lamp_everywhere(s, n, k, rec, g, exponent, tint):
-    """`lamp_light` on plane g in; LAMP_RED and the others out, without a grid of vertices. See `shading.cover_body`."""
+    """Compute LAMP_RED and the others on plane g from `lamp_light`, without a grid. See `shading.cover_body`."""
     raise_row(s, n, i8(LAMP_SHINE), exponent)
     raise_row(s, n, i8(CONE_FACTOR), int(k[CONE + 1]))
     share = f4(rec[g, SHARE])
@@ -424,7 +424,7 @@ def lamp_color(plane, corner, right, up, a, b, c):
 
 @part
 def lamp_on_plane(s, n, k, rec, plane, g):
-    """U and V on the lit plane g in; LAMP_RED and the others, and LIGHT where there is any, out.
+    """Compute LAMP_RED and the others, and LIGHT where there is any, at U and V on the lit plane g.
 
     OpenGL draws each cell of the grid as two triangles. Gives whether there is any light.
     """

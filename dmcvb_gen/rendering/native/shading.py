@@ -231,7 +231,7 @@ def cover_plane(s, n, k, rec, g, veil, further, tint):
 
 @part
 def meet_body(s, n, rec, g, place, axis):
-    """RAY_X and RAY_Y in; points and unit normals where these rays meet ball or capsule g out, or at its outline
+    """Compute points and unit normals where the rays RAY_X, RAY_Y meet ball or capsule g, or at its outline
     where they pass by.
 
     Args:
@@ -332,7 +332,7 @@ def turn_rays(s, n, source_x, source_y, dx, dy):
 
 @part
 def own_directions(s, n, rec, g, first, less):
-    """Normals in; they in geom g's own frame out, in the three rows from `first` on, less those from `less` on."""
+    """Turn normals into geom g's own frame: into the three rows from `first` on, less those from `less` on."""
     for axis in range(3):
         a, b, c = f4(rec[g, TURN + axis]), f4(rec[g, TURN + 3 + axis]), f4(rec[g, TURN + 6 + axis])
         to, off = first + axis * CHUNK, less + axis * CHUNK

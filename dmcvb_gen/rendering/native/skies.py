@@ -108,8 +108,8 @@ def channel(texels, at, shift):
 
 
 def sky_maker(version: int):
-    """What makes (rows, columns, 3) uint8 the texels of `side` * `side`, and of all smaller levels, one after the
-    other; see `frame.painter`.
+    """Return a function that makes of (rows, columns, 3) uint8 the texels of `side` * `side` and of all smaller levels,
+    one after another; see `frame.painter`.
     """
 
     @njit(nogil=True, error_model="numpy", cache=True)
