@@ -1,9 +1,9 @@
 """Write files atomically: bytes, text or JSON become a whole file, flushed to the disk, or none.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
-disturb each other. The name says who makes it (machine, process namespace and process), so that files of a killed
-process can be told from those of a running one. Containers have process namespaces of their own: their files are left
-alone, even if they share the machine's name.
+disturb each other. The name says who makes it (machine, process namespace, process and its start), so that files of a
+killed process can be told from those of a running one. Containers have process namespaces of their own: their files are
+left alone, even if they share the machine's name.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PARTIAL = ".partial"
 """Ending of files in the making."""
 LARGEST_YAML = 100_000
 """Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
-_OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)\.[^.]+{re.escape(PARTIAL)}")
+_OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)(?:-(\d+))?\.[^.]+{re.escape(PARTIAL)}")
 
 
 @contextlib.contextmanager
@@ -56,6 +56,7 @@ def replacing(path: str | Path, new: bool = False) -> Iterator[Path]:
             temporary.unlink()
         else:
             os.replace(temporary, path)
+            temporary.unlink(missing_ok=True)  # it stays if both names were one file already
         _flush_folder(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -63,7 +64,8 @@ def replacing(path: str | Path, new: bool = False) -> Iterator[Path]:
 
 
 def _owner() -> str:
-    return f"{_machine()}@{os.getpid()}"
+    started = _start_of(os.getpid())
+    return f"{_machine()}@{os.getpid()}" + ("" if started is None else f"-{started}")
 
 
 @functools.cache
@@ -200,7 +202,7 @@ def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = T
     """
     for path in _partial_files(Path(folder), below):
         owner = _OWNED.fullmatch(path.name)
-        if not (owner[1] == _machine() and not _alive(int(owner[2])) if owner else foreign):
+        if not (owner[1] == _machine() and not _alive(int(owner[2]), owner[3]) if owner else foreign):
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -217,7 +219,7 @@ def others_at_work(folder: str | Path) -> list[str]:
         machine, process = owner[1], int(owner[2])
         if machine != _machine():
             found.add(f"a process of machine {machine.rpartition('-')[0]}")
-        elif process != os.getpid() and _alive(process):
+        elif process != os.getpid() and _alive(process, owner[3]):
             found.add(f"process {process}")
     return sorted(found)
 
@@ -233,7 +235,16 @@ def _partial_files(folder: Path, below: bool) -> list[Path]:
     return found
 
 
-def _alive(process: int) -> bool:
+def _start_of(process: int) -> str | None:
+    """When a process started, in ticks since the system's start; None if the system does not tell (Linux does)."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return None
+
+
+def _alive(process: int, started: str | None) -> bool:
+    """Return True if a process is running, and did not take over the number of one that started at another time."""
     if os.name == "nt":
         return True  # os.kill would end it
     try:
@@ -241,8 +252,8 @@ def _alive(process: int) -> bool:
     except ProcessLookupError:
         return False
     except (PermissionError, OverflowError):
-        return True
-    return True
+        pass
+    return started in (None, _start_of(process) or started)
 
 
 def sha256_file(path: str | Path) -> str:

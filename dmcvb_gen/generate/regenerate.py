@@ -16,7 +16,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.dataset.index import POLICIES, VIDEOS, ZARR_JSON, restore_index, restored_commit, trusted_index
-from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, environment
+from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, environment, parse_commit
 from dmcvb_gen.dataset.pictures import SHOWN, stored_pictures
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
@@ -505,11 +505,23 @@ def _input_files(root: Path) -> set[str]:
     return {path.relative_to(root).as_posix() for folder in folders for path in folder.rglob("*") if path.is_file()}
 
 
+def _stands_for(record: Path, commit: CommitRecord) -> bool:
+    """Return True if a record file promises the bytes of a commit."""
+    try:
+        return parse_commit(record.read_bytes()).same_data(commit)
+    except (OSError, StoreError):
+        return False
+
+
 def _replace_shard(root: Path, folder: Path, commit: CommitRecord) -> None:
-    """Replace a shard's files, then its record: at no moment does a record stand for files that are not there."""
+    """Replace a shard's files, then its record: at no moment does a record stand for other files than it promises.
+
+    A record of the same bytes stays in its place, so that a repair that is interrupted does not lose it.
+    """
     record = root / commit_path(commit.subset, commit.shard)
     try:
-        record.unlink(missing_ok=True)
+        if not _stands_for(record, commit):
+            record.unlink(missing_ok=True)
         for file in commit.files:
             target = root / file.path
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -104,6 +104,22 @@ def test_damaged_and_missing_shards_are_repaired_and_sound_ones_not_touched(copy
         assert (copy / path.relative_to(small_release)).read_bytes() == data
 
 
+def test_a_repair_that_is_interrupted_keeps_the_record_of_the_damaged_shard(copy, monkeypatch):
+    manifest = open_release(copy).manifest
+    commit = copy / commit_path(manifest.subsets[0].name, 0)
+    record = parse_commit(commit.read_bytes())
+    (copy / record.files[0].path).unlink()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(StoreError, match="make room"):
+        patch.setattr("dmcvb_gen.generate.regenerate.os.replace", full)
+        Regeneration(copy).repair()
+    assert parse_commit(commit.read_bytes()).same_data(record)
+    assert Regeneration(copy).repair().sound and verify(copy).sound
+
+
 def test_lost_metadata_is_put_back(copy):
     (copy / f"{NAME}.zarr/zarr.json").write_text("{")
     shutil.rmtree(copy / f"{NAME}.zarr/pixels")

@@ -84,3 +84,24 @@ def test_what_killed_writers_left_is_removed(tmp_path):
     assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, nobodys.name, container.name, "kept"])
     files.remove_partial(tmp_path, foreign=True)
     assert sorted(os.listdir(tmp_path / "sub")) == sorted([living.name, container.name, "kept"])
+
+
+@pytest.mark.skipif(files._start_of(os.getpid()) is None, reason="this system does not tell when a process started")
+def test_a_process_that_took_over_the_number_of_a_killed_one_keeps_nothing(tmp_path):
+    with files.replacing(tmp_path / "kept") as mine:
+        mine.write_text("half")
+        started = files._start_of(os.getpid())
+        of_killed = tmp_path / mine.name.replace(f"-{started}.", "-1.")
+        of_killed.write_text("half")
+        files.remove_partial(tmp_path)
+        assert (mine.exists(), of_killed.exists()) == (True, False)
+    assert os.listdir(tmp_path) == ["kept"]
+
+
+def test_a_link_in_place_of_the_same_file_leaves_nothing_behind(tmp_path):
+    (tmp_path / "one").write_text("data")
+    os.link(tmp_path / "one", tmp_path / "two")
+    with files.replacing(tmp_path / "two") as temporary:  # as two publishers do at once
+        temporary.unlink()
+        os.link(tmp_path / "one", temporary)
+    assert sorted(os.listdir(tmp_path)) == ["one", "two"]
