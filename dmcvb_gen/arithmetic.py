@@ -108,12 +108,6 @@ def arctan2(y, x) -> np.ndarray:
     return np.copysign(angle, y)
 
 
-def arccos(x) -> np.ndarray:
-    """Arc cosine elementwise, of numbers in [-1, 1]."""
-    x = np.asarray(x, np.float64)
-    return arctan2(np.sqrt((1 - x) * (1 + x)), x)
-
-
 def erf(x) -> np.ndarray:
     """Error function elementwise; absolute error below 2e-8 beyond 4, where it counts as 1."""
     x = np.asarray(x, np.float64)

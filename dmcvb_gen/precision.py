@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import torch
 
-PRECISIONS = ("auto", "float32", "bfloat16")
 PROBE_SECONDS = 0.2
 """Seconds that a probe takes at most, once every product has run."""
 WORTH = 0.95
@@ -22,7 +21,7 @@ def choose_precision(asked: str, product: Callable[[torch.dtype], object], devic
     """ "float32" or "bfloat16".
 
     Args:
-      asked: one of `PRECISIONS`; "auto" takes the faster one.
+      asked: "float32", "bfloat16", or "auto", which takes the faster one.
       product: computes a typical product in a precision; called several times with each.
       device: "cpu" is probed; "cuda" is asked whether it supports bfloat16.
     """

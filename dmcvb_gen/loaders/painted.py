@@ -62,7 +62,7 @@ class Painting:
 
 
 class PaintedArray:
-    """A picture array that is rendered when it is indexed; see `store.reader.StoredArray`."""
+    """A picture array that is rendered when it is indexed; see `dataset.reader.StoredArray`."""
 
     def __init__(self, subset: PaintedSubset, name: str):
         self._subset, self.name = subset, name

@@ -74,7 +74,7 @@ class Verification:
 
 
 def check_files(root: Path, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> Iterator[Issue]:
-    """Every file of a local release has its digest and every shard of a complete one is there; see `store.index`.
+    """Every file of a local release has its digest and every shard of a complete one is there; see `dataset.index`.
 
     Args:
       workers: processes, a Ray cluster that sees the folder, or an open pool.

@@ -1,15 +1,10 @@
-"""A task as vectorized reinforcement-learning environments.
-
-`TaskVecEnv` is a Stable-Baselines3 VecEnv over one batch of simulations, for any SB3 or sb3-contrib algorithm;
-`TaskEnv` is one episode at a time as a Gymnasium environment.
-"""
+"""A task as a Stable-Baselines3 VecEnv over one batch of simulations, for any algorithm of SB3 or sb3-contrib."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -114,27 +109,3 @@ class TaskVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))
-
-
-class TaskEnv(gymnasium.Env):
-    """One episode at a time; `reset(seed=...)` draws the initial state from that seed."""
-
-    metadata = {"render_modes": []}
-
-    def __init__(self, task: Task):
-        self.task, self.batch = task, task.batch(1)
-        self.observation_space, self.action_space = _spaces(task)
-        self._length = 0
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
-        super().reset(seed=seed)
-        self._length = 0
-        self.batch.reset([self.np_random])
-        return self.batch.behaviour_observation()[0], {}
-
-    def step(self, action: np.ndarray):
-        result = self.batch.step(np.asarray(action)[None])
-        self._length += 1
-        terminated = bool(result.terminated[0])
-        truncated = self._length >= self.task.max_steps and not terminated
-        return self.batch.behaviour_observation()[0], float(result.reward[0]), terminated, truncated, {}
