@@ -76,8 +76,8 @@ class PolicyHeader(_Model):
       layer_norm: True if each hidden layer is normalized before its activation.
       distribution: "squashed_gaussian": tanh(mean + std * noise); "gaussian": clipped to [-1, 1];
         "deterministic": the mean, with fixed `noise` added when sampling.
-      way: widths of the hidden layers of the network that says where to head in a maze (`policies.open_maze`); None: the
-        policy heads for its goal.
+      way: widths of the hidden layers of the network that says where to head in a maze (`policies.open_maze`); None:
+        the policy heads for its goal.
       clip_observation: normalized observations are clipped to +- this.
       training: settings, seed, wall time, versions.
       command: command that trains it again.
