@@ -51,7 +51,7 @@ from dmcvb_gen.dataset.writer import LOCK, finish_release, mark_created, read_co
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.storage import Storage, open_storage
-from dmcvb_gen.storage.base import in_parallel
+from dmcvb_gen.storage.base import in_parallel, unfinished
 from dmcvb_gen.storage.remote import local_path, storage_errors
 
 
@@ -347,6 +347,7 @@ class Download:
             if self.stop.is_set():
                 raise StoreError("Interrupted. Transferred files are kept, rerun the same command")
             if link_known(self.out, file, self._equal.get(file.path, ())):
+                unfinished(self.out / file.path).unlink(missing_ok=True)
                 return key, True, file.bytes
             return key, self.source.storage.download(file, self.out), file.bytes
 

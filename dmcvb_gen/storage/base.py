@@ -254,7 +254,7 @@ class Storage(abc.ABC):
         if local.is_file() and local.stat().st_size == file.bytes and sha256_file(local) == file.sha256:
             return False
         local.parent.mkdir(parents=True, exist_ok=True)
-        partial = local.with_name(local.name + ".partial")
+        partial = unfinished(local)
 
         def attempt() -> bool:
             self._fetch(file, partial, root)
@@ -302,6 +302,11 @@ class Storage(abc.ABC):
 
     def _attempt(self, path: str, attempt: Callable[[], Result], doing: str) -> Result:
         return retry(self.place, path, attempt, doing)
+
+
+def unfinished(local: Path) -> Path:
+    """The file beside `local` that holds what an interrupted download has brought of it."""
+    return local.with_name(local.name + ".partial")
 
 
 def checked(root: Path, file: Digested) -> Path:

@@ -17,6 +17,7 @@ from dmcvb_gen.dataset.sharing import disk_bytes
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.storage.base import unfinished
 from tests.conftest import maze_recipe, roll_out, small_recipe
 
 pytestmark = pytest.mark.slow  # whole releases of three families
@@ -86,6 +87,20 @@ def test_links_survive_publishing_and_fetching_and_a_part_is_whole_by_itself(mad
     assert verify(tmp_path / "part").sound and list(open_release(tmp_path / "part")) == [names[-1]]
     fetch(f"file://{tmp_path}/there", tmp_path / "part")
     assert same_bytes(folder, tmp_path / "part")
+
+
+def test_a_file_that_becomes_a_link_leaves_no_unfinished_download(made, tmp_path):
+    folder, names, _ = made
+    publish(folder, f"file://{tmp_path}/there")
+    fetched = tmp_path / "here"
+    fetch(f"file://{tmp_path}/there", fetched)
+    chunks = [
+        fetched / file.path for name in names for c in open_release(fetched)[name].commits.values() for file in c.files
+    ]
+    for chunk in chunks:  # as a fetch leaves them that is killed while it downloads all at once
+        chunk.rename(unfinished(chunk))
+    fetch(f"file://{tmp_path}/there", fetched)
+    assert not list(fetched.rglob("*.partial")) and verify(fetched).sound
 
 
 def test_a_damaged_file_harms_all_that_share_it_and_repair_links_them_again(made, tmp_path):
