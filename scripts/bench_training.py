@@ -33,12 +33,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.precision import choose_precision, dense_product
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import runs
 from dmcvb_gen.training.defaults import default_run
 from dmcvb_gen.training.runs import RunConfig
-from dmcvb_gen.training.sac import Sac, SacSettings
+from dmcvb_gen.training.sac import Sac, SacSettings, precision_setting
 from dmcvb_gen.training.training import open_run
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
@@ -131,6 +130,8 @@ def ours(
     with tempfile.TemporaryDirectory() as folder:
         runs.EVALUATION_EPISODES = episodes
         settings = default_run(task, algorithm)["settings"]
+        if algorithm == "sac":
+            settings |= precision_setting(settings)
         config = RunConfig(task, algorithm, 2_000_000, seed, settings, evaluate_every=every, evaluate_sparse=every)
         try:
             open_run(Path(folder) / "run", config, resume=False).train(report)
@@ -159,7 +160,8 @@ def precisions(task: str, updates: int) -> None:
     """Updates a second of SAC's critics and actor in both precisions, and which one `--precision auto` takes here."""
     found = get_task(task)
     sizes = {"observation_size": found.state_size, "action_size": found.action_size}
-    settings, rates = SacSettings(**default_run(task, "sac")["settings"]), {}
+    chosen, rates = default_run(task, "sac")["settings"], {}
+    settings = SacSettings(**chosen)
     header = PolicyHeader(task=task, algorithm="sac", agent_step=0, hidden=settings.actor_hidden, **sizes)
     rows = settings.batch_size
     batch = {name: torch.randn(rows, sizes["observation_size"]) for name in ("observation", "next_observation")}
@@ -173,7 +175,7 @@ def precisions(task: str, updates: int) -> None:
         for _ in range(updates):
             sac.update(batch)
         rates["bfloat16" if half else "float32"] = updates / (time.perf_counter() - started)
-    auto = choose_precision("auto", dense_product(settings.critic_hidden[-1], settings.batch_size))
+    auto = "bfloat16" if precision_setting(chosen)["bfloat16"] else "float32"
     shown = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
     print(f"updates a second: {shown}; auto takes {auto}, {rates[auto] / max(rates.values()):.2f} of the faster one")
 

@@ -22,11 +22,10 @@ import torch
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.precision import choose_precision, dense_product
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.training.defaults import parse_settings, run_config
-from dmcvb_gen.training.sac import SacSettings
+from dmcvb_gen.training.sac import precision_setting
 from dmcvb_gen.training.training import open_run
 
 SHARE, EPISODES, SEED = 0.95, 100, 20_000
@@ -53,9 +52,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     settings = parse_settings(tuple(given.pairs), None, "sac")
-    sizes = SacSettings(**settings)
-    precision = choose_precision(given.precision, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
-    settings["bfloat16"] = precision == "bfloat16"
+    settings |= precision_setting(settings, given.precision)
     expert = paper_returns(given.task, "expert")
     if not expert:
         sys.exit(f"{given.task} has no expert in the paper's tables; give walker-walk, cheetah-run or humanoid-walk")
@@ -85,6 +82,7 @@ def main() -> None:
         except Reached as found:
             reached = f"{float(found.args[0]):.0f}"
     minutes, frames = (time.process_time() - began) / 60, ACTION_REPEAT * run.step
+    precision = "bfloat16" if settings["bfloat16"] else "float32"
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     command = f"`speedrun.sh {shlex.join(sys.argv[1:])}`"
     amount = (f"{frames:,}", f"{minutes:.1f}") if reached else (f"not in {frames:,}", f"{minutes:.1f}")

@@ -123,8 +123,7 @@ def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:
 
 def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: Any) -> dict[str, bool]:
     """The setting that --precision decides; none if a run is resumed or has one of its own."""
-    from dmcvb_gen.precision import choose_precision, dense_product
-    from dmcvb_gen.training.sac import SacSettings
+    from dmcvb_gen.training.sac import precision_setting
 
     if algorithm != "sac":
         if asked != "auto":
@@ -134,6 +133,4 @@ def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: A
         return {}
     if "bfloat16" in settings:
         raise DmcvbError("give --precision or --set bfloat16, not both")
-    sizes = SacSettings(**settings)
-    precision = choose_precision(asked, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
-    return {"bfloat16": precision == "bfloat16"}
+    return precision_setting(settings, asked)

@@ -20,6 +20,7 @@ from torch import nn
 
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
+from dmcvb_gen.precision import choose_precision, dense_product
 from dmcvb_gen.training.networks import Actor
 from dmcvb_gen.training.row_files import map_rows, rows_in
 from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, Share
@@ -64,7 +65,7 @@ class SacSettings:
       clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
         tasks want).
       weight_decay: weight decay of AdamW, on actor and critics.
-      bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
+      bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32); see `precision_setting`.
       compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
@@ -99,8 +100,15 @@ class SacSettings:
     critics: Count = 2
     clipped: bool = True
     weight_decay: NonNegative = 0.0
-    bfloat16: bool = True
+    bfloat16: bool = False
     compile: bool = True
+
+
+def precision_setting(settings: Mapping[str, Any], asked: str = "auto") -> dict[str, bool]:
+    """{"bfloat16": ...} for a training with `settings`; "auto" times the critics' products in both precisions."""
+    sizes = SacSettings(**settings)
+    precision = choose_precision(asked, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
+    return {"bfloat16": precision == "bfloat16"}
 
 
 RETURN_LIMIT = 5.0
