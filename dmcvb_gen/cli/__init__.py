@@ -112,7 +112,7 @@ def main():
     """Make, check, share and use DMC-VB style data sets.
 
     \b
-    dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8 --out releases/demo
+    dmcvb-gen rollout walker-walk --level expert --episodes 8 --out releases/demo
     dmcvb-gen preview releases/demo
     """
     _stop_on_signals(click.get_current_context())
