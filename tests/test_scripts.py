@@ -20,3 +20,9 @@ def run(name: str, *arguments: str) -> str:
 @pytest.mark.slow
 def test_both_precisions_are_timed():
     assert "auto takes" in run("bench_training.py", "--precisions", "--updates", "3")
+
+
+@pytest.mark.slow
+def test_a_painted_sample_of_a_shipped_release_has_the_same_digests_twice():
+    printed = run("paint_sample.py", "dmcvb-v1-locomotion", "--share", "0.0001")
+    assert "painted twice, 0 shards differ" in printed
