@@ -12,6 +12,8 @@ from click.testing import CliRunner
 
 from dmcvb_gen import precision
 from dmcvb_gen.cli import main
+from dmcvb_gen.training import sac
+from dmcvb_gen.training.defaults import default_run
 from dmcvb_gen.training.runs import read_config
 
 SHORT = ["--steps", "12", "--set", "warmup_steps=8", "--set", "simulations=4", "--set", "batch_size=8"]
@@ -45,11 +47,17 @@ def test_a_processor_without_bfloat16_computes_in_float32():
 
 @pytest.mark.parametrize("fast", ["float32", "bfloat16"])
 def test_a_run_says_and_records_what_auto_chose(tmp_path, monkeypatch, fast):
-    monkeypatch.setattr(precision, "choose_precision", lambda *arguments: fast)
+    monkeypatch.setattr(sac, "choose_precision", lambda *arguments: fast)
     run = CliRunner().invoke(main, ["train-behaviour", "walker-walk", "--out", str(tmp_path / "run"), *SHORT])
     assert run.exit_code == 0, run.output
     assert f"Computing in {fast}" in run.stderr
     assert read_config(tmp_path / "run").settings["bfloat16"] == (fast == "bfloat16")
+
+
+def test_settings_that_nothing_probed_compute_in_float32():
+    """bench_training.py once took bfloat16 as a default: ten times slower without hardware for it."""
+    assert not sac.SacSettings().bfloat16
+    assert all("bfloat16" not in default_run(task)["settings"] for task in ("walker-walk", "ant-maze-empty7x7"))
 
 
 @pytest.mark.parametrize(
