@@ -29,6 +29,7 @@ from dmcvb_gen.agents.networks import (
     state_decoder,
     state_encoder,
 )
+from dmcvb_gen.agents.privileged_bc import PrivilegedBC
 from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
 from dmcvb_gen.agents.state_prediction import StatePrediction
 from dmcvb_gen.agents.td3_bc import TD3BC
@@ -323,6 +324,7 @@ def td3(alpha=2.5, bounded=True):
 MOVED = {
     "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), ("encoder", "policy")),
     "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), ("policy",)),
+    "privileged bc": (lambda: PrivilegedBC(small_encoder(), SIZES), ("encoder", "estimator", "policy")),
     "id": (lambda: InverseDynamics(small_encoder(), SIZES), ("encoder", "f.")),
     "sampled id": (lambda: InverseDynamics(small_encoder(), SIZES, k=4, sample=True), ("encoder", "f.", "embed_k")),
     "lfd": (lambda: LatentForwardDynamics(small_encoder(), SIZES), ("encoder", "embed_action", "g.", "target_")),
@@ -339,6 +341,23 @@ def test_one_update_moves_exactly_the_parameters_that_the_paper_says(kind):
     make, prefixes = MOVED[kind]
     learner = make()
     assert moved(learner) == names(learner, *prefixes)
+
+
+def test_privileged_bcs_policy_learns_from_true_states_alone():
+    learner = PrivilegedBC(small_encoder(), SIZES)
+    batch = make_batch()
+    losses = learner.losses(batch)
+    losses["cloning"].backward(retain_graph=True)
+    reached = {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
+    assert reached == {"policy"}
+    learner.zero_grad(set_to_none=True)
+    losses["estimate"].backward()
+    assert "policy" not in {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
+    held_out = [learner.metrics(batch)["cloning"] for _ in range(2)]
+    assert torch.equal(*held_out), "held-out losses have no noise"
+    with torch.no_grad():
+        estimate = learner.estimator(learner.encoder(batch.observation))
+        torch.testing.assert_close(learner.act(batch.observation), learner.policy(estimate))
 
 
 def test_td3_bc_moves_convolutions_and_both_trunks_by_the_actors_loss_alone():
@@ -471,6 +490,7 @@ OVERFIT = {
     "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), 40, 0.05),
     "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), STATE_SIZES), 60, 0.05),
     "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), 60, 0.05),
+    "privileged bc": (lambda: PrivilegedBC(small_encoder(), SIZES), 80, 0.1),
     "td3-bc": (lambda: td3(alpha=0.01), 80, 0.1),
     "td3-bc on states": (lambda: TD3BC(None, STATE_SIZES, alpha=0.01), 150, 0.1),
     "id": (lambda: InverseDynamics(small_encoder(), SIZES), 40, 0.05),
