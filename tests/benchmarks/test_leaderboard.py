@@ -37,15 +37,16 @@ def report_of(release, out, agents, only, benchmark="b1"):
 @pytest.fixture(scope="module")
 def walkers(small_release, tmp_path_factory):
     out = tmp_path_factory.mktemp("walkers")
-    return report_of(small_release, out, ["state-bc", "bc", "td3-bc"], ["*/*/none", "*/*/dynamic"])
+    return report_of(small_release, out, ["state-bc", "bc", "td3-bc", "privileged-bc"], ["*/*/none", "*/*/dynamic"])
 
 
 @pytest.fixture(scope="module")
 def mazes(small_mazes, tmp_path_factory):
-    return report_of(small_mazes, tmp_path_factory.mktemp("mazes"), ["state-td3-bc", "id+bc"], ["*/*/visible"])
+    out = tmp_path_factory.mktemp("mazes")
+    return report_of(small_mazes, out, ["state-td3-bc", "id+bc", "privileged-bc"], ["*/*/visible"])
 
 
-@pytest.mark.parametrize("report, count", [("walkers", 5), ("mazes", 2)])
+@pytest.mark.parametrize("report, count", [("walkers", 7), ("mazes", 3)])
 def test_every_row_of_a_report_holds_when_its_policy_is_scored_again(report, count, request, tmp_path):
     folder = request.getfixturevalue(report)
     rows = add_rows(tmp_path, rows_of_report(folder, "dmcvb-gen rollout ..."))
