@@ -62,6 +62,8 @@ COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in comma
 
 ALIASES = {"questions": "claims"}
 """Earlier name of a command -> its name."""
+RESUMING = frozenset({"rollout", "paint", "repaint", "validate", "publish", "fetch", "export", "import"})
+"""Commands that keep what they finished, and go on from there when they are run again."""
 
 
 class LazyGroup(click.Group):
@@ -94,8 +96,12 @@ class LazyGroup(click.Group):
         _name_glfw_library()
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:
+            _say_how_to_go_on(ctx)
+            raise
         except Exception as error:
             if _asked_to_stop.is_set():  # Ctrl-C within foreign code comes out as that code's own kind of error
+                _say_how_to_go_on(ctx)
                 raise click.Abort() from None
             what = str(error) if isinstance(error, DmcvbError) else None
             if isinstance(error, ModuleNotFoundError):
@@ -133,6 +139,11 @@ def _name_glfw_library() -> None:
         library = Path(found.origin).with_name(variant) / "libglfw.so"
         if library.exists():
             os.environ.setdefault("PYGLFW_LIBRARY", str(library))
+
+
+def _say_how_to_go_on(context: click.Context) -> None:
+    if context.invoked_subcommand in RESUMING:
+        click.echo("\nInterrupted. What is finished is kept; rerun the same command to go on.", err=True)
 
 
 def _stop_on_signals(context: click.Context) -> None:

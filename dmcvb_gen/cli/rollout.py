@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import shlex
@@ -142,7 +141,7 @@ def _run(plan, workers, as_json, whole=True):
         finished += sum(commit.episode_count for commit in result.commits)
         bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
 
-    with _interruption_message(), commands.progress_bar(not as_json, " frames", plan.manifest.name) as bar:
+    with commands.progress_bar(not as_json, " frames", plan.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     manifest, steps, place = made.manifest, made.steps, plan.target.place
     facts = dict(out=place, complete=manifest.complete, steps=steps, seconds=round(made.seconds, 2))
@@ -158,15 +157,6 @@ def _run(plan, workers, as_json, whole=True):
     painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
     look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else "")
     answer(as_json, facts, done, look)
-
-
-@contextlib.contextmanager
-def _interruption_message():
-    try:
-        yield
-    except KeyboardInterrupt:
-        click.echo("\nInterrupted. Finished shards are saved; rerun the same command to resume.", err=True)
-        raise
 
 
 def _show_plan(plan, workers, as_json):

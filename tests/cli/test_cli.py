@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from dmcvb_gen.cli import COMMANDS, main
+from dmcvb_gen.cli import COMMANDS, RESUMING, main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
@@ -186,6 +186,27 @@ def test_a_stop_that_foreign_code_turns_into_its_own_error_is_no_traceback(tmp_p
     monkeypatch.setattr("dmcvb_gen.generate.info.describe_release", foreign)
     result = run("info", tmp_path)
     assert result.exit_code == 1 and "Aborted" in result.output and isinstance(result.exception, SystemExit)
+
+
+@pytest.mark.parametrize("foreign", [True, False])
+@pytest.mark.parametrize("command", sorted(RESUMING))
+def test_a_command_that_resumes_says_so_when_it_is_stopped(monkeypatch, command, foreign):
+    def stopped(context):
+        if not foreign:
+            raise KeyboardInterrupt
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def turned_into_an_error(context):
+        try:
+            stopped(context)
+        except KeyboardInterrupt:
+            raise ValueError("argument 1: KeyboardInterrupt") from None
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr(main.get_command(None, command), "invoke", turned_into_an_error if foreign else stopped)
+    monkeypatch.setattr(main.get_command(None, command), "params", [])
+    result = run(command)
+    assert result.exit_code == 1 and "rerun the same command to go on" in result.output
 
 
 HALF_BEGUN = """
