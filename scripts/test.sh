@@ -2,7 +2,7 @@
 # Sets everything up on a fresh machine (Python 3.11, pip) and runs the checks.
 #   bash scripts/test.sh [pytest options]          the linters and the fast tests: under 5 minutes on two cores
 #   bash scripts/test.sh --all [pytest options]    every test, the slow ones too: under 15 minutes
-# A test without the mark slow may compute for 5 s: checked in the fast tier, whose 5 minutes it guards.
+# Tests without the mark slow that compute for more than 5 s are listed at the end.
 tier=(-m "not slow" --cpu-limit 5)
 if [ "${1:-}" = --all ]; then
   tier=()
