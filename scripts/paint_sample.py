@@ -45,7 +45,7 @@ def painted(release: Path, key: ShardKey) -> tuple[tuple[FileRecord, ...], float
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("manifest", help="name of a shipped manifest")
+    parser.add_argument("manifest", help="name of a shipped manifest without pictures")
     parser.add_argument("--share", type=float, default=0.02, help="share of the shards")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw")
     options = parser.parse_args()
@@ -61,6 +61,8 @@ def main() -> int:
             made = dmcvb_gen.regenerate(
                 manifest=options.manifest, only=subset, episodes=span, out=first, progress=False
             )
+            if open_release(first)[subset].commits[shard].painted:
+                sys.exit(f"{options.manifest} has pictures; compare them with dmcvb-gen regenerate --check")
             shutil.copytree(first, second, symlinks=True)
             (one, spent), (other, more) = painted(first, key), painted(second, key)
             steps = open_release(first)[subset].commits[shard].steps

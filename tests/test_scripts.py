@@ -26,3 +26,7 @@ def test_both_precisions_are_timed():
 def test_a_painted_sample_of_a_shipped_release_has_the_same_digests_twice():
     printed = run("paint_sample.py", "dmcvb-v1-locomotion", "--share", "0.0001")
     assert "painted twice, 0 shards differ" in printed
+    painted = subprocess.run(
+        [sys.executable, SCRIPTS / "paint_sample.py", "quickstart"], capture_output=True, text=True
+    )
+    assert painted.returncode == 1 and "regenerate --check" in painted.stderr
