@@ -1,8 +1,8 @@
 """Privileged BC: estimate the state from the observation, and act by the estimate. Not in the paper.
 
-The policy learns from the true states of the data, which only training needs, and never sees a latent. So it cannot
-copy the last action from the difference of two frames. Under static distractors it errs more on the data than BC, and
-yet falls less often when it drives (docs/results.md).
+The policy learns from the true states of the data, which only training needs, and never sees a latent. So nothing but
+the state can decide its actions. Under static distractors it errs more on the data than BC, and yet falls less often
+when it drives (docs/results.md).
 """
 
 from __future__ import annotations
