@@ -134,7 +134,7 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode != 0 and "rerun the same command to resume" in errors and "Traceback" not in errors
+    assert process.returncode != 0 and "rerun the same command to go on" in errors and "Traceback" not in errors
     assert len(open_release(tmp_path / "r").subsets) >= 1
 
 
