@@ -40,9 +40,11 @@ class ProgressBar(tqdm):
         self.total = count
 
     def advance(self, what: str, steps: int) -> None:
-        """Name the item in progress, and count steps."""
+        """Name the item in progress, and count steps; with none, the name alone is shown."""
         self.set_description(what, refresh=False)
         self.update(steps)
+        if not steps:
+            self.refresh()
 
     def refresh(self, *args: Any, **options: Any) -> bool | None:
         if self._logged:

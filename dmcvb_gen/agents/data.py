@@ -302,13 +302,23 @@ class TrainingData:
         return self._with(stack=stack)
 
     @torch.no_grad()
-    def encoded(self, encoder: nn.Module, dtype: torch.dtype = torch.float32) -> TrainingData:
-        """The same episodes with the latents of a frozen encoder, computed once; its pictures are not shifted."""
+    def encoded(
+        self,
+        encoder: nn.Module,
+        dtype: torch.dtype = torch.float32,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> TrainingData:
+        """The same episodes with the latents of a frozen encoder, computed once; its pictures are not shifted.
+
+        Args:
+          progress: called with the share of the rows that are encoded.
+        """
         rows = torch.arange(len(self.state), device=self.device)
         parts = []
         for few in rows.split(ENCODED_ROWS):
             with torch.autocast(self.device.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
                 parts.append(encoder(self.observe(few, dtype=dtype)).float())
+            progress((int(few[-1]) + 1) / len(rows))
         return self._with(latent=torch.cat(parts))
 
     def _with(self, **changes) -> TrainingData:

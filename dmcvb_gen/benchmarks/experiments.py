@@ -151,11 +151,18 @@ def _load_encoder(setup: Setup, work: Pretraining, encoder: nn.Module) -> None:
         raise DmcvbError(f"cannot read the encoder {path} ({error}); delete it and run again") from None
 
 
-def encoded(setup: Setup, encoder: nn.Module, data: TrainingData) -> TrainingData:
-    """Data of a frozen encoder: its latents are computed once if the profile does not shift pictures."""
-    if setup.profile.frozen_shift:
+def encoded(
+    setup: Setup, encoder: nn.Module, data: TrainingData, draws: int, tick: ProgressCallback = ignore
+) -> TrainingData:
+    """Data of a frozen encoder: its latents are computed once if that pays and the profile does not shift pictures.
+
+    Args:
+      draws: how many transitions will be drawn; if there are more rows than that, each is encoded as it is drawn.
+    """
+    if setup.profile.frozen_shift or draws < len(data.state):
         return data
-    return data.encoded(encoder, torch.bfloat16 if setup.precision == "bfloat16" else torch.float32)
+    dtype = torch.bfloat16 if setup.precision == "bfloat16" else torch.float32
+    return data.encoded(encoder, dtype, lambda share: tick(f"encoding, {share:.0%}", 0))
 
 
 # -- a cell ---------------------------------------------------------------------------------------
@@ -278,7 +285,8 @@ def _train_policy(
     label = f"{cell.agent.name} on {cell.task} {cell.policy_label}/{cell.setting}"
     frozen = cell.agent.pretrain is not None
     settings = train_settings(setup, policy_steps(profile, cell.agent), pixels, profile.evaluations, frozen)
-    data = encoded(setup, policy.encoder, data) if frozen else data
+    if frozen:
+        data = encoded(setup, policy.encoder, data, settings.steps * settings.batch_size, tick)
     started = time.perf_counter()
     try:
         curve = train(
@@ -411,7 +419,9 @@ def inspect(
         "state": StateProbe(encoder, data.sizes),
     }
     settings = train_settings(setup, setup.profile.readout_steps, frozen=True)
-    data = encoded(setup, encoder, data)
+    inspected = min(len(data.hold_out_rows), INSPECTED)
+    draws = len(readouts) * (settings.steps * settings.batch_size + inspected) + inspected  # states' errors count twice
+    data = encoded(setup, encoder, data, draws, tick)
     for name, learner in readouts.items():
         learner.to(setup.device)
         curves[name] = train(
@@ -422,7 +432,8 @@ def inspect(
             folder=folder / name,
             tick=lambda made, n=name: tick(f"{n} decoder", made),
         )
-        errors[f"{name}_mse"] = _hold_out_error(learner, data, setup.profile.batch_size)
+        tested = functools.partial(tick, f"test error of the {name} decoder", 0)
+        errors[f"{name}_mse"] = _hold_out_error(learner, data, setup.profile.batch_size, tested)
     units = state_units(setup, cell.task)
     errors["state_l1"] = _field_errors(readouts["state"], data, get_task(cell.task), units, setup.profile.batch_size)
     held_out = len(data.hold_out_rows) > 0
@@ -444,10 +455,11 @@ def _hold_out_batches(learner: Learner, data: TrainingData, size: int) -> Iterat
 
 
 @torch.no_grad()
-def _hold_out_error(learner: Learner, data: TrainingData, size: int) -> float | None:
-    """Mean loss over the held-out transitions; None if none are held out."""
+def _hold_out_error(learner: Learner, data: TrainingData, size: int, tick: Callable[[], None] = ignore) -> float | None:
+    """Mean loss over the held-out transitions; None if none are held out. `tick` is called after each batch."""
     total = count = 0.0
     for batch in _hold_out_batches(learner, data, size):
+        tick()
         total, count = total + float(learner.metrics(batch)["loss"]) * len(batch.action), count + len(batch.action)
     return total / count if count else None
 

@@ -129,7 +129,7 @@ class _Pace:
             self.tell()
 
     def tell(self) -> None:
-        if self._steps:
+        if self._what:
             self._tick(self._what, self._steps)
         self._steps, self._told = 0, time.monotonic()
 

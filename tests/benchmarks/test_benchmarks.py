@@ -11,7 +11,7 @@ from PIL import Image
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.data import Normalization, Source, default_memory, load_data, normalize_pixels
-from dmcvb_gen.benchmarks import report
+from dmcvb_gen.benchmarks import experiments, report
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.experiments import _DataCache, run_cell, train_settings
 from dmcvb_gen.benchmarks.paper import paper_score
@@ -431,6 +431,28 @@ def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, requ
     assert found["seconds"]["all"] >= found["seconds"]["inspection"] >= decoding > 0
     assert list(found["score"]["returns"]) == list(expected["score"]["returns"])
     assert not list((tmp_path / "other").rglob("*.run"))
+
+
+@pytest.mark.parametrize("whole", ["small_release", "maze_release"])
+def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, request, tmp_path, monkeypatch):
+    folder, found, told = request.getfixturevalue(whole), {}, {}
+    cell = plan_benchmark("b1", open_release(folder), ["bc"])[0][0]
+    profile, original = dataclasses.replace(PROFILES["smoke"], frozen_shift=False), experiments.encoded
+
+    def inspection(draws):
+        monkeypatch.setattr(experiments, "encoded", lambda *a: original(*a[:3], draws, a[-1]))
+        ticks = []
+        setup = Setup(str(folder), str(tmp_path / str(draws)), profile)
+        found[draws] = run_cell(setup, cell, lambda *tick: ticks.append(tick))["inspection"]
+        assert sum(steps for _, steps in ticks) == planned_steps(profile, [cell])
+        told[draws] = {what for what, _ in ticks}
+
+    inspection(0)
+    inspection(10**9)
+    assert "encoding, 100%" in told[10**9] - told[0]
+    assert {"test error of the observation decoder", "test error of the state decoder"} <= told[0]
+    for name in ("state_l1", "observation_mse", "state_mse"):
+        assert found[0][name] == pytest.approx(found[10**9][name], rel=1e-3)
 
 
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
