@@ -11,12 +11,16 @@ import io
 import lzma
 import tarfile
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dmcvb_gen.dataset.manifest import MANIFEST
+from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 from dmcvb_gen.errors import StoreError, UnknownNameError
+
+if TYPE_CHECKING:
+    from dmcvb_gen.dataset.index import Index
 
 _FOLDER = resources.files("dmcvb_gen.generate") / "data" / "manifests"
 ENDING = ".tar.xz"
@@ -61,17 +65,38 @@ def write_archive(release: str | Path, out: str | Path) -> int:
     Raises:
       StoreError: the release is not complete.
     """
-    from dmcvb_gen.dataset.index import INDEX, trusted_index  # loads zarr, which names need not
+    from dmcvb_gen.dataset.index import INDEX
+
+    read_complete(release)
+    return pack({name: (Path(release) / name).read_bytes() for name in (MANIFEST, INDEX)}, out)
+
+
+def read_complete(release: str | Path) -> tuple[Manifest, Index]:
+    """The manifest and index of a complete release on this machine, of which the data need not be there.
+
+    Raises:
+      StoreError: the release is not complete.
+    """
+    from dmcvb_gen.dataset.index import trusted_index  # loads zarr, which names need not
     from dmcvb_gen.dataset.reader import load_manifest
 
     root, manifest = load_manifest(release)
-    if not manifest.complete or trusted_index(root, manifest) is None:
+    index = trusted_index(root, manifest)
+    if not manifest.complete or index is None:
         raise StoreError(f"{root} is not complete; finish it with the command that began it")
+    return manifest, index
+
+
+def pack(members: Mapping[str, bytes], out: str | Path) -> int:
+    """Write an archive, see `write_archive`.
+
+    Args:
+      members: the bytes of manifest and index, by their names in a release.
+    """
     # One stream, because both hold the same digests; without times, so that equal releases give equal archives.
     with lzma.open(out, "wb", preset=9 | lzma.PRESET_EXTREME) as packed:
         with tarfile.open(fileobj=packed, mode="w") as archive:
-            for name in (MANIFEST, INDEX):
-                content = (root / name).read_bytes()
+            for name, content in members.items():
                 member = tarfile.TarInfo(name)
                 member.size = len(content)
                 archive.addfile(member, io.BytesIO(content))

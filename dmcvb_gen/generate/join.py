@@ -1,0 +1,70 @@
+"""The manifest of a whole release from those of its parts, which may be made on different days and machines."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from dmcvb_gen.dataset.index import Index, data_files, is_card, root_digest
+from dmcvb_gen.dataset.manifest import FileRecord, Manifest, SubsetRecord
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import json_bytes, sha256_bytes
+from dmcvb_gen.generate.plan import create_groups, describe
+from dmcvb_gen.generate.recipe import Recipe, expand
+from dmcvb_gen.generate.shipped import manifest_source, read_complete
+
+DESCRIPTIONS = {"name", "version", "description", "license", "authors"}
+"""Facts of a recipe that decide no bytes of an array."""
+
+
+def join(recipe: Recipe, parts: Sequence[str | Path]) -> tuple[Manifest, Index]:
+    """The manifest and index of a recipe's release, from those of releases that hold its subsets; no data are needed.
+
+    A subset's bytes follow from its own record and the recipe's seed, whatever else the release holds. So the parts may
+    be made on different days and machines, and the root digest is that of one rollout of the whole recipe.
+
+    Args:
+      parts: folders of complete releases, or names of shipped manifests.
+
+    Raises:
+      StoreError: a part is not complete, or was not made as the recipe says; a subset of the recipe is in no part.
+    """
+    found: dict[str, SubsetRecord] = {}
+    listed: dict[str, FileRecord] = {}
+    environments: list[dict[str, str]] = []
+    for part in parts:
+        with contextlib.ExitStack() as stack:
+            folder = Path(part) if Path(part).is_dir() else stack.enter_context(manifest_source(part))
+            manifest, index = read_complete(folder)
+        _check_part(manifest, recipe, str(part))
+        found |= {record.name: record for record in manifest.subsets}
+        listed |= {file.path: file for file in index.files if not is_card(file.path)}
+        environments += [environment for environment in manifest.environments if environment not in environments]
+    whole, _ = describe(recipe, pixels=any(record.pixels for record in found.values()))
+    for record in whole.subsets:
+        if record.name not in found:
+            raise StoreError(f"{record.name} of {recipe.name} is in none of the parts; give a release that holds it")
+        if found[record.name].model_copy(update={"digest": None}) != record:
+            raise StoreError(f"{record.name} was not made as {recipe.name} says; roll it out with that recipe")
+    facts = {"subsets": tuple(found[record.name] for record in whole.subsets), "complete": True}
+    whole = whole.model_copy(update=facts | {"environments": tuple(environments)})
+    with tempfile.TemporaryDirectory() as folder:  # arrays' metadata name the release, so a part has others
+        create_groups(Path(folder), whole, whole.subsets)
+        listed |= {file.path: file for file in data_files(Path(folder), whole, {})}
+    files = tuple(listed[path] for path in sorted(listed))
+    whole = whole.model_copy(update={"digest": root_digest(files, whole)})
+    return whole, Index(manifest_sha256=sha256_bytes(json_bytes(whole)), files=files).with_checksum()
+
+
+def _check_part(manifest: Manifest, recipe: Recipe, part: str) -> None:
+    """Raises StoreError for a part that was made otherwise, or with subsets that the recipe does not have."""
+    if manifest.additions or manifest.lineage:
+        raise StoreError(f"{part} grew or was repainted; give a release as its rollout left it")
+    asked = recipe.model_dump(mode="json")
+    for name in asked.keys() - DESCRIPTIONS - {"subsets"}:
+        if (given := manifest.recipe.get(name)) != asked[name]:
+            raise StoreError(f"{part} was made with {name} {given}, and {recipe.name} has {asked[name]}")
+    if strange := {record.name for record in manifest.subsets} - {request.name for request in expand(recipe)}:
+        raise StoreError(f"{part} holds {min(strange)}, which {recipe.name} does not have")

@@ -1,0 +1,91 @@
+"""Parts of a release, made apart, give the manifest of the whole: the digests of one rollout of its recipe."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from dmcvb_gen.dataset.index import INDEX, read_index, root_digest, trusted_index
+from dmcvb_gen.dataset.manifest import MANIFEST
+from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import json_bytes
+from dmcvb_gen.generate.join import join
+from dmcvb_gen.generate.recipe import load_recipe, make_recipe
+from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.shipped import manifest_source, pack
+from tests.conftest import roll_out, small_recipe
+
+WALKER = {"tasks": "walker-walk", "levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 20}
+MAZE = {"tasks": "ant-maze-empty7x7", "levels": "random", "episodes": 2, "episodes_per_shard": 1, "max_steps": 20}
+PATTERNS = {
+    "walker": [WALKER | {"settings": ["none", "dynamic"]}],
+    "maze": [MAZE | {"settings": ["visible", "hidden"]}],
+}
+
+
+def recipe(name, *families, **changes):
+    return small_recipe(name=name, subsets=[pattern for family in families for pattern in PATTERNS[family]], **changes)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folders of the parts and of the whole, and the whole's recipe."""
+    folder = tmp_path_factory.mktemp("join")
+    for name in PATTERNS:
+        roll_out(recipe(name, name), folder / name)
+    roll_out(recipe("whole", *PATTERNS), folder / "whole")
+    return folder
+
+
+def test_joined_parts_have_the_root_digest_of_the_whole(made):
+    manifest, index = join(recipe("whole", *PATTERNS), [made / "maze", made / "walker"])
+    expected = load_manifest(made / "whole")[1]
+    assert manifest.digest == expected.digest and manifest.digest is not None
+    assert [record.digest for record in manifest.subsets] == [record.digest for record in expected.subsets]
+    assert root_digest(index.files, manifest) == root_digest(read_index(made / "whole").files, expected)
+
+
+@pytest.mark.parametrize("name", ["dmcvb-mini", "dmcvb-v1-locomotion", "quickstart"])
+def test_a_shipped_release_joined_alone_is_itself(name):
+    with manifest_source(name) as folder:
+        expected = load_manifest(folder)[1]
+    if expected.additions:
+        with pytest.raises(StoreError, match="grew"):
+            join(load_recipe(name), [name])
+    else:
+        assert join(load_recipe(name), [name])[0] == expected
+
+
+@pytest.mark.parametrize("family", PATTERNS)
+def test_a_part_of_what_was_joined_is_made_again_with_its_bytes(made, tmp_path, family):
+    manifest, index = join(recipe("whole", *PATTERNS), [made / name for name in PATTERNS])
+    pack({MANIFEST: json_bytes(manifest), INDEX: json_bytes(index)}, tmp_path / "whole.tar.xz")
+    shutil.unpack_archive(tmp_path / "whole.tar.xz", tmp_path / "bare")
+    assert trusted_index(tmp_path / "bare", load_manifest(tmp_path / "bare")[1]) is not None
+    name = next(record.name for record in manifest.subsets if ("maze" in record.task) == (family == "maze"))
+    outcome = Regeneration(tmp_path / "bare", [name], (0, 1)).remake(tmp_path / "out")
+    assert [shard.equal for shard in outcome.shards] == [True]
+
+
+def test_what_does_not_fit_is_refused(made, tmp_path):
+    whole, parts = recipe("whole", *PATTERNS), [made / name for name in PATTERNS]
+    with pytest.raises(StoreError, match="walker-walk/random/none of whole is in none of the parts"):
+        join(whole, parts[1:])
+    with pytest.raises(StoreError, match="was made with seed 3, and whole has 4"):
+        join(recipe("whole", *PATTERNS, seed=4), parts)
+    with pytest.raises(StoreError, match="was made with trajectories shared, and whole has independent"):
+        join(recipe("whole", *PATTERNS, trajectories="independent"), parts)
+    with pytest.raises(StoreError, match="holds ant-maze.*which whole does not have"):
+        join(recipe("whole", "walker"), parts)
+    with pytest.raises(StoreError, match="was made with size 16, and whole has 32"):
+        join(recipe("whole", *PATTERNS, size=32), parts)
+    longer = recipe("whole", *PATTERNS).model_dump()
+    longer["subsets"][0]["max_steps"] = 30
+    with pytest.raises(StoreError, match="walker-walk/random/none was not made as whole says"):
+        join(make_recipe(longer), parts)
+    with pytest.raises(StoreError, match="not complete"):
+        shutil.copytree(made / "walker", tmp_path / "walker")
+        (tmp_path / "walker" / INDEX).unlink()
+        join(whole, [tmp_path / "walker", made / "maze"])
