@@ -141,7 +141,7 @@ def rollout(
     request = request_of(options)
     target = target_for(options, request)
     plan = prepare_rollout(rollout_plan(options, request, target), options)
-    with progress_bar(progress, " frames", plan.manifest.name) as bar:
+    with progress_bar(progress, f" {plan.unit}", plan.manifest.name) as bar:
         run_plan(plan, workers, bar, finishing=part is None)
     return open_for_reading(target.place, storage_options)
 

@@ -141,7 +141,7 @@ def _run(plan, workers, as_json, whole=True):
         finished += sum(commit.episode_count for commit in result.commits)
         bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
 
-    with commands.progress_bar(not as_json, " frames", plan.manifest.name) as bar:
+    with commands.progress_bar(not as_json, f" {plan.unit}", plan.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     manifest, steps, place = made.manifest, made.steps, plan.target.place
     facts = dict(out=place, complete=manifest.complete, steps=steps, seconds=round(made.seconds, 2))

@@ -84,6 +84,11 @@ class Plan:
     def steps(self) -> int:
         return sum(job.frames for job in self.jobs)
 
+    @property
+    def unit(self) -> str:
+        """What a progress bar counts: frames, or steps if no pictures are painted."""
+        return "frames" if any(record.pixels for record in self.manifest.subsets) else "steps"
+
 
 def make_plan(
     recipe: Recipe | None,

@@ -66,6 +66,9 @@ def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, 
         bars = {line[1]: line for line in lines if line[1] in ("fetched: ", "painted: ")}  # side by side
         for last in bars.values() or lines[-1:]:
             assert last["done"] == last["all"] and last["done"].strip("0."), (words, told)
+        if words[0] == "rollout" and "--dry-run" not in words:
+            unit = "steps/s" if "--no-pixels" in words else "frames/s"
+            assert all(unit in line for line in shown), told
 
 
 @pytest.mark.parametrize("release", ("small_release", "small_mazes"))
