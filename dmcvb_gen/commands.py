@@ -208,7 +208,7 @@ def repaint(
     Args:
       release (RELEASE): Folder of the release.
       only (PATTERN): Use only these subsets.
-      distractor: none, static or dynamic. [default: as each subset has]
+      distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: as each subset has]
       difficulty: Strength of the distractors. [default: as each subset has]
       size: Width and height in pixels. [default: as each subset has]
       renderer: native, warp or opengl. [default: as each subset has]
@@ -470,7 +470,7 @@ def validate(
       profile: Budget: smoke (no scores), brief, quick or paper.
       scale: Multiply the profile's steps.
       benchmarks: b1, b2, b3, ablations.
-      agents (A,B): Agents to train, e.g. bc,state-bc,id+bc. [default: all]
+      agents (A,B): Agents to train, e.g. bc,state-bc,id+bc. [default: the benchmark's]
       only (PATTERN): Use only these subsets, e.g. 'walker-walk/expert/*'.
       out (FOLDER): Folder of the report. [default: reports/NAME]
       checks_only: Check the structure and train nothing.
@@ -480,7 +480,7 @@ def validate(
       device: Device that trains.
       precision: Precision of networks that see images; auto times both.
       compile: Compile the losses with torch.compile (for CUDA and long runs).
-      memory (GB): Memory of all workers; ray: of each. [default: half]
+      memory (GB): Memory for images, of all workers together; ray: of each. [default: half of what is free]
       seed: Random seed of the trainings.
       dino_weights (FILE): Safetensors file with the weights of dino+bc.
       backgrounds (FOLDER): Folder of the background videos, if it has moved.

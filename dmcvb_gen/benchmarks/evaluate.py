@@ -350,6 +350,7 @@ def evaluate(
     pixels: bool = True,
     size: int = 64,
     renderer: str = RendererChoice().backend,
+    samples: int | None = None,
     backgrounds: str = "builtin",
     split: str = SPLIT,
     max_steps: int | None = None,
@@ -367,7 +368,8 @@ def evaluate(
       seed: seed of starts and distractors; `validate` has 0.
       stack: frames an observation; the first one of an episode is repeated.
       pixels: give pictures; without them an evaluation takes seconds.
-      size: pixels a side. renderer: its name. backgrounds: "builtin" or a folder of videos.
+      size: pixels a side. renderer: its name. samples: anti-aliasing samples of a pixel, the renderer's by default.
+      backgrounds: "builtin" or a folder of videos.
       split: videos and maze styles to show: "val", as `validate` does, or "train", those of the data. The difference of
         the two scores is what a policy loses on distractors that it has not seen.
       max_steps: cut episodes short.
@@ -382,7 +384,8 @@ def evaluate(
         raise DmcvbError(f"episodes={episodes}, stack={stack}: give at least 1 of each")
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
-    scene = EvaluationScene.parse(where, size=size, renderer=renderer, backgrounds=backgrounds, split=split)
+    shown = dict(size=size, renderer=renderer, samples=samples, backgrounds=backgrounds, split=split)
+    scene = EvaluationScene.parse(where, **shown)
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
     evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
     try:

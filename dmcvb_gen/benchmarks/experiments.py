@@ -27,7 +27,15 @@ from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.own import AgentData, OwnAgent
 from dmcvb_gen.benchmarks.profiles import Profile
-from dmcvb_gen.benchmarks.setup import Pretraining, Setup, data_of_run, fingerprint, pretraining_of, read_result
+from dmcvb_gen.benchmarks.setup import (
+    Pretraining,
+    Setup,
+    data_of_run,
+    fingerprint,
+    pretraining_of,
+    read_result,
+    sees_pictures,
+)
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part
 from dmcvb_gen.benchmarks.trained import save_agent
 from dmcvb_gen.dataset import Release, Subset
@@ -332,7 +340,7 @@ def _facts(
             subset,
             None if cell.policy[0].goal_pair is None else goal_cells(subset, cell.policy[0].goal_pair),
             setup.backgrounds,
-            pictures=not agent.sees_state,
+            pictures=sees_pictures(agent),
             max_steps=profile.episode_steps,
         ),
         "renderers": {"data": subset.record.renderer["name"], "evaluation": renderer_choice(subset)["name"]},
@@ -476,7 +484,7 @@ def _field_errors(
     errors = [(learner.predict(batch) - batch.state).abs() for batch in _hold_out_batches(learner, data, size)]
     if not errors:
         return None
-    scale = (data.normalization.std / units).to(data.device)
+    scale = (data.normalization.std.cpu() / units).to(data.device)
     each = (torch.cat(errors) * scale).mean(dim=0)
     return {name: float(each[part].mean()) for name, part in task.state_slices.items()}
 

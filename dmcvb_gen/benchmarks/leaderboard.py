@@ -169,6 +169,8 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
     release = facts["release"]
     if not release.get("digest"):
         raise DmcvbError(f"{folder}: its release has no root digest; finish the release and run validate again")
+    if not facts["complete"] or not facts["structure"]["sound"]:
+        raise DmcvbError(f"{folder}: its release was not whole and sound; fetch or repair it and run validate again")
     command = data_command or shlex.join(
         ["dmcvb-gen", "rollout", "--recipe", release["name"], *([] if release.get("pixels", True) else ["--no-pixels"])]
     )
@@ -237,10 +239,11 @@ def add_rows(folder: str | Path, rows: dict[str, tuple[Row, Path | None]]) -> li
     folder.mkdir(parents=True, exist_ok=True)
     for name, (row, policy) in rows.items():
         kept = folder / f"{name}.safetensors"
-        kept.unlink(missing_ok=True)
         if policy:
             copy_file(policy, kept)
             row = row.model_copy(update={"policy": sha256_file(kept)})
+        else:
+            kept.unlink(missing_ok=True)
         write_json(folder / f"{name}.json", row.model_dump(mode="json"))
         written.append(row)
     return written
@@ -289,7 +292,7 @@ def check_row(folder: str | Path, row: Row, evaluate: Callable[..., Any] | None 
     how, agent = row.evaluation, load_agent(path)
     if how.backgrounds and load_backgrounds("builtin", evaluation.SPLIT).digest != how.backgrounds:
         raise DmcvbError(f"{row.name} was evaluated with videos of its own, which this package does not have")
-    pictures = dict(size=how.size, renderer=how.renderer) if agent.pixels else {}
+    pictures = dict(size=how.size, renderer=how.renderer, samples=how.samples) if agent.pixels else {}
     limits = dict(episodes=how.episodes, seed=how.seed, max_steps=how.steps)
     score = (evaluate or evaluation.evaluate)(
         agent, f"{row.task}/{row.setting}", pixels=agent.pixels, stack=agent.stack, **limits, **pictures

@@ -122,6 +122,11 @@ def pretraining_of(cell: Cell) -> Pretraining | None:
     return Pretraining(cell.task, setting, cell.agent.pretraining, cell.pretrain_parts)
 
 
+def sees_pictures(agent: Agent) -> bool:
+    """Return True if an agent is evaluated on pictures."""
+    return OwnAgent.load(agent.own).pixels if agent.own else not agent.sees_state
+
+
 def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str:
     """SHA-256 of everything that decides a result, the machine aside.
 
@@ -143,9 +148,11 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
             subset,
             None if pair is None else goal_cells(subset, pair),
             setup.backgrounds,
-            pictures=not work.agent.sees_state,
+            pictures=sees_pictures(work.agent),
             max_steps=setup.profile.episode_steps,
         )
+        if setup.profile.readout_steps and not (work.agent.sees_state or work.agent.own):  # `state_units` are of them
+            facts["units"] = sorted(subset_digest(s.commits) for s in release.subsets.values() if s.task == work.task)
         if is_maze(work.task):
             facts["speed"] = "straight"  # results of before measured the data's along the path
         if work.agent.own:

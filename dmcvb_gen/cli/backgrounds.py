@@ -12,7 +12,7 @@ from dmcvb_gen.progress import ProgressBar
 
 @click.command()
 @click.option("--videos", type=click.IntRange(1), default=8, show_default=True, help="Clips for each of train and val.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed of the clips.")
 @click.option("--out", type=OutPath(path_type=Path), default=Path("data/backgrounds"), show_default=True)
 @click.option("--sheet", type=OutPath(path_type=Path), help="Also write a contact sheet of them, a PNG.")
 @json_option

@@ -65,7 +65,9 @@ def _select(folder, as_json, episodes=100, seed=20_000, sample=False, converged=
 @click.option(
     "--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes to score each pick."
 )
-@click.option("--seed", type=click.IntRange(0), default=20_000, show_default=True)
+@click.option(
+    "--seed", type=click.IntRange(0), default=20_000, show_default=True, help="Random seed of the fresh episodes."
+)
 @click.option("--sample", is_flag=True, help="Score sampled actions instead of the policy mean.")
 @click.option("--converged", type=float, help="Return at convergence, of a longer run.  [default: from the curve]")
 @json_option

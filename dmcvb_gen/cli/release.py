@@ -60,9 +60,9 @@ def _verified(path, result):
 def regenerate(release, out, as_json, **options):
     """Make a release's shards again from its manifest alone, bit for bit.
 
-    Repairs damaged and missing shards in place, unless --check or --out is given; of a part that was fetched, what was
-    fetched. Exit code 1 when a shard comes out otherwise; what differs in the environment, and how far the values are,
-    is said then. With --check, 3 when all that are here came out right, and others are not here.
+    Without --check and --out it repairs damaged and missing shards in place. If only a part was fetched, it repairs
+    that part. Exit code 1 if a shard comes out different: the command then says what differs in the environment, and
+    how far the values are apart. With --check, exit code 3 if all shards here are right and others are not here.
 
     \b
     dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check

@@ -39,7 +39,9 @@ def join(recipe: Recipe, parts: Sequence[str | Path]) -> tuple[Manifest, Index]:
             folder = Path(part) if Path(part).is_dir() else stack.enter_context(manifest_source(part))
             manifest, index = read_complete(folder)
         _check_part(manifest, recipe, str(part))
-        found |= {record.name: record for record in manifest.subsets}
+        for record in manifest.subsets:
+            if found.setdefault(record.name, record) != record:
+                raise StoreError(f"{record.name} of {part} is not that of a part before it; verify both")
         listed |= {file.path: file for file in index.files if not is_card(file.path)}
         environments += [environment for environment in manifest.environments if environment not in environments]
     whole, _ = describe(recipe, pixels=any(record.pixels for record in found.values()))
@@ -63,7 +65,7 @@ def _check_part(manifest: Manifest, recipe: Recipe, part: str) -> None:
     if manifest.additions or manifest.lineage:
         raise StoreError(f"{part} grew or was repainted; give a release as its rollout left it")
     asked = recipe.model_dump(mode="json")
-    for name in asked.keys() - DESCRIPTIONS - {"subsets"}:
+    for name in asked.keys() - DESCRIPTIONS - {"subsets", "backgrounds"}:  # each subset's record has its videos' digest
         if (given := manifest.recipe.get(name)) != asked[name]:
             raise StoreError(f"{part} was made with {name} {given}, and {recipe.name} has {asked[name]}")
     if strange := {record.name for record in manifest.subsets} - {request.name for request in expand(recipe)}:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -197,3 +198,9 @@ class Mpo(ReplayLearner):
         super().load_networks(state)
         with torch.no_grad():
             self.duals.copy_(state["duals"])
+
+    def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
+        super().load_actor(weights)
+        self.target_actor.load_state_dict(
+            self.actor.state_dict()
+        )  # which draws the actions that the actor is fitted to

@@ -47,7 +47,7 @@ from dmcvb_gen.state_file import STATE, pack_state, read_state
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.networks import as_arrays
 from dmcvb_gen.training.pruning import prunable_checkpoints
-from dmcvb_gen.training.run_log import RunLog
+from dmcvb_gen.training.run_log import RunLog, read_rows
 from dmcvb_gen.training.settings import check_settings
 
 EVALUATION_EPISODES = 20
@@ -73,7 +73,7 @@ ProgressCallback = Callable[[int], Any]
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """Config of a run; written once to run.json, and a resumed run must have the same.
+    """Config of a run, in its run.json; a run that goes on must have the same, but for `FREE`.
 
     Attributes:
       steps: agent steps (at action repeat 2) to train; a resumed run may have more.
@@ -270,6 +270,8 @@ class Run(abc.ABC):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
             with self._alone():
                 saved = self.saved()
+                if not saved:
+                    self._refuse_lost_state()
                 self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
                 self._drop_later_checkpoints()
                 self._log = RunLog(self.folder, self.step)
@@ -279,6 +281,15 @@ class Run(abc.ABC):
                         self._train(saved, report, tick)
                 finally:
                     self._log.close()
+
+    def _refuse_lost_state(self) -> None:
+        """Raise if a run has trained for longer than it takes to save it, and its saved state is gone."""
+        rows = read_rows(self.folder)
+        if rows and float(rows[-1]["seconds"] or 0) > 2 * SAVE_SECONDS:
+            raise DmcvbError(
+                f"{self.folder} has checkpoints, but nothing to resume from (resume/{STATE} is gone); choose another "
+                "--out, or delete checkpoints/ and progress.csv to begin anew"
+            )
 
     def saved(self) -> dict[str, Any] | None:
         """The state to resume from (tensors, numbers and texts only), None if nothing is saved yet."""

@@ -421,6 +421,14 @@ class ReplayLearner(abc.ABC):
         self.updates = int(state["updates"])
         torch.set_rng_state(state["torch_rng"])
 
+    def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
+        """Take the weights of a policy file.
+
+        Raises:
+          RuntimeError: they have other shapes.
+        """
+        self.actor.load_state_dict(weights)
+
     def load_networks(self, state: dict[str, Any]) -> None:
         """Take networks, temperature and normalization of `state()`, but no optimizer or random state.
 

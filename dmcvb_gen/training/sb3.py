@@ -273,10 +273,14 @@ class Sb3Run(Run):
             return
         weights = as_tensors(load_policy(source).weights)
         fit(lambda: model.policy.load_state_dict({name: weights[ours] for ours, name in self._names().items()}, False))
+        if hasattr(model, "actor_target"):  # TD3's targets ask it for actions
+            model.actor_target.load_state_dict(model.actor.state_dict())
         if normalize and normalize.norm_obs:
             std = weights["observation_std"].numpy().astype(float)
             normalize.obs_rms.mean = weights["observation_mean"].numpy().astype(float)
             normalize.obs_rms.var, normalize.obs_rms.count = std**2, 1e5
+        elif weights["observation_mean"].any() or (weights["observation_std"] != 1).any():
+            raise DmcvbError(f"--init-from {source} normalizes observations; give --set normalize_observation=true")
 
 
 def _statistics(running: RunningMeanStd) -> dict[str, Any]:

@@ -59,9 +59,10 @@ class Convergence:
     """Convergence of a curve.
 
     Attributes:
-      value: return at convergence, the mean of the last quarter of the smoothed curve.
+      value: return at convergence, the mean of the best stretch of a quarter of the curve.
       error: its standard error.
-      converged: True if the last quarter lies within 5 % of the way of the quarter before.
+      converged: False if there are too few evaluations, if the return never rose, or if the best quarter is the last
+        and lies more than 5 % of the way above the quarter before.
       reason: why not.
     """
 

@@ -20,7 +20,7 @@ from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.state_file import read_state
+from dmcvb_gen.state_file import STATE, read_state
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import Episodes, shaping_of
@@ -211,7 +211,7 @@ def _start_from(learner: ReplayLearner, algorithm: str, source: str) -> None:
             )
         _fit(f"--init-from {source}", learner.load_networks, saved["learner"])
         return
-    _fit(f"--init-from {source}", learner.actor.load_state_dict, as_tensors(load_policy(path).weights))
+    _fit(f"--init-from {source}", learner.load_actor, as_tensors(load_policy(path).weights))
     learner.norm.mean = learner.actor.observation_mean.numpy().astype(float)
     learner.norm.count = 1e5
     learner.norm.m2 = learner.actor.observation_std.numpy().astype(float) ** 2 * learner.norm.count
@@ -252,7 +252,8 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         check_same(folder, found, config)
     elif folder.is_file() or (folder.exists() and any(folder.iterdir())):
         raise DmcvbError(f"{folder} is not empty and holds no run; choose another --out")
-    if config.init_from and not Path(config.init_from).is_file() and not read_config(config.init_from):
+    begun = found is not None and (folder / "resume" / STATE).exists()  # never reads again what it started from
+    if config.init_from and not begun and not Path(config.init_from).is_file() and not read_config(config.init_from):
         raise DmcvbError(f"--init-from {config.init_from} is neither a run folder nor a policy file")
     config = dataclasses.replace(config, init_sha256=found.init_sha256 if found else _digest(config.init_from))
     run = run_class(config.algorithm)(folder, config)
@@ -263,6 +264,8 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         )
     if problem := run.problem():
         raise DmcvbError(problem)
+    if config.init_from and not begun and isinstance(run, ReplayRun):
+        _start_from(run.learner(), config.algorithm, config.init_from)  # refused before anything is written
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(folder).free < 1e9:

@@ -154,6 +154,8 @@ def test_noise_and_unfinished_releases_make_no_rows(walkers, tmp_path):
     for change, message in (
         ({"profile": facts["profile"] | {"scores": False}}, "are noise"),
         ({"release": facts["release"] | {"digest": None}}, "no root digest"),
+        ({"complete": False}, "was not whole and sound"),
+        ({"structure": facts["structure"] | {"sound": False}}, "was not whole and sound"),
         ({"results": []}, "no cell that can be evaluated again"),
     ):
         (tmp_path / "report.json").write_text(json.dumps(facts | change))

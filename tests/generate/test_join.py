@@ -9,6 +9,7 @@ import pytest
 from dmcvb_gen.dataset.index import INDEX, read_index, root_digest, trusted_index
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.dataset.reader import load_manifest
+from dmcvb_gen.distractors.clips import make_clips
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import json_bytes
 from dmcvb_gen.generate.join import join
@@ -69,6 +70,16 @@ def test_a_part_of_what_was_joined_is_made_again_with_its_bytes(made, tmp_path, 
     assert [shard.equal for shard in outcome.shards] == [True]
 
 
+def test_parts_may_show_videos_of_their_own(tmp_path):
+    make_clips(1, 0, tmp_path / "videos")
+    clips = {"backgrounds": str(tmp_path / "videos")}
+    for name in PATTERNS:
+        roll_out(recipe(name, name, **clips), tmp_path / name)
+    whole = recipe("whole", *PATTERNS, **clips)
+    expected = roll_out(whole, tmp_path / "whole")
+    assert join(whole, [tmp_path / name for name in PATTERNS])[0].digest == expected.digest
+
+
 def test_what_does_not_fit_is_refused(made, tmp_path):
     whole, parts = recipe("whole", *PATTERNS), [made / name for name in PATTERNS]
     with pytest.raises(StoreError, match="walker-walk/random/none of whole is in none of the parts"):
@@ -85,6 +96,14 @@ def test_what_does_not_fit_is_refused(made, tmp_path):
     longer["subsets"][0]["max_steps"] = 30
     with pytest.raises(StoreError, match="walker-walk/random/none was not made as whole says"):
         join(make_recipe(longer), parts)
+    shutil.copytree(made / "walker", tmp_path / "altered")
+    altered = load_manifest(tmp_path / "altered")[1]
+    first = altered.subsets[0].model_copy(update={"digest": "0" * 64})
+    altered = altered.model_copy(update={"subsets": (first, *altered.subsets[1:])})
+    altered = altered.model_copy(update={"digest": root_digest(read_index(made / "walker").files, altered)})
+    (tmp_path / "altered" / MANIFEST).write_bytes(json_bytes(altered))
+    with pytest.raises(StoreError, match="walker-walk/random/none of .*altered is not that of a part before it"):
+        join(whole, [*parts, tmp_path / "altered"])
     with pytest.raises(StoreError, match="not complete"):
         shutil.copytree(made / "walker", tmp_path / "walker")
         (tmp_path / "walker" / INDEX).unlink()

@@ -113,6 +113,15 @@ def test_targets_are_copies_of_long_ago():
     assert torch.equal(mpo_learner.target_actor.observation_mean, mpo_learner.actor.observation_mean)
 
 
+def test_from_a_policy_file_the_targets_draw_its_actions(tmp_path):
+    source = learner()
+    weights = {name: value + 0.1 for name, value in source.actor.state_dict().items()}
+    started = learner()
+    started.load_actor(weights)
+    for network in (started.actor, started.target_actor):
+        assert all(torch.equal(value, weights[name]) for name, value in network.state_dict().items())
+
+
 def test_its_policies_roll_out(tmp_path):
     config = RunConfig("walker-walk", "mpo", 128, 0, SMALL, evaluate_every=128, evaluate_sparse=128)
     run = open_run(tmp_path / "run", config, False)

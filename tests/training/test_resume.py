@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -277,6 +278,27 @@ def test_a_run_that_is_made_longer_keeps_its_replay_buffer(tmp_path):
     fill(longer, [9, 10])
     assert len(longer) == 8 and set(longer.arrays["reward"][:8]) == set(range(3, 11))
     assert len(ReplayBuffer(4, 2, 1, 1, tmp_path).arrays["reward"]) == 10  # never shorter: nothing is thrown away
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "guided"])
+def test_a_run_whose_saved_state_is_gone_keeps_its_checkpoints(tmp_path, algorithm, monkeypatch):
+    train(tmp_path / "run", algorithm=algorithm)
+    kept = sorted((tmp_path / "run" / "checkpoints").iterdir())
+    shutil.rmtree(tmp_path / "run" / "resume")
+    monkeypatch.setattr(runs, "SAVE_SECONDS", 0)
+    with pytest.raises(DmcvbError, match="has checkpoints, but nothing to resume from.*choose another --out"):
+        train(tmp_path / "run", resume=True, algorithm=algorithm, steps=240)
+    assert sorted((tmp_path / "run" / "checkpoints").iterdir()) == kept != []
+
+
+def test_a_run_goes_on_when_what_it_started_from_is_gone(tmp_path):
+    train(tmp_path / "first")
+    source = {"init_from": str(tmp_path / "first")}
+    train(tmp_path / "run", **source)
+    shutil.rmtree(tmp_path / "first")
+    assert train(tmp_path / "run", resume=True, steps=240, **source).step == 240
+    with pytest.raises(DmcvbError, match="neither a run folder nor a policy file"):
+        train(tmp_path / "other", **source)
 
 
 def test_two_processes_do_not_train_in_one_folder(tmp_path):

@@ -8,7 +8,7 @@ import torch
 from stable_baselines3.common.vec_env import VecNormalize
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.training import runs, sb3
 from dmcvb_gen.training.runs import RunConfig
 from dmcvb_gen.training.training import open_run
@@ -83,6 +83,12 @@ def test_a_warm_start_takes_the_networks_of_a_run_or_a_policy(tmp_path, models, 
         train(tmp_path / "wide", algorithm, init_from=str(path), settings=TINY[algorithm] | {"hidden": [32]})
     with pytest.raises(DmcvbError, match="no run of td3"):
         train(tmp_path / "td3", "td3", init_from=str(first.folder))
+    with pytest.raises(DmcvbError, match="normalizes observations; give --set normalize_observation=true"):
+        normal = load_policy(path)
+        arrays = dict(normal.weights) | {"observation_mean": normal.weights["observation_mean"] + 1}
+        save_policy(tmp_path / "normal.safetensors", normal.header, arrays)
+        unnormal = TINY[algorithm] | {"normalize_observation": False}
+        train(tmp_path / "unnormal", algorithm, init_from=str(tmp_path / "normal.safetensors"), settings=unnormal)
     with pytest.raises(DmcvbError, match="neither a run folder nor a policy file"):
         train(tmp_path / "none", "td3", init_from=str(tmp_path / "nowhere"))
     assert not (tmp_path / "none").exists()

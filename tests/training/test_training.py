@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 import pytest
 import torch
@@ -13,12 +11,15 @@ from hypothesis import strategies as st
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.header import PolicyHeader
+from dmcvb_gen.policies.policy_file import save_policy
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import runs
 from dmcvb_gen.training.defaults import default_run, parse_settings, run_config
 from dmcvb_gen.training.episodes import standing_states
+from dmcvb_gen.training.networks import as_arrays
 from dmcvb_gen.training.runs import RunConfig, check_same
 from dmcvb_gen.training.sac import SUPPORT, CriticEnsemble, ReplayBuffer, ReturnScale, RunningNorm, Sac, SacSettings
 from dmcvb_gen.training.training import SacRun, open_run
@@ -358,17 +359,29 @@ def test_the_class_and_the_config_name_the_same_run(tmp_path):
 def test_a_policy_says_what_it_started_from_but_not_where_that_lay(tmp_path):
     source = tmp_path / "home of somebody" / "own.safetensors"
     source.parent.mkdir()
-    source.write_bytes(b"weights")
+    actor = SacRun(tmp_path / "actor", config()).learner().actor
+    save_policy(source, actor.header, as_arrays(actor.state_dict()))
+    first = sha256_file(source)
     run = open_run(tmp_path / "run", config(init_from=str(source)), resume=False)
     assert run.header.training["init_from"] == "own.safetensors" and "--init-from own.safetensors" in run.header.command
-    assert run.header.training["init_sha256"] == hashlib.sha256(b"weights").hexdigest()
+    assert run.header.training["init_sha256"] == first
     assert str(tmp_path) not in run.header.model_dump_json() and "home of somebody" not in run.header.model_dump_json()
-    source.write_bytes(b"other weights")  # what lies there later is not what the run began with
+    other = {name: value + 1 for name, value in as_arrays(actor.state_dict()).items()}
+    save_policy(source, actor.header, other)  # what lies there later is not what the run began with
     again = open_run(tmp_path / "run", config(init_from=str(source)), resume=True)
     assert again.header == run.header
+    again.train()
     folder = open_run(tmp_path / "second", config(init_from=f"{tmp_path / 'run'}/"), resume=False).header
     assert folder.training["init_from"] == "run" and "init_sha256" not in folder.training
     assert "--init-from run " in folder.command
+
+
+def test_a_policy_that_does_not_fit_begins_no_run(tmp_path):
+    actor = SacRun(tmp_path / "actor", config(settings=TINY | {"actor_hidden": [24]})).learner().actor
+    save_policy(tmp_path / "wide.safetensors", actor.header, as_arrays(actor.state_dict()))
+    with pytest.raises(DmcvbError, match="do not fit"):
+        open_run(tmp_path / "run", config(init_from=str(tmp_path / "wide.safetensors")), resume=False)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("task_id", ["walker-walk", "ant-maze-empty7x7"])
