@@ -201,6 +201,4 @@ class Mpo(ReplayLearner):
 
     def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
         super().load_actor(weights)
-        self.target_actor.load_state_dict(
-            self.actor.state_dict()
-        )  # which draws the actions that the actor is fitted to
+        self.target_actor.load_state_dict(self.actor.state_dict())  # it draws what the actor is fitted to
