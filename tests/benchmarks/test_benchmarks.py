@@ -455,6 +455,21 @@ def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, reques
         assert found[0][name] == pytest.approx(found[10**9][name], rel=1e-3)
 
 
+@pytest.mark.parametrize("whole", ["small_release", "maze_release"])
+def test_a_picture_cell_is_made_again_if_the_units_of_its_state_errors_change(whole, request, tmp_path):
+    folder = request.getfixturevalue(whole)
+    release, setup = open_release(folder), Setup(str(folder), str(tmp_path), PROFILES["smoke"])
+    cells = {agent: plan_benchmark("b1", release, [agent])[0][0] for agent in ("bc", "state-bc")}
+    before = {agent: fingerprint(setup, release, cell) for agent, cell in cells.items()}
+    other = next(iter(release.subsets.values()))
+    record = other.record.model_copy(update={"name": f"{other.task}/other/{other.setting}"})
+    one = dict(list(other.commits.items())[:1])
+    manifest = release.manifest.model_copy(update={"subsets": (*release.manifest.subsets, record)})
+    grown = Release(release.root, manifest, release.subsets | {record.name: Subset(folder, record, one, {})})
+    assert fingerprint(setup, grown, cells["bc"]) != before["bc"]
+    assert fingerprint(setup, grown, cells["state-bc"]) == before["state-bc"]
+
+
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
     cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc"])[0]][:1]
     setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"], seed=7)  # data that no other test has loaded

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,6 +59,22 @@ def test_every_row_of_a_report_holds_when_its_policy_is_scored_again(report, cou
     for row in rows:
         checked = check_row(tmp_path, row)
         assert checked.holds and checked.returns == row.returns, (row.name, checked.why)
+
+
+@pytest.mark.parametrize("report", ["walkers", "mazes"])
+def test_a_check_paints_with_the_samples_of_the_row(report, request, tmp_path):
+    rows = add_rows(tmp_path, rows_of_report(request.getfixturevalue(report)))
+    row = next(row for row in rows if row.evaluation.size)
+    shown = []
+
+    def watched(*_, **options):
+        shown.append(options["samples"])
+        return SimpleNamespace(returns=row.returns)
+
+    for samples in (row.evaluation.samples, 1):
+        asked = row.model_copy(update={"evaluation": row.evaluation.model_copy(update={"samples": samples})})
+        assert check_row(tmp_path, asked, watched).holds
+    assert shown == [row.evaluation.samples, 1] and row.evaluation.samples != 1
 
 
 def facts_of(report):

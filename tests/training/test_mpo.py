@@ -113,7 +113,7 @@ def test_targets_are_copies_of_long_ago():
     assert torch.equal(mpo_learner.target_actor.observation_mean, mpo_learner.actor.observation_mean)
 
 
-def test_from_a_policy_file_the_targets_draw_its_actions(tmp_path):
+def test_from_a_policy_file_the_targets_draw_its_actions():
     source = learner()
     weights = {name: value + 0.1 for name, value in source.actor.state_dict().items()}
     started = learner()
