@@ -52,9 +52,9 @@ def join(recipe: Recipe, parts: Sequence[str | Path]) -> tuple[Manifest, Index]:
             raise StoreError(f"{record.name} was not made as {recipe.name} says; roll it out with that recipe")
     facts = {"subsets": tuple(found[record.name] for record in whole.subsets), "complete": True}
     whole = whole.model_copy(update=facts | {"environments": tuple(environments)})
-    with tempfile.TemporaryDirectory() as folder:  # arrays' metadata name the release, so a part has others
-        create_groups(Path(folder), whole, whole.subsets)
-        listed |= {file.path: file for file in data_files(Path(folder), whole, {})}
+    with tempfile.TemporaryDirectory() as scratch:  # arrays' metadata name the release, so a part has others
+        create_groups(Path(scratch), whole, whole.subsets)
+        listed |= {file.path: file for file in data_files(Path(scratch), whole, {})}
     files = tuple(listed[path] for path in sorted(listed))
     whole = whole.model_copy(update={"digest": root_digest(files, whole)})
     return whole, Index(manifest_sha256=sha256_bytes(json_bytes(whole)), files=files).with_checksum()
