@@ -18,7 +18,7 @@ from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
 from dmcvb_gen.tasks.own import own_task
-from dmcvb_gen.tasks.suite import suite_ids, suite_task
+from dmcvb_gen.tasks.suite import REFUSED, suite_ids, suite_task
 
 ENTRY_POINTS = "dmcvb_gen.tasks"
 """Entry point group of other packages: the name is a task id, the object a function that gives the `Task`."""
@@ -61,7 +61,7 @@ def get_task(task_id: str) -> Task:
 
     Raises:
       UnknownNameError: no task has that name.
-      DmcvbError: a task of your own that cannot be used.
+      DmcvbError: a task of your own, or of the suite, that cannot be used.
     """
     if task_id in REGISTRY:
         return REGISTRY[task_id]()
@@ -73,6 +73,8 @@ def get_task(task_id: str) -> Task:
         return _entry_points()[task_id].load()()
     if task_id in suite_ids():
         return suite_task(task_id)
+    if task_id in REFUSED:
+        raise DmcvbError(f"{task_id} cannot be used: {REFUSED[task_id]}")
     raise UnknownNameError("task", task_id, all_task_ids())
 
 

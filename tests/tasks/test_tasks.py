@@ -16,7 +16,7 @@ from dmcvb_gen.own_code import TASKS as ALLOWED
 from dmcvb_gen.own_code import allow
 from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, REGISTRY, get_task, register_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
-from dmcvb_gen.tasks.suite import SuiteTask
+from dmcvb_gen.tasks.suite import REFUSED, SuiteTask
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
 """Largest difference of an observation; physics states are always equal. Humanoid's limb positions are one matrix
@@ -145,7 +145,13 @@ def test_episodes_of_a_suite_task_depend_on_their_own_streams_alone():
 
 
 def test_the_suite_is_known_without_importing_it():
-    assert {f"{domain}-{name}" for domain, name in suite.ALL_TASKS} == set(suite_ids())
+    assert {f"{domain}-{name}" for domain, name in suite.ALL_TASKS} == {*suite_ids(), *REFUSED}
+
+
+@pytest.mark.parametrize("task_id", REFUSED)
+def test_a_suite_task_that_cannot_be_used_is_refused_in_one_line(task_id):
+    with pytest.raises(DmcvbError, match="a new terrain"):
+        get_task(task_id)
 
 
 def ten_lines(tmp_path, monkeypatch, code):
