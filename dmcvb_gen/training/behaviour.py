@@ -103,6 +103,10 @@ def train_behaviour(
         notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
     done, name = saved["step"] if saved else 0, task_folder(task)
     total = configuration.steps
+    if total < done:
+        raise DmcvbError(f"{folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
+    if found and total < found.steps:
+        notify(f"The run ends at step {total:,} now, not at {found.steps:,}.")
     with ProgressBar(progress, total=total, initial=done, unit=" steps", unit_scale=True, desc=name) as bar:
 
         def report(progress: Any) -> None:

@@ -2,7 +2,7 @@
 
 A run folder holds
 
-    run.json                              what is trained, never changed
+    run.json                              what is trained; only its number of steps changes
     checkpoints/<agent step>.safetensors  a policy file an evaluation, thinned if there are many
     progress.csv, tensorboard/            a row, a point an evaluation
     resume/                               learner, replay buffer, simulations, random states: a killed run goes on
@@ -34,7 +34,7 @@ import filelock
 import numpy as np
 import torch
 
-from dmcvb_gen.dataset.manifest import environment
+from dmcvb_gen.dataset.manifest import environment, write_json_atomically
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.policies.actor import Policy
@@ -269,6 +269,7 @@ class Run(abc.ABC):
             for name in ("checkpoints", "resume"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
             with self._alone():
+                self.write_config()
                 saved = self.saved()
                 if not saved:
                     self._refuse_lost_state()
@@ -281,6 +282,16 @@ class Run(abc.ABC):
                         self._train(saved, report, tick)
                 finally:
                     self._log.close()
+
+    def write_config(self) -> None:
+        """Write run.json.
+
+        Raises:
+          DmcvbError: another process has begun another run in the folder.
+        """
+        if found := read_config(self.folder):
+            check_same(self.folder, found, self.config)
+        write_json_atomically(self.folder / "run.json", json.loads(json.dumps(dataclasses.asdict(self.config))))
 
     def _refuse_lost_state(self) -> None:
         """Raise if a run has trained for longer than it takes to save it, and its saved state is gone."""

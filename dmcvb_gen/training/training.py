@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.policy_file import load_policy
@@ -270,5 +269,6 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         folder.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(folder).free < 1e9:
             raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")
-        write_json_atomically(folder / "run.json", json.loads(json.dumps(dataclasses.asdict(config))))
+        if not found:  # a run that goes on writes it once it is alone in the folder
+            run.write_config()
     return run

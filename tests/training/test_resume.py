@@ -25,6 +25,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.policy_file import load_policy, read_header
 from dmcvb_gen.state_file import STATE, pack_state, read_state
 from dmcvb_gen.training import runs
+from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.training.run_log import COLUMNS, read_rows
 from dmcvb_gen.training.runs import RunConfig, Stopped
 from dmcvb_gen.training.sac import ReplayBuffer
@@ -308,6 +309,31 @@ def test_two_processes_do_not_train_in_one_folder(tmp_path):
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(DmcvbError, match="another process"):
             run.train()
+        before = (tmp_path / "run" / "run.json").read_bytes()
+        with pytest.raises(DmcvbError, match="another process"):
+            open_run(tmp_path / "run", config(steps=200), True).train()
+        assert (tmp_path / "run" / "run.json").read_bytes() == before  # it says what the other one trains
+
+
+def test_a_run_looks_again_when_it_is_alone(tmp_path):
+    late = open_run(tmp_path / "run", config(), False)
+    (tmp_path / "run" / "run.json").unlink()
+    train(tmp_path / "run", seed=1)
+    with pytest.raises(DmcvbError, match="with seed 1, asked for 0"):
+        late.train()
+
+
+def test_a_run_that_is_made_shorter_says_so(tmp_path):
+    train(tmp_path / "run", steps=80)
+    said = []
+    train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=160, progress=False, notify=said.append)
+    with pytest.raises(DmcvbError, match="at step 160, past --steps 120"):
+        train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=120, progress=False)
+    assert not said
+    path = tmp_path / "run" / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"steps": 400}))
+    train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=200, progress=False, notify=said.append)
+    assert said == ["The run ends at step 200 now, not at 400."]
 
 
 def test_a_saved_state_that_holds_code_or_rubbish_is_refused(tmp_path):
