@@ -11,6 +11,7 @@ import sys
 import threading
 import warnings
 from pathlib import Path
+from typing import NoReturn
 
 import click
 
@@ -97,12 +98,10 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            _say_how_to_go_on(ctx)
-            raise
+            _end_interrupted(ctx)
         except Exception as error:
             if _asked_to_stop.is_set():  # Ctrl-C within foreign code comes out as that code's own kind of error
-                _say_how_to_go_on(ctx)
-                raise click.Abort() from None
+                _end_interrupted(ctx)
             what = str(error) if isinstance(error, DmcvbError) else None
             if isinstance(error, ModuleNotFoundError):
                 what = install_hint(error.name or "")
@@ -141,9 +140,11 @@ def _name_glfw_library() -> None:
             os.environ.setdefault("PYGLFW_LIBRARY", str(library))
 
 
-def _say_how_to_go_on(context: click.Context) -> None:
-    if context.invoked_subcommand in RESUMING:
-        click.echo("\nInterrupted. What is finished is kept; rerun the same command to go on.", err=True)
+def _end_interrupted(context: click.Context) -> NoReturn:
+    resumes = context.invoked_subcommand in RESUMING
+    how = " What is finished is kept; rerun the same command to go on." if resumes else ""
+    click.echo(f"\nInterrupted.{how}", err=True)
+    context.exit(1)
 
 
 def _stop_on_signals(context: click.Context) -> None:
