@@ -19,11 +19,18 @@ class DmcvbError(Exception):
 
 
 class UnknownNameError(DmcvbError, KeyError):
-    """A name that is not among the known ones; the message lists those and the nearest match."""
+    """A name that is not among the known ones; the message lists those and the nearest match.
+
+    Args:
+      kind: what is named.
+      known: all names; of those that begin with `name`, the first one is the nearest.
+    """
 
     def __init__(self, kind: str, name: object, known: Iterable[str]):
-        known = sorted(map(str, known))
-        near = difflib.get_close_matches(str(name), known, n=1)
+        known = list(map(str, known))
+        longer = [other for other in known if name and other.startswith(str(name))]
+        known = sorted(known)
+        near = longer or difflib.get_close_matches(str(name), known, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         listed, rest = known, ""
         if len(known) > MOST_LISTED:
