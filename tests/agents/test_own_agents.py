@@ -132,6 +132,7 @@ def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_p
     facts = json.loads((tmp_path / "report" / "report.json").read_text())
     scores = {r["cell"]["agent_name"]: r["score"] for r in facts["results"]}
     assert set(scores) == {"state-bc", "own_agents:still", "own_agents:learned"}, result.output
+    assert all("renderer" not in r["evaluation"] for r in facts["results"])  # none of them saw pictures
     [failed] = facts["failed"]
     assert "step 0" in failed["error"] and "expected (2, 6)" in failed["error"] and result.exit_code == 1
     assert scores["own_agents:still"]["returns"] != scores["own_agents:learned"]["returns"]
@@ -171,7 +172,8 @@ def test_what_an_agent_learns_from_is_what_it_sees_when_it_is_scored(kind, reque
     result = CliRunner().invoke(main, command)
     facts = json.loads((tmp_path / "report" / "report.json").read_text())
     assert not facts["failed"], facts["failed"]
-    assert any("seeing" in one["cell"]["agent_name"] for one in facts["results"]), result.output
+    seeing = [one for one in facts["results"] if "seeing" in one["cell"]["agent_name"]]
+    assert seeing and all("renderer" in one["evaluation"] for one in seeing), result.output
 
 
 @pytest.mark.parametrize("name, told", [("own_agnts:still", "cannot load"), ("bc", "--agents")])
