@@ -230,7 +230,7 @@ def repaint(
 
     look = (distractor, difficulty, size, renderer, samples, _videos(backgrounds), split, device)
     with progress_bar(progress, " frames") as bar:
-        run(Repainting(release, out, as_names(only), *look, as_names(labels), name), workers, bar)
+        run(Repainting(release, out, as_names(only), *look, tuple(dict.fromkeys(as_names(labels))), name), workers, bar)
     return open_for_reading(str(out))
 
 

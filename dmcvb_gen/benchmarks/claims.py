@@ -106,7 +106,8 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
                 seed = result.get("seed", facts["settings"]["seed"])
                 seeds.setdefault((place, seed), {})[result["fingerprint"]] = folder
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DmcvbError(f"cannot read {path} ({type(error).__name__}); dmcvb-gen validate writes it") from None
+            why = getattr(error, "strerror", None) or type(error).__name__
+            raise DmcvbError(f"cannot read {path} ({why}); dmcvb-gen validate writes it") from None
     if len(profiles) > 1:
         named = ", ".join(f"{folder} ({profile})" for profile, folder in profiles.items())
         raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")

@@ -51,7 +51,8 @@ class Score:
     """Returns of online episodes.
 
     Attributes:
-      mean, stderr: mean and standard error of the returns; the standard error is std / sqrt(episodes), std with n - 1.
+      mean, stderr: mean and standard error of the returns; the standard error is std / sqrt(episodes), std with n - 1,
+        and NaN of one episode.
       returns: return of each episode.
       success: share of the episodes that the task ended (mazes), else None.
       speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_speed`).
@@ -147,7 +148,11 @@ class EvaluationScene:
         task, slash, setting = where.rpartition("/")
         if not slash or not setting:
             raise DmcvbError(f"{where!r} names no evaluation; give TASK/SETTING, e.g. walker-walk/dynamic")
+        if len(parts := where.split("/")) == 3:  # a subset's name
+            raise DmcvbError(f"{where!r} names a subset; an evaluation has no level: give {parts[0]}/{parts[2]}")
         spec = SubsetSpec.parse(task, "random", setting)
+        if options.get("backgrounds", cls.backgrounds) != cls.backgrounds and spec.distractor.kind == "none":
+            raise DmcvbError(f"{where} shows no videos, so backgrounds have no effect: leave them out")
         if spec.goal is GoalMode.FIXED:
             raise DmcvbError(f"{where}: goals are fixed by a release's episodes; use `validate --benchmark b3`")
         views = [view for view in get_task(task).views if view not in NOT_TRAINED_ON]
@@ -282,7 +287,7 @@ class Evaluator:
                 break
         return Score(
             mean=float(returns.mean()),
-            stderr=float(returns.std(ddof=1) / math.sqrt(count)) if count > 1 else 0.0,
+            stderr=float(returns.std(ddof=1) / math.sqrt(count)) if count > 1 else math.nan,
             returns=tuple(float(value) for value in returns),
             success=None if distance is None else float(ended.mean()),
             speed=None if distance is None else goal_speed(distance, length, ended, task),
@@ -365,7 +370,7 @@ def evaluate(
         gives (episode, action) in [-1, 1], as a numpy array or anything that numpy can read.
       where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible".
       episodes: number of episodes, each run once.
-      seed: seed of starts and distractors; `validate` has 0.
+      seed: seed of starts and distractors; `validate` has 0. Each setting has starts of its own.
       stack: frames an observation; the first one of an episode is repeated.
       pixels: give pictures; without them an evaluation takes seconds.
       size: pixels a side. renderer: its name. samples: anti-aliasing samples of a pixel, the renderer's by default.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.precision import choose_precision, image_product
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.spec import select
+from dmcvb_gen.spec import matches, select
 from dmcvb_gen.storage.remote import local_path
 
 STATE_BC_SHARE = 0.9
@@ -171,11 +170,14 @@ def validate(
         the report's folder cannot be written.
     """
     started, progress = time.perf_counter(), progress or Progress()
-    release = open_data(dataclasses.replace(setup, root=str(path)))
+    release = open_data(replace(setup, root=str(path)))
     chosen = only(release, patterns)
     if not chosen.subsets:
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
     cells, missing = _plan(chosen, benchmarks, agents, release.subsets.keys() - chosen.subsets.keys())
+    if patterns:  # nobody misses what was not asked for
+        asked = [replace(one, subsets=tuple(n for n in one.subsets if matches(n, patterns))) for one in missing]
+        missing = [one for one in asked if one.subsets or one.left_out]
     check_writable(setup.out)
     structure = check_structure(chosen, setup.backgrounds, progress.checking, workers)
     results = []

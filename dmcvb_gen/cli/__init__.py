@@ -15,6 +15,7 @@ from typing import NoReturn
 
 import click
 
+from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.version import __version__
@@ -144,7 +145,7 @@ def _end_interrupted(context: click.Context) -> NoReturn:
     resumes = context.invoked_subcommand in RESUMING
     how = " What is finished is kept; rerun the same command to go on." if resumes else ""
     click.echo(f"\nInterrupted.{how}", err=True)
-    context.exit(1)
+    context.exit(INTERRUPTED)
 
 
 def _stop_on_signals(context: click.Context) -> None:

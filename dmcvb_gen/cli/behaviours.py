@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+import math
 from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, answer, json_option, print_json, print_table
+from dmcvb_gen.cli.common import INTERRUPTED, OutPath, answer, json_option, print_json, print_table
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
 from dmcvb_gen.progress import ProgressBar
@@ -35,13 +36,13 @@ def train_behaviour(layout, as_json, **options):
         run = train(layout=layout, notify=functools.partial(click.echo, err=True), **options)
     except Stopped as stopped:
         click.echo(stopped, err=True)
-        click.get_current_context().exit(1)
+        click.get_current_context().exit(INTERRUPTED)
     selecting = f"dmcvb-gen select-checkpoints {run.folder}"
     try:
         picked = _select(run.folder, as_json) if layout else None
     except KeyboardInterrupt:
         click.echo(f"Interrupted. The run is trained; select its checkpoints: {selecting}", err=True)
-        click.get_current_context().exit(1)
+        click.get_current_context().exit(INTERRUPTED)
     if as_json:
         facts = dict(out=str(run.folder), steps=run.steps, seconds=round(run.seconds, 1), curve=str(run.curve))
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
@@ -75,7 +76,7 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     """Pick the expert, medium and mixed checkpoints of a run.
 
     Expert: the first with 95 % of the return at convergence; medium: half of it (mazes: nearest to the paper's row);
-    mixed: eight, evenly spaced in training steps from the start to medium.
+    mixed: eight, evenly spaced in training steps from the start to medium. Exit code 1 if none can be picked yet.
 
     \b
     dmcvb-gen select-checkpoints runs/walker-walk
@@ -85,8 +86,11 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
 
     picked = _select(run, as_json, episodes, seed, sample, converged)
     if as_json:
-        return print_json(selection_json(picked))
-    _show_picks(picked, run)
+        print_json(selection_json(picked))
+    else:
+        _show_picks(picked, run)
+    if not picked.picks:
+        click.get_current_context().exit(1)
 
 
 def _show_picks(picked, run):
@@ -94,7 +98,8 @@ def _show_picks(picked, run):
 
     end = picked.convergence
     state = "converged" if end.converged else f"not converged ({end.reason})"
-    click.echo(f"{task_folder(picked.task)}: return at convergence {end.value:.1f} +- {end.error:.1f}, {state}")
+    error = "" if math.isnan(end.error) else f" +- {end.error:.1f}"
+    click.echo(f"{task_folder(picked.task)}: return at convergence {end.value:.1f}{error}, {state}")
     picks = [pick for level in picked.picks.values() for pick in level]
     if picks:
         print_table(
@@ -106,7 +111,8 @@ def _show_picks(picked, run):
         )
     for level, reason in picked.reasons.items():
         click.echo(f"{level} cannot be picked yet: {reason}")
-    click.echo(f"wrote {run}/selected, {run}/selection.json, {run}/curve.png")
+    written = [f"{run}/selection.json", f"{run}/curve.png"]
+    click.echo(f"wrote {', '.join([f'{run}/selected'] * bool(picks) + written)}")
 
 
 @click.command("convert-policy")
@@ -183,7 +189,7 @@ def evaluate_behaviour(as_json, progress, **options):
 
 def _show_returns(rows, episodes, seed):
     """Print returns, the paper's under each."""
-    mazes = any("success" in row for row in rows)
+    mazes, mode = any("success" in row for row in rows), rows[0]["mode"]
     statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
     scores = ("success", "to goal m/s", "rms m/s") if mazes else ()
     lines = []
@@ -192,13 +198,14 @@ def _show_returns(rows, episodes, seed):
         if "success" in row:
             speed = "-" if row["speed"] is None else f"{row['speed']:.2f}"
             extra = [f"{row['success']:.0%}", speed, f"{row['running_speed']:.2f}"]
-        lines.append((row["task"], row["level"], *(f"{row['returns'][key]:.1f}" for key in statistics), *extra))
+        level = row["behaviour"] or row["level"]
+        lines.append((row["task"], level, *(f"{row['returns'][key]:.1f}" for key in statistics), *extra))
         if row["paper"]:
             numbers = [f"{row['paper'][key]:.1f}" for key in statistics]
             lines.append(("  DMC-VB paper", row["level"], *numbers, *[""] * len(scores)))
     print_table(
         ("task", "<level", *statistics, *scores),
         lines,
-        title=f"{episodes} episodes each, seed {seed}, {rows[0]['mode']} actions",
+        title=f"{episodes} episodes each, seed {seed}" + ("" if mode == "own" else f", {mode} actions"),
         optional=(("p25", "p75"), ("rms m/s",), ("min", "max"), ("to goal m/s",)),
     )

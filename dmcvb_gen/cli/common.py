@@ -12,6 +12,8 @@ from dmcvb_gen.errors import DmcvbError
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C or SIGTERM, as shells have it; 1 means that a check failed."""
 WORDS = "dmcvb_gen.words"
 """Key in a context's `meta`: the words of the command line."""
 
@@ -138,7 +140,7 @@ def format_bytes(count: float) -> str:
 
 def moved_files(moved: Any) -> str:
     """Say what a publish or fetch moved."""
-    return f"{moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them moved now"
+    return f"{moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them copied now"
 
 
 def format_duration(seconds: float) -> str:

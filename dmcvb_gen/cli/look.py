@@ -18,6 +18,7 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.storage.remote import public
+from dmcvb_gen.text import pluralize
 
 
 @click.command()
@@ -53,6 +54,7 @@ def info(path, options, as_json):
         if paper := subset["paper"]:
             numbers = (f"{paper[key]:.1f}" for key in statistics)
             rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers))
+    rows += [(name, f"0/{planned:,}", *[""] * 10) for name, planned in facts["missing"].items()]
     print_table(
         ("subset", "episodes", "steps", "size", "B/step", *statistics),
         rows,
@@ -65,6 +67,10 @@ def info(path, options, as_json):
     click.echo(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}")
     if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
         click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
+    if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
+        click.echo(f"No images are stored; add them: dmcvb-gen paint {public(path)}")
+    if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
+        click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {public(path)}")
     if facts["digest"]:
         click.echo(f"digest {facts['digest']}")
 
@@ -176,7 +182,7 @@ def status(place, options, as_json):
     print_table(
         ("subset", "done", "late", "open"),
         [
-            (subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done:,}")
+            (subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done - subset.late:,}")
             for subset in found.subsets
         ],
         title=f"{found.name}: {found.done:,} of {found.total:,} shards",
@@ -187,8 +193,8 @@ def status(place, options, as_json):
         click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")
     if found.late:
         click.echo(
-            f"{found.late} shards are late: later ones are done. They are still in progress or their worker died; "
-            "rerun the same command to make them"
+            f"{pluralize(found.late, 'shards')} late (later ones are done): in progress, of a --part that has not run, "
+            "or of a worker that died. The same rollout makes them."
         )
     if found.done == found.total:
         click.echo("complete" if found.complete else "All shards are done; finish the release with --finish.")

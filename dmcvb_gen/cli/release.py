@@ -12,6 +12,8 @@ import click
 from dmcvb_gen import commands
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, print_table, remote_option
 from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.dataset.manifest import MANIFEST
+from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import pluralize
 
 if TYPE_CHECKING:
@@ -51,9 +53,12 @@ def _verified(path, result):
         verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
         verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
-    yield f"{path}: {verdict} ({checked})"
+    yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; the rest is sound ({checked})"
     if result.digest:
         yield f"digest {result.digest}"
+    damaged = [found for found in result.findings if found.check == "files" and not found.message.startswith("is not")]
+    if any(found.subset != MANIFEST for found in damaged) and not is_url(str(path)):
+        yield f"`dmcvb-gen regenerate {path}` makes damaged and missing shards again."
 
 
 @command_of(commands.regenerate)
@@ -214,10 +219,9 @@ def diff_command(one, other, data, options, as_json):
     from dmcvb_gen.release.diff import diff
 
     found = diff(one, other, options)
-    facts: Any = [dataclasses.asdict(difference) for difference in found]
     compared = compare(open_release(one, options), open_release(other, options)) if data else []
-    if data:
-        facts = {"differences": facts, "data": [dataclasses.asdict(row) | {"z": row.z} for row in compared]}
+    facts: dict[str, Any] = {"differences": [dataclasses.asdict(difference) for difference in found]}
+    facts["data"] = [dataclasses.asdict(row) | {"z": row.z} for row in compared]
     answer(as_json, facts, *(map(str, found) if found else ["no difference"]))
     if not as_json:
         _print_comparisons(compared)

@@ -74,10 +74,9 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     plan = rollout_plan(options, request, target)
     if request:
         _tell_what_is_asked(request, options)
+    _tell_what_is_there(plan, shared=dry_run or init or bool(options["part"]))
     if dry_run:
         return _show_plan(plan, workers, as_json)
-    shared = init or bool(options["part"])
-    _tell_what_is_there(plan, shared)
     plan = prepare_rollout(plan, options, init)
     if init:
         return _tell_begun(plan, as_json)
@@ -94,7 +93,7 @@ def _tell_what_is_asked(request, options):
     if source != "builtin" and (counts := videos_by_split(source)):
         other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
         click.echo(
-            f"{counts[split]} of {sum(counts.values())} videos in {source} are used; the others are kept for {other}. "
+            f"Videos of {source} used: {counts[split]} of {sum(counts.values())}; the rest is kept for {other}. "
             "To choose them yourself, put them into folders named train and val.",
             err=True,
         )
@@ -106,7 +105,8 @@ def _tell_what_is_there(plan, shared):
 
     if plan.growth:
         added = ", ".join(plan.growth[:3]) + (f" and {len(plan.growth) - 3} more" if len(plan.growth) > 3 else "")
-        click.echo(f"{plan.target.place} is a release already; this adds {added}.", err=True)
+        there = plan.target.manifest()
+        click.echo(f"{plan.target.place} holds {there.name} {there.version} already; this adds {added}.", err=True)
     if not shared and (others := rollouts_at_work(plan.target)):
         click.echo(
             f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. "

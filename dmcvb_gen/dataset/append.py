@@ -45,6 +45,7 @@ def merged(old: Manifest, asked: Manifest, place: str) -> Manifest:
     for record in asked.subsets:
         there = records.get(record.name)
         if there is None:
+            _check_same_policies(old, record, place)
             added[record.name] = (0, record.episodes)
             records[record.name] = record
             continue
@@ -89,6 +90,18 @@ def _value(record: SubsetRecord, field: str) -> Any:
     if field == "policies":
         return tuple((policy.name, policy.digest, policy.path) for policy in record.policies)
     return getattr(record, field)
+
+
+def _check_same_policies(old: Manifest, record: SubsetRecord, place: str) -> None:
+    """Refuse a new subset whose task and level are there already, of other policies."""
+    for there in old.subsets:
+        if (there.task, there.level) == (record.task, record.level):
+            one, other = (" ".join(policy.name for policy in each.policies) for each in (there, record))
+            if _value(there, "policies") != _value(record, "policies"):
+                raise StoreError(
+                    f"{place} holds {there.name} of {_short(one)}, asked for {record.name} of {_short(other)}, and a "
+                    "release has one behaviour for each task and level; choose another --out"
+                )
 
 
 def _check_can_grow(there: SubsetRecord, record: SubsetRecord, place: str) -> None:

@@ -266,15 +266,21 @@ def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
     refuse_altered(metadata_files(index), digest, str(root))
 
 
-def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> None:
-    """Write a missing or damaged index again, if the files that are here give the root digest of the manifest."""
+def restore_index(root: Path, manifest: Manifest, commits: dict[str, dict[int, CommitRecord]]) -> bool:
+    """Write a missing or damaged index again, if the files that are here give the root digest of the manifest.
+
+    Returns:
+      True if it was written.
+    """
     if manifest.digest is None or trusted_index(root, manifest) is not None:
-        return
+        return False
     listed = data_files(root, manifest, commits)
-    if root_digest(listed, manifest) == manifest.digest:
-        everything = sorted([*listed, *card_files(root)], key=lambda file: file.path)
-        digest = files.sha256_file(root / MANIFEST)
-        files.write_json(root / INDEX, Index(manifest_sha256=digest, files=tuple(everything)).with_checksum())
+    if root_digest(listed, manifest) != manifest.digest:
+        return False
+    everything = sorted([*listed, *card_files(root)], key=lambda file: file.path)
+    digest = files.sha256_file(root / MANIFEST)
+    files.write_json(root / INDEX, Index(manifest_sha256=digest, files=tuple(everything)).with_checksum())
+    return True
 
 
 def restored_commit(root: Path, manifest: Manifest, commit: CommitRecord) -> CommitRecord:

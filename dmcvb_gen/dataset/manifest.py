@@ -362,7 +362,7 @@ def _parse(model, text, where):
     try:
         data = parse_json(text)
     except ValueError as error:
-        raise StoreError(f"{where} is not JSON ({error}); fetch or regenerate the release again") from None
+        raise StoreError(f"{where} is not JSON ({error}); fetch it again, or make a new release") from None
     version = data.get("schema_version", SCHEMA_VERSION) if isinstance(data, dict) else None
     if isinstance(version, int) and version > SCHEMA_VERSION:
         raise StoreError(

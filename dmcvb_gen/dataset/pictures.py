@@ -18,6 +18,7 @@ from typing import Protocol
 
 from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.text import as_names
 
 ONE_VIEW = ("pixels",)
 """The views of a task with one."""
@@ -50,7 +51,7 @@ class Pictures:
         """Names of the picture arrays, one a view: ("pixels",), or ("pixels/top", ...)."""
         return picture_arrays(self.views, self.hide_goal)
 
-    def select(self, views: Sequence[str] | None) -> Pictures:
+    def select(self, views: str | Sequence[str] | None) -> Pictures:
         """The asked views alone, in the asked order; all if none are asked for (None).
 
         Args:
@@ -62,7 +63,8 @@ class Pictures:
         """
         if views is None:
             return self
-        names = dict(zip(self.arrays, self.views, strict=True)) | {view: view for view in self.views}
+        names, views = dict(zip(self.arrays, self.views, strict=True)), as_names(views)
+        names |= {view: view for view in self.views}
         for view in views:
             if view not in names:
                 raise UnknownNameError("view", view, self.views)

@@ -33,6 +33,8 @@ def return_statistics(returns: np.ndarray) -> dict[str, float]:
 def describe_release(path: str | Path, storage_options: dict | None = None) -> dict[str, Any]:
     """Subsets of a release with episodes, steps, bytes and returns, the paper's row beside each.
 
+    "missing" names the subsets of which nothing is here, and how many episodes they are to have.
+
     Raises:
       StoreError: there is no release at `path`.
     """
@@ -52,6 +54,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 bytes=subset.bytes,
                 bytes_per_step=subset.bytes / max(subset.steps, 1),
                 size=subset.record.size,
+                images=subset.record.pixels,
                 renderer=subset.record.renderer.get("name"),
                 digest=subset.record.digest,
                 returns=return_statistics(subset.returns),
@@ -69,6 +72,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
         bytes=sum(subset["bytes"] for subset in subsets),
         disk_bytes=None if is_url(str(path)) else disk_bytes(release.path, _files(release)),
         subsets=subsets,
+        missing={name: planned for name, (here, planned) in release.shortfalls.items() if not here},
     )
 
 

@@ -98,7 +98,8 @@ def background_source(root: Path, record: SubsetRecord, moved: str | None = None
         raise StoreError(f"the backgrounds of {record.name} cannot be used: {error}") from None
     if digest != record.backgrounds["digest"]:
         raise StoreError(
-            f"backgrounds {given!r} are not those that {record.name} was painted with; give --backgrounds FOLDER"
+            f"backgrounds {given!r} are not those that {record.name} was painted with; give the folder of "
+            "those, or show others: `dmcvb-gen repaint`"
         )
     return given
 

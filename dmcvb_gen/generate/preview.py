@@ -205,7 +205,10 @@ def write_preview(
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:
-        raise StoreError(f"{path} has no committed episodes with pictures; run the rollout first, or `dmcvb-gen paint`")
+        cure = f"see what is here: dmcvb-gen verify {path}"
+        if names:
+            cure = f"add them: dmcvb-gen paint {path}, or see it without: dmcvb-gen view {path}"
+        raise StoreError(f"{path} has no finished episodes with images; {cure}")
     folder = target or release.path / "preview"
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import commit_path, shard_count
+from dmcvb_gen.dataset.manifest import MANIFEST, commit_path, shard_count
 from dmcvb_gen.dataset.shards import chosen_shards
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.jobs import make_jobs
@@ -68,7 +68,7 @@ def progress_of(target: Target) -> ReleaseProgress:
     """
     manifest = target.manifest()
     if manifest is None:
-        raise StoreError(f"{target.place} holds no release; begin one with `dmcvb-gen rollout`")
+        raise StoreError(f"{target.place} holds no release (no {MANIFEST}); give the place that `rollout --out` made")
     commits = target.commits(manifest.subsets)
     listed = target.storage.list()
     late = dict.fromkeys((record.name for record in manifest.subsets), 0)

@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -63,7 +63,7 @@ class RendererChoice(_Model):
     """Which renderer paints: backend "native", "warp" or "opengl"; samples a pixel (None: the renderer's default)."""
 
     backend: str = "native"
-    samples: int | None = pydantic.Field(default=None, ge=1, le=8)
+    samples: Literal[1, 2, 4, 8] | None = None
 
 
 class SubsetPattern(_Model):
@@ -268,10 +268,12 @@ def override(recipe: Recipe, **changes: Any) -> Recipe:
         raise RecipeError(f"recipe {recipe.name!r} has no fixed goals, so --{_option(goals)} means nothing for it")
     amount = {"episodes", "steps"} & set(each)
     if amount and fixed and not (goals and settings - {FIXED}):
-        cure = "give those too" if settings - {FIXED} else "give those"
+        others = sorted(settings - {FIXED})
+        flags = " ".join(f"--{'goal' if name in GOAL_MODES else 'distractor'} {name}" for name in others)
+        cure = f"give those too, or leave these subsets out: {flags}" if others else "give those"
         raise RecipeError(
             f"--{amount.pop()} means nothing for fixed goals, which have --fixed-goals x --episodes-per-goal episodes; "
-            f"{cure}, or leave those subsets out with --goal visible --goal hidden"
+            f"{cure}"
         )
     if amount:
         each = {"episodes": None, "steps": None} | each
@@ -375,13 +377,15 @@ def load_recipe(source: str | Path) -> Recipe:
         data = read_yaml(
             resources.files("dmcvb_gen.generate") / "data" / "recipes" / f"{source}.yaml" if shipped else path
         )
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise RecipeError(
-            f"cannot read recipe {str(source)!r} ({error}); give a YAML file or one of the shipped: "
+            f"cannot read recipe {str(source)!r} ({error.strerror}); give a YAML file or one of the shipped: "
             + ", ".join(shipped_recipes())
         ) from None
+    except ValueError as error:
+        raise RecipeError(f"{source}: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
-        raise RecipeError(f"{source} holds no mapping of recipe fields; see `dmcvb-gen rollout --help`")
+        raise RecipeError(f"{source} holds no recipe; begin it with `name: mine` and `subsets:`, see docs/recipes.md")
     return make_recipe(data, str(source))
 
 
@@ -394,6 +398,27 @@ def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
     try:
         return Recipe.model_validate(data)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
+        # A misspelt field is why another one is missing, so it comes first.
+        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
         place = ".".join(map(str, first["loc"])) or "the top"
-        raise RecipeError(f"{where}: {place}: {first['msg']}") from None
+        raise RecipeError(f"{where}: {place}: {_cure(first)}") from None
+
+
+CURES = {
+    "missing": "is missing",
+    "tuple_type": "give a list; each entry begins with '- '",
+    "model_type": "give `backend: native` on a line of its own below it",
+    "string_type": 'give text; quote what looks like a number, e.g. "1.0.0"',
+}
+"""Kind of a pydantic error -> what to write instead."""
+
+
+def _cure(error: Mapping[str, Any]) -> str:
+    """What is wrong with a field of a recipe, and what to write instead."""
+    place, kind = error["loc"], error["type"]
+    if kind == "extra_forbidden":
+        model = Recipe if len(place) == 1 else SubsetPattern if place[0] == "subsets" else RendererChoice
+        return str(UnknownNameError("field", place[-1], model.model_fields))
+    if kind == "string_pattern_mismatch":
+        return 'give three numbers, e.g. "1.0.0"' if place == ("version",) else "give letters, digits, '.', '_' or '-'"
+    return CURES.get(kind, error["msg"])

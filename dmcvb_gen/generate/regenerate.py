@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from dmcvb_gen.dataset.index import POLICIES, VIDEOS, ZARR_JSON, restore_index, restored_commit, trusted_index
+from dmcvb_gen.dataset.index import INDEX, POLICIES, VIDEOS, ZARR_JSON, restore_index, restored_commit, trusted_index
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, environment, parse_commit
 from dmcvb_gen.dataset.pictures import SHOWN, stored_pictures
 from dmcvb_gen.dataset.reader import load_manifest
@@ -233,7 +233,7 @@ class Regeneration:
             commits = {record.name: read_commits(root, record) for record in manifest.subsets}
             repaired = [commits[found.subset][found.shard] for found in outcomes if found.repaired]
             link_equal_files(root, manifest, commits, {file.path for commit in repaired for file in commit.files})
-            restore_index(root, manifest, commits)
+            restored += [INDEX] * restore_index(root, manifest, commits)
         return Outcome(tuple(outcomes), environment_diff(manifest), restored=tuple(restored))
 
     def _folder(self) -> tuple[Path, Manifest]:

@@ -10,10 +10,20 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.errors import RecipeError
+from dmcvb_gen.errors import RecipeError, UnknownNameError
 from dmcvb_gen.generate.recipe import Recipe, check_options_used, load_recipe, narrow, override, single_recipe
 from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
-from dmcvb_gen.spec import DIFFICULTY_SCALES, FIXED, Distractor, MazeName, difficulty_of, is_maze, task_folder
+from dmcvb_gen.spec import (
+    ANT_MAZE,
+    DIFFICULTY_SCALES,
+    FIXED,
+    Distractor,
+    Level,
+    MazeName,
+    difficulty_of,
+    is_maze,
+    task_folder,
+)
 from dmcvb_gen.text import as_names
 
 EPISODES = 20
@@ -75,9 +85,17 @@ def background_source(given: str | Path) -> str:
 
 
 def behaviour_source(given: str | Path | None) -> str | None:
-    """--behaviour as a recipe has it: an absolute path, or "<module>:<function>", whose code may then run."""
+    """--behaviour as a recipe has it: an absolute path, or "<module>:<function>", whose code may then run.
+
+    Raises:
+      RecipeError: it names a Python file.
+    """
     if not given:
         return None
+    module, _, function = str(given).partition(":")
+    if module.endswith(".py"):
+        name = f"{Path(module).stem}:{function or 'FUNCTION'}"
+        raise RecipeError(f"--behaviour {given} is a file; in its folder, give --behaviour {name}")
     if is_own(str(given)):
         allow([str(given)], BEHAVIOURS)  # a person typed its name
         return str(given)
@@ -129,6 +147,8 @@ def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
 
 def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Recipe:
     levels = tuple(given.get("levels") or ("random",))
+    for level in levels:
+        Level.parse(level)
     if len({is_maze(task) for task in tasks}) > 1:
         raise RecipeError("mazes and locomotion tasks take different settings; roll them out by a --recipe")
     check_maze_options(tasks, given)
@@ -171,9 +191,15 @@ def _difficulty(given: Mapping[str, Any]) -> str:
 
 
 def _layout_task(layout: str | Path) -> str:
-    from dmcvb_gen.tasks.ant_maze import layout_task_id
+    from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, layout_task_id
 
-    return layout_task_id(layout) if Path(layout).suffix or Path(layout).exists() else str(MazeName(str(layout)))
+    if Path(layout).suffix or Path(layout).exists():
+        return layout_task_id(layout)
+    task, known = str(MazeName(str(layout))), [name.removeprefix(f"{ANT_MAZE}-") for name in ANT_MAZE_TASKS]
+    maze = MazeName.parse(task)
+    if maze is None or (maze.rows is None and maze.layout not in known):
+        raise UnknownNameError("layout", layout, known)
+    return task
 
 
 def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
@@ -189,15 +215,14 @@ def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
     if all(is_maze(task) for task in tasks):
         _check_given_to_mazes(given)
         return
-    if given.get("goals") or given.get("fixed_goals"):
-        raise RecipeError("--goal and --fixed-goals have no effect outside mazes: remove them")
-    for name, flag in (("episodes_per_goal", "--episodes-per-goal"), ("reward", "--reward")):
+    flags = {"goals": "--goal", "fixed_goals": "--fixed-goals", "reward": "--reward"}
+    for name, flag in (flags | {"episodes_per_goal": "--episodes-per-goal"}).items():
         if name in given:
             raise RecipeError(f"{flag} has no effect outside mazes: remove it")
     for name in _STRENGTHS:
         if name in given and all("_" in kind or kind == "none" for kind in given.get("distractors", ())):
             flag = f"--{name.replace('_', '-')}"
-            raise RecipeError(f"{flag} is for --distractor static or dynamic without one of their own; give one")
+            raise RecipeError(f"{flag} has no effect here: ask for --distractor static or dynamic")
 
 
 def _check_given_to_mazes(given: Mapping[str, Any]) -> None:

@@ -32,14 +32,16 @@ def evaluate_behaviour(
       pictures (FOLDER): Folder for drawings of ten paths in each maze.
 
     Returns:
-      A row for each task and level: task, level, episodes, seed, mode ("mean" or "sampled"), returns (statistics),
-      paper (the same or None); of mazes success, speed and running_speed (m/s) too.
+      A row for each task and level: task, level, episodes, seed, mode ("mean", "sampled", or "own" if a function of
+      your own acts), behaviour (that function's name or None), returns (statistics), paper (the same or None); of mazes
+      success, speed and running_speed (m/s) too.
 
     Raises:
       DmcvbError: an unknown name, a policy that does not fit, or pictures of tasks that are no mazes.
     """
     from dmcvb_gen.generate.info import return_statistics  # here, so that --help is quick
     from dmcvb_gen.generate.request import behaviour_source
+    from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.bundled import bundled_levels
     from dmcvb_gen.policies.evaluation import maze_scores, running_speed, walked_paths
     from dmcvb_gen.policies.paper import paper_returns
@@ -59,7 +61,9 @@ def evaluate_behaviour(
             policies = _policies(task_id, level, behaviour)
             out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
-            row |= dict(mode="sampled" if sample else "mean", returns=return_statistics(out.returns))
+            own = is_own(behaviour or "") and level != "random"
+            mode = "own" if own else "sampled" if sample else "mean"
+            row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
             if success is not None:
                 row |= dict(success=success, speed=speed, running_speed=running_speed(task, out))

@@ -7,6 +7,7 @@ colors, before other videos, all drawn from named streams: augmentation that kee
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -20,7 +21,7 @@ from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.jobs import stream_names
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
@@ -258,7 +259,12 @@ def open_painted(path: str, storage_options: dict | None = None, **painting: Any
 
     Raises:
       StoreError: there is no release, it cannot be read, or it was imported.
+      UnknownNameError: `painting` has an unknown field.
     """
+    known = [field.name for field in dataclasses.fields(Painting)]
+    for name in painting:
+        if name not in known:
+            raise UnknownNameError("option of painting", name, known)
     return painted_release(open_release(path, storage_options), Painting(**painting))
 
 

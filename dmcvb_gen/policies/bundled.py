@@ -65,10 +65,21 @@ def levels_of(behaviour: str | Path) -> list[str]:
         levels = [level for level in TRAINED_LEVELS if level_files(folder, level)]
         if levels:
             return levels
+    reasons = _reasons(path)
+    if reasons:
+        raise PolicyFileError(f"{behaviour} has no selected policies: {next(iter(reasons.values()))}")
     raise PolicyFileError(
         f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {behaviour}` first, "
         "or give a policy file"
     )
+
+
+def _reasons(run: Path) -> dict[str, str]:
+    """Level -> why the last selection picked none of it; empty if there was none, or its file is damaged."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        levels = parse_json((run / "selection.json").read_bytes()).get("levels", {})
+        return {level: found["reason"] for level, found in levels.items() if found.get("reason")}
+    return {}
 
 
 def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = None) -> list[Path]:
@@ -96,11 +107,8 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
         files = level_files(folder, level)
         if files:
             return files
-    selection = path / "selection.json"
-    why = ""
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # what is damaged gives no reason
-        why = parse_json(selection.read_bytes()).get("levels", {}).get(level, {}).get("reason") or ""
+    if why := _reasons(path).get(level):
+        raise PolicyFileError(f"{behaviour} has no {level} policy selected: {why}")
     raise PolicyFileError(
-        f"{behaviour} has no {level} policy selected{f' ({why})' if why else ''}; run `dmcvb-gen select-checkpoints "
-        f"{behaviour}` first"
+        f"{behaviour} has no {level} policy selected; run `dmcvb-gen select-checkpoints {behaviour}` first"
     )

@@ -173,7 +173,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except OSError as error:
         raise PolicyFileError(f"cannot read {path}: {error.strerror or error}; give the path of a policy") from None
     except Exception as error:  # torch's own kinds, pickle's and zip's
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        reason = (str(error).splitlines() or [type(error).__name__])[0].split(". ")[0][:120]
         raise PolicyFileError(
             f"{path} holds no weights that can be read without running code ({reason}); save its state dict with "
             "torch.save(actor.state_dict(), ...)"

@@ -77,8 +77,7 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
             write_table(release, part)
         texts = _texts(release, folder / TABLE, published)
         if not (folder / CHANGELOG).exists():
-            manifest = release.manifest
-            texts[CHANGELOG] = f"# Changelog of {manifest.name}\n\n## {manifest.version}\n\n- First release.\n"
+            texts[CHANGELOG] = _changelog(release.manifest)
         for name, text in texts.items():
             write_text(folder / name, text)
         with replacing(folder / PLOT) as part:
@@ -90,6 +89,18 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     if folder.resolve() == release.path.resolve():
         take_in_card(folder)
     return [folder / name for name in (*texts, PLOT, SHEET, TABLE)]
+
+
+def _changelog(manifest: Manifest) -> str:
+    """The text of a new CHANGELOG.md: the newest version first, and what each one added."""
+    first = manifest.recipe.get("version", manifest.version) if manifest.additions else manifest.version
+    versions = [(first, ["First release."])]
+    for entry in manifest.additions:
+        counts = {name: pluralize(end - start, "episodes") for name, (start, end) in entry.subsets.items()}
+        more = {name: "more episodes" if start else "a new subset" for name, (start, _) in entry.subsets.items()}
+        versions.append((entry.version, [f"`{name}`: {more[name]}, {count}." for name, count in counts.items()]))
+    parts = [f"## {version}\n\n" + "".join(f"- {line}\n" for line in lines) for version, lines in versions[::-1]]
+    return "\n".join([f"# Changelog of {manifest.name}\n", *parts])
 
 
 def _told(folder: Path, manifest: Manifest) -> Publication:
@@ -265,6 +276,8 @@ def card_text(
             arrays=_arrays(release),
             statistics=STATISTICS,
             deviation=deviation,
+            compared=_compared(facts["subsets"]),
+            shorter=_shorter(facts["subsets"]),
             far=[f"`{name}`" for name in far_subsets(facts["subsets"])],
             levels=level_statistics(release),
             level_episodes=STATISTICS_EPISODES,
@@ -307,8 +320,18 @@ def deviation(subset: Mapping[str, Any]) -> float:
 
 def far_subsets(subsets: Iterable[Mapping[str, Any]]) -> list[str]:
     """Names of the subsets of whole episodes whose mean return is another one than the paper's."""
-    compared = [subset for subset in subsets if subset["paper"] and not subset["shorter"]]
-    return [subset["name"] for subset in compared if abs(deviation(subset)) > FAR]
+    return [subset["name"] for subset in _compared(subsets) if abs(deviation(subset)) > FAR]
+
+
+def _compared(subsets: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Subsets of whole episodes that the paper has, too."""
+    return [subset for subset in subsets if subset["paper"] and not subset["shorter"]]
+
+
+def _shorter(subsets: Sequence[Mapping[str, Any]]) -> str:
+    """How many subsets have episodes that end sooner than the paper's, in words; "" if none."""
+    count = sum(bool(subset["paper"] and subset["shorter"]) for subset in subsets)
+    return "" if not count else "all subsets" if count == len(subsets) else pluralize(count, "subsets")
 
 
 def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
@@ -405,11 +428,12 @@ def _limits(release: Release) -> list[str]:
         for policy in own
     ]
     if algorithms := {str(policy.header.get("algorithm", "unknown means")) for policy in policies} - {OWN_CODE}:
-        limits.append(f"{trained(algorithms)}; the paper's by MPO. Compare the returns above.")
+        limits.append(f"{trained(algorithms)}; the paper's by MPO.")
     steps = {name: subset.steps for name, subset in release.subsets.items()}
     small = [name for name, count in steps.items() if count < 1_000_000]
     if small:
-        limits.append(f"{len(small)} of {len(steps)} subsets have fewer steps than the paper's million.")
+        which = "All" if len(small) == len(steps) else f"{len(small)} of {len(steps)}"
+        limits.append(f"{which} subsets have fewer steps than the paper's million.")
     seconds = {ACTION_REPEAT * get_task(record.task).control_timestep for record in manifest.subsets}
     limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
     if manifest.imported:

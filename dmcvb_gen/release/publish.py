@@ -144,7 +144,7 @@ def publish(
     """
     root, manifest = load_manifest(root)
     if not manifest.complete:
-        raise StoreError(f"{root} is not complete; finish it with the same rollout, or `dmcvb-gen regenerate {root}`")
+        raise StoreError(f"{root} is not complete; finish it with the same rollout, without --only or --part")
     index = index_of(root, manifest)
     total = sum(file.bytes for file in index.files)
     _check_card(root, manifest, index)

@@ -43,6 +43,7 @@ class LevelStatistics:
     """Motion statistics of the policies of a level.
 
     Attributes:
+      subset: name of the subset whose first `EPISODES` episodes they are of.
       speed: mean horizontal speed of the root, m/s; None if the task has no root that moves.
       height: mean height of body or head in meters; None if the state has none.
       success: share of episodes that reached their goal; None for tasks without one.
@@ -50,6 +51,7 @@ class LevelStatistics:
 
     task: str
     level: str
+    subset: str
     episodes: int
     speed: float | None
     height: float | None
@@ -119,7 +121,7 @@ def level_statistics(release: Release) -> list[LevelStatistics]:
             height = float(np.concatenate([rows[:, field] for rows in _episodes(subset, "state")]).mean())
         success = float(subset.read("terminated")[:EPISODES].mean()) if task.goal_geoms else None
         count = len(subset.episodes[:EPISODES])
-        out.append(LevelStatistics(name, level, count, _speed(task, subset), height, success))
+        out.append(LevelStatistics(name, level, subset.name, count, _speed(task, subset), height, success))
     return out
 
 

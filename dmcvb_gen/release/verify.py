@@ -93,7 +93,7 @@ def check_files(root: Path, workers: Workers | Pool = 1, tick: ProgressCallback 
         index = None
     else:
         if index is None and manifest.digest is not None:
-            yield Issue("files", INDEX, "is missing; fetch it again")
+            yield Issue("files", INDEX, "is missing; `dmcvb-gen regenerate` writes it again")
     works, checked = _works(root, manifest), set()
     expect(tick, len(works) + len(manifest.subsets))
     found = in_order(_check_shards, works, workers, tick)
@@ -129,7 +129,7 @@ def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue
             name = path.relative_to(root).as_posix()
             ours = name.startswith(PREVIEWS) or any(part.startswith(".") for part in name.split("/"))
             if not ours and name not in listed and path.is_file():
-                text = f"{name} is not part of the release; move it elsewhere"
+                text = "is not part of the release; move it elsewhere"
                 yield Issue("files", subset_of(manifest, name), text)
 
 

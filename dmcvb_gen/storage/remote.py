@@ -10,9 +10,14 @@ bytes into a `StoreError`; it never shows a secret. Whatever touches storage run
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import errno
+import functools
+import logging
 import re
+import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -141,7 +146,21 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
         return f"cannot {doing} {place} ({reason(error)}); check the URL and the network, and rerun the command"
     if isinstance(error, OSError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}"
-    return f"{place} is damaged ({reason(error)}); repair it with `dmcvb-gen regenerate`, or fetch it again"
+    _end_quietly()
+    why = reason(error).split(". ")[0]
+    return f"{place} is damaged ({why}); repair it with `dmcvb-gen regenerate`, or fetch it again"
+
+
+@functools.cache
+def _end_quietly() -> None:
+    """Hide what the end of the process says of the reads that Zarr gave up after one that failed."""
+    atexit.register(_hide_unfinished)
+
+
+def _hide_unfinished() -> None:
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+    sys.unraisablehook = lambda *_: None
 
 
 def _kind(error: BaseException) -> str:

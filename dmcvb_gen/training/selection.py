@@ -28,6 +28,7 @@ from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze, task_folder
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import pluralize
 from dmcvb_gen.training.run_log import read_rows
 from dmcvb_gen.training.runs import read_config
 
@@ -120,7 +121,7 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
             float(curve[-1]) if len(curve) else float("nan"),
             float("nan"),
             False,
-            f"{len(curve)} evaluations, at least {MIN_POINTS} are needed",
+            f"{pluralize(len(curve), 'evaluations')}, at least {MIN_POINTS} are needed",
         )
     grid = np.linspace(steps[0], steps[-1], 64)
     even = np.interp(grid, steps, curve)
@@ -327,7 +328,7 @@ def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies:
 
 
 def selection_json(selection: Selection) -> dict:
-    """A selection as plain values."""
+    """A selection as plain values; None for numbers that are not known."""
     levels = {}
     for level in TRAINED_LEVELS:
         picks = [asdict(pick) | {"evaluation": pick.evaluation.model_dump()} for pick in selection.picks.get(level, ())]
@@ -335,7 +336,10 @@ def selection_json(selection: Selection) -> dict:
     return {
         "task": selection.task,
         "base": selection.base,
-        "convergence": asdict(selection.convergence),
+        "convergence": {
+            name: None if isinstance(value, float) and np.isnan(value) else value
+            for name, value in asdict(selection.convergence).items()
+        },
         "levels": levels,
     }
 

@@ -4,7 +4,7 @@ import sys
 
 import torch
 from torch import nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, RandomSampler
 
 import dmcvb_gen
 
@@ -23,16 +23,15 @@ encoder = nn.Sequential(
 policy = nn.Sequential(encoder, nn.LazyLinear(256), nn.ReLU(), nn.Linear(256, len(first["action"])), nn.Tanh())
 policy(torch.zeros(1, channels, size, size))  # fixes the size of the lazy layer
 optimizer = torch.optim.Adam(policy.parameters(), lr=3e-4)
-loader, step, losses = DataLoader(source, batch_size=64, shuffle=True), 0, []
-while step < STEPS:
-    for batch in loader:
-        loss = nn.functional.mse_loss(policy(batch["pixels"] / 255 - 0.5), batch["action"])
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-        step += 1
-print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f} after {step} steps of {len(source)} samples")
+drawn = RandomSampler(source, replacement=True, num_samples=64 * STEPS)
+losses = []
+for batch in DataLoader(source, batch_size=64, sampler=drawn):
+    loss = nn.functional.mse_loss(policy(batch["pixels"] / 255 - 0.5), batch["action"])
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    losses.append(loss.item())
+print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f} after {len(losses)} steps of {len(source)} samples")
 
 
 @torch.no_grad()

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from dmcvb_gen.cli import COMMANDS, RESUMING, main
+from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
@@ -185,7 +186,8 @@ def test_a_stop_that_foreign_code_turns_into_its_own_error_is_no_traceback(tmp_p
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # a command that is stopped silences it
     monkeypatch.setattr("dmcvb_gen.generate.info.describe_release", foreign)
     result = run("info", tmp_path)
-    assert result.exit_code == 1 and "Interrupted" in result.output and isinstance(result.exception, SystemExit)
+    assert result.exit_code == INTERRUPTED and isinstance(result.exception, SystemExit)
+    assert "Interrupted" in result.output
 
 
 @pytest.mark.parametrize("foreign", [True, False])
@@ -206,7 +208,7 @@ def test_a_command_that_resumes_says_so_when_it_is_stopped(monkeypatch, command,
     monkeypatch.setattr(main.get_command(None, command), "invoke", turned_into_an_error if foreign else stopped)
     monkeypatch.setattr(main.get_command(None, command), "params", [])
     result = run(command)
-    assert result.exit_code == 1 and "rerun the same command to go on" in result.output
+    assert result.exit_code == INTERRUPTED and "rerun the same command to go on" in result.output
     assert "Aborted" not in result.output
 
 
@@ -228,7 +230,7 @@ main(["verify", "."])
 
 def test_nothing_that_was_half_begun_prints_a_traceback_when_a_command_is_stopped():
     ended = subprocess.run([sys.executable, "-c", HALF_BEGUN], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr.strip()) == (1, "", "Interrupted.")
+    assert (ended.returncode, ended.stdout, ended.stderr.strip()) == (INTERRUPTED, "", "Interrupted.")
 
 
 PROCESSES = """

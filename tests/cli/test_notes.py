@@ -39,7 +39,7 @@ def copy(release, tmp_path):
 def test_a_release_that_gains_subsets_or_episodes_says_which(copy):
     assert "adds" not in run("rollout", "walker-walk", *TINY, "--episodes", 3, "--out", copy)
     said = run("rollout", "cheetah-run", *TINY, "--episodes", 1, "--out", copy)
-    assert f"{copy} is a release already; this adds cheetah-run/random/none." in said
+    assert f"{copy} holds walker-walk-random 1.0.0 already; this adds cheetah-run/random/none." in said
     run("rollout", "pendulum-swingup", *TINY, "--episodes", 50, "--out", copy)
     said = run("rollout", "pendulum-swingup", *TINY, "--episodes", 51, "--out", copy)
     assert "this adds pendulum-swingup/random/none (1 episode more)." in said

@@ -41,7 +41,8 @@ def test_another_seed_changes_arrays_and_missing_episodes_are_counted(maze_relea
     (tmp_path / "copy" / commit_path(NAME, 1)).unlink()
     result = CliRunner().invoke(main, ["diff", str(small_release), str(tmp_path / "copy"), "--json"])
     assert result.exit_code == 1
-    assert json.loads(result.output) == [{"subset": NAME, "message": "episodes that are there: 3 and 2"}]
+    found = [{"subset": NAME, "message": "episodes that are there: 3 and 2"}]
+    assert json.loads(result.output) == {"differences": found, "data": []}
     shutil.copytree(maze_release, tmp_path / "a")
     shutil.copytree(maze_release, tmp_path / "b")
     for folder, shard in (("a", 0), ("b", 1)):

@@ -1,0 +1,260 @@
+"""What newcomers did wrong, or read and did not understand: each answer says what is the matter and names the cure."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset.manifest import commit_path
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.recipe import load_recipe
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.release.card import write_card
+from tests.conftest import roll_out, small_recipe
+
+NAME = "walker-walk/random/none"
+TINY = ["--max-steps", "4", "--size", "16", "--episodes", "2"]
+
+
+def run(*words, code=0):
+    done = CliRunner().invoke(main, [str(word) for word in words])
+    assert done.exit_code == code, done.output
+    return done.output
+
+
+@pytest.fixture
+def copy(small_release, tmp_path):
+    return shutil.copytree(small_release, tmp_path / "copy")
+
+
+# -- recipes and options --------------------------------------------------------------------------
+
+WRONG_RECIPES = {
+    "subsets:\n  tasks: walker-walk": "subsets: give a list",
+    "subsets:\n- {task: walker-walk, levels: random, settings: none, episodes: 1}": "unknown field 'task'.*'tasks'",
+    "subsets:\n- {levels: random, settings: none, episodes: 1}": "subsets.0.tasks: is missing",
+    "version: 1.0": 'version: give text; quote what looks like a number, e.g. "1.0.0"',
+    "version: one": 'version: give three numbers, e.g. "1.0.0"',
+    "renderer: native": "renderer: give `backend: native`",
+    "renderer: {backend: native, samples: 3}": "samples: Input should be 1, 2, 4 or 8",
+    "renderer: {backend: native, sample: 2}": "unknown field 'sample'. Did you mean 'samples'",
+}
+
+
+@pytest.mark.parametrize("text", WRONG_RECIPES)
+def test_a_wrong_field_of_a_recipe_is_told_with_what_to_write(text, tmp_path):
+    subsets = "subsets:\n- {tasks: walker-walk, levels: random, settings: none, episodes: 1}\n"
+    (tmp_path / "r.yaml").write_text("name: mine\n" + ("" if text.startswith("subsets") else subsets) + text)
+    with pytest.raises(DmcvbError, match=WRONG_RECIPES[text]):
+        load_recipe(tmp_path / "r.yaml")
+
+
+def test_a_file_that_holds_no_recipe_says_what_is_wrong_with_it(tmp_path):
+    (tmp_path / "empty.yaml").touch()
+    with pytest.raises(DmcvbError, match="holds no recipe; begin it with"):
+        load_recipe(tmp_path / "empty.yaml")
+    (tmp_path / "open.yaml").write_text("name: [mine\n")
+    with pytest.raises(DmcvbError, match="open.yaml: not YAML") as caught:
+        load_recipe(tmp_path / "open.yaml")
+    assert "shipped" not in str(caught.value)
+
+
+@pytest.mark.parametrize("words, told", [
+    (["walker-walk", "--level", "expert,medium"], "unknown level 'expert,medium'"),
+    (["walker-walk", "--goal", "hidden"], "--goal has no effect outside mazes"),
+    (["--layout", "foo"], "unknown layout 'foo'"),
+    (["walker-walk", "--level", "expert", "--behaviour", "mine.py"], "give --behaviour mine:FUNCTION"),
+    (["walker-walk", "--level", "expert", "--behaviour", "mine.py:swing"], "give --behaviour mine:swing"),
+    (["walker-walk", "--samples", "3"], "samples: Input should be 1, 2, 4 or 8"),
+])  # fmt: skip
+def test_an_option_that_cannot_be_is_answered_by_its_own_name(words, told, tmp_path):
+    said = run("rollout", *words, *TINY, "--out", tmp_path / "out", code=2)
+    assert told in said and not (tmp_path / "out").exists()
+
+
+def test_the_cure_for_fixed_goals_keeps_all_other_subsets(tmp_path):
+    maze = {"tasks": "ant-maze-empty7x7", "levels": "random", "settings": ["visible", "fixed"], "episodes": 1}
+    walker = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static_hard"], "episodes": 1}
+    (tmp_path / "r.yaml").write_text(json.dumps({"name": "both", "subsets": [maze, walker]}))
+    asked = ["rollout", "--recipe", tmp_path / "r.yaml", "--episodes", 2, "--dry-run", "--out", tmp_path / "out"]
+    said = run(*asked, code=2)
+    cure = said.strip().rpartition("leave these subsets out: ")[2].split()
+    plan = run(*asked, *cure)
+    assert all(name in plan for name in ("visible", "none", "static_hard")) and "/fixed" not in plan
+
+
+# -- releases that are there ----------------------------------------------------------------------
+
+
+def test_a_level_has_one_behaviour_in_a_release(tmp_path):
+    expert = ["rollout", "walker-walk", "--level", "expert", *TINY, "--out", tmp_path / "a"]
+    run(*expert)
+    other = bundled_policies("walker-walk", "medium")[0]
+    said = run(*expert, "--distractor", "static", "--behaviour", other, code=2)
+    assert "one behaviour for each task and level" in said
+    planned = run(*expert, "--distractor", "static", "--dry-run")
+    assert "holds walker-walk-expert 1.0.0 already; this adds walker-walk/expert/static" in planned
+    run(*expert, "--distractor", "static")
+
+
+def test_info_names_what_is_missing_and_what_to_do(copy, tmp_path):
+    (copy / commit_path(NAME, 0)).unlink()
+    (copy / commit_path(NAME, 1)).unlink()
+    said = run("info", copy)
+    [row] = [line for line in said.splitlines() if line.startswith(NAME)]
+    assert row.split()[1] == "0/3" and f"see which: dmcvb-gen verify {copy}" in said
+    assert json.loads(run("info", copy, "--json"))["missing"] == {NAME: 3}
+    said = run("verify", copy, code=1)
+    assert "the rest is sound" in said and f"`dmcvb-gen regenerate {copy}` makes" in said
+    run("regenerate", copy)
+    assert "see which" not in run("info", copy)
+
+
+def test_a_release_without_images_says_how_to_get_them(tmp_path):
+    words = ["rollout", "walker-walk", "--level", "random", *TINY]
+    run(*words, "--no-pixels", "--out", tmp_path / "light")
+    run(*words, "--out", tmp_path / "painted")
+    assert f"No images are stored; add them: dmcvb-gen paint {tmp_path / 'light'}" in run("info", tmp_path / "light")
+    assert "No images" not in run("info", tmp_path / "painted")
+    assert f"dmcvb-gen paint {tmp_path / 'light'}" in run("preview", tmp_path / "light", code=2)
+    found = run("diff", tmp_path / "painted", tmp_path / "light", code=1)
+    assert "only the first has images" in found and "other bytes" not in found
+
+
+def test_a_lost_index_is_written_again_and_named(copy):
+    (copy / "files.json").unlink()
+    assert "`dmcvb-gen regenerate` writes it again" in run("verify", copy, code=1)
+    assert "put back, e.g. files.json" in run("regenerate", copy)
+    assert "sound" in run("verify", copy)
+
+
+def test_a_label_given_twice_is_stored_once(copy, tmp_path):
+    twice = ["--label", "depth", "--label", "depth"]
+    run("repaint", copy, *twice, "--only", "*/none", "--out", tmp_path / "depth")
+    assert "depth" in dmcvb_gen.open(str(tmp_path / "depth"))[NAME].arrays
+
+
+READ = """
+import sys, dmcvb_gen
+subset = dmcvb_gen.open(sys.argv[1])["walker-walk/random/dynamic"]
+try:
+    for step in range(0, 1500, 10):
+        subset.source(stack=3)[step]
+except dmcvb_gen.errors.StoreError as error:
+    print("caught", error)
+"""
+
+
+def test_a_damaged_chunk_is_one_line_in_python(copy):
+    files = [path for path in (copy / "walker-walk/random/dynamic.zarr/pixels").rglob("*") if path.is_file()]
+    for path in (path for path in files if path.name != "zarr.json"):
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 255
+        path.write_bytes(data)
+    read = subprocess.run([sys.executable, "-c", READ, str(copy)], capture_output=True, text=True, check=True)
+    assert read.stdout.startswith("caught") and "Stored:" not in read.stdout and read.stderr == ""
+
+
+def test_late_and_open_shards_are_counted_once(copy):
+    (copy / commit_path(NAME, 0)).unlink()
+    [row] = [line for line in run("status", copy).splitlines() if line.startswith(NAME)]
+    assert row.split()[1:] == ["1", "1", "0"]
+
+
+# -- cards ----------------------------------------------------------------------------------------
+
+
+def test_a_card_of_cut_episodes_does_not_compare_them(tmp_path):
+    out = tmp_path / "a"
+    run("rollout", "walker-walk", "--level", "random", *TINY, "--out", out)
+    run("rollout", "walker-walk", "--level", "random", "--distractor", "static", *TINY, "--out", out)
+    write_card(out)
+    text = " ".join((out / "README.md").read_text().split())
+    assert "Episodes of all subsets end sooner than the paper's, so their returns do not compare." in text
+    assert "z is" not in text and "z =" not in text and "All subsets have fewer steps" in text
+    changes = (out / "CHANGELOG.md").read_text()
+    assert changes.index("## 1.1.0") < changes.index("## 1.0.0") and changes.endswith("- First release.\n")
+    assert "- `walker-walk/random/static`: a new subset, 2 episodes." in changes
+    assert "fits the release" in run("card", out, "--check")
+
+
+def test_a_card_names_the_subset_that_its_statistics_are_of(small_mazes, tmp_path):
+    write_card(small_mazes, tmp_path)
+    assert "| `ant-maze-tiny/random/visible` | 2 |" in (tmp_path / "README.md").read_text()
+
+
+# -- policies and scores --------------------------------------------------------------------------
+
+
+def still(observation):
+    return np.zeros((len(observation["state"]), 6))
+
+
+def test_an_evaluation_of_one_episode_has_no_standard_error():
+    assert math.isnan(dmcvb_gen.evaluate(still, "walker-walk/none", episodes=1, max_steps=2, pixels=False).stderr)
+
+
+def test_what_an_evaluation_cannot_be_of_is_said():
+    with pytest.raises(DmcvbError, match="names a subset; .* give walker-walk/dynamic"):
+        dmcvb_gen.evaluate(still, "walker-walk/expert/dynamic")
+    with pytest.raises(DmcvbError, match="shows no videos, so backgrounds have no effect"):
+        dmcvb_gen.evaluate(still, "walker-walk/none", backgrounds="videos")
+
+
+def test_one_view_may_be_named_alone(small_release):
+    subset = dmcvb_gen.open(str(small_release))[NAME]
+    assert subset.source(pictures="pixels")[0]["pixels"].shape == (9, 16, 16)
+    with pytest.raises(UnknownNameError, match="unknown view 'agent'"):
+        subset.source(pictures="agent")
+    with pytest.raises(UnknownNameError, match="option of painting 'distractor'. Did you mean 'distractors'"):
+        dmcvb_gen.open(str(small_release), paint=True, distractor="resample")
+
+
+SWING = """
+import numpy as np
+
+def swing(observations, generator):
+    return generator.normal(size=(len(observations), 6)).clip(-1, 1)
+"""
+
+
+def test_a_function_of_ones_own_is_named_beside_its_returns(tmp_path, monkeypatch):
+    (tmp_path / "swinging.py").write_text(SWING)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DMCVB_GEN_BEHAVIOURS", raising=False)
+    said = run("evaluate-behaviour", "walker-walk", "--behaviour", "swinging:swing", "--episodes", 2)
+    assert "swinging:swing" in said and "mean actions" not in said
+
+
+def test_a_selection_that_picks_nothing_says_why_wherever_one_looks(tmp_path):
+    settings = [f"--set={pair}" for pair in ("warmup_steps=100", "compile=false", "batch_size=16")]
+    folder = tmp_path / "run"
+    run("train-behaviour", "cheetah-run", "--steps", 160, "--evaluate-every", 80, *settings, "--out", folder)
+    found = json.loads(run("select-checkpoints", folder, "--json", "--episodes", 2, code=1), parse_constant=pytest.fail)
+    assert found["convergence"]["error"] is None
+    said = run("select-checkpoints", folder, "--episodes", 2, code=1)
+    assert "nan" not in said and f"{folder}/selected" not in said and "selection.json" in said
+    for words in (["evaluate-behaviour", "cheetah-run"], ["rollout", "cheetah-run", "--level", "expert", *TINY]):
+        said = run(*words, "--behaviour", folder, code=2)
+        assert "at least 8 are needed" in said and "select-checkpoints" not in said
+
+
+def test_subsets_that_only_leaves_out_are_not_missed(small_release, tmp_path):
+    asked = ["validate", small_release, "--profile", "smoke", "--agents", "state-bc", "--workers", 1, "--threads", 1]
+    said = run(*asked, "--only", NAME, "--out", tmp_path / "report")
+    assert "not in the release" not in said
+
+
+def test_a_partial_release_that_is_published_names_the_cure(tmp_path):
+    roll_out(small_recipe(), tmp_path / "part", only=[NAME])
+    said = run("publish", tmp_path / "part", f"file:{tmp_path / 'public'}", code=2)
+    assert "without --only or --part" in said
