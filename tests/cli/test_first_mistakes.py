@@ -81,6 +81,7 @@ def test_an_option_that_cannot_be_is_answered_by_its_own_name(words, told, tmp_p
     assert told in said and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_cure_for_fixed_goals_keeps_all_other_subsets(tmp_path):
     maze = {"tasks": "ant-maze-empty7x7", "levels": "random", "settings": ["visible", "fixed"], "episodes": 1}
     walker = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static_hard"], "episodes": 1}
@@ -106,6 +107,7 @@ def test_a_level_has_one_behaviour_in_a_release(tmp_path):
     run(*expert, "--distractor", "static")
 
 
+@pytest.mark.slow
 def test_info_names_what_is_missing_and_what_to_do(copy, tmp_path):
     (copy / commit_path(NAME, 0)).unlink()
     (copy / commit_path(NAME, 1)).unlink()
@@ -235,6 +237,7 @@ def test_a_function_of_ones_own_is_named_beside_its_returns(tmp_path, monkeypatc
     assert "swinging:swing" in said and "mean actions" not in said
 
 
+@pytest.mark.slow
 def test_a_selection_that_picks_nothing_says_why_wherever_one_looks(tmp_path):
     settings = [f"--set={pair}" for pair in ("warmup_steps=100", "compile=false", "batch_size=16")]
     folder = tmp_path / "run"
