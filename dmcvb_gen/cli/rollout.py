@@ -93,7 +93,7 @@ def _tell_what_is_asked(request, options):
     if source != "builtin" and (counts := videos_by_split(source)):
         other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
         click.echo(
-            f"Videos of {source} used: {counts[split]} of {sum(counts.values())}; the rest is kept for {other}. "
+            f"{source}: {counts[split]} of {sum(counts.values())} videos used; the rest is kept for {other}. "
             "To choose them yourself, put them into folders named train and val.",
             err=True,
         )

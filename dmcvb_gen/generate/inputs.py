@@ -99,7 +99,7 @@ def background_source(root: Path, record: SubsetRecord, moved: str | None = None
     if digest != record.backgrounds["digest"]:
         raise StoreError(
             f"backgrounds {given!r} are not those that {record.name} was painted with; give the folder of "
-            "those, or show others: `dmcvb-gen repaint`"
+            "those (--backgrounds), or show others: `dmcvb-gen repaint`"
         )
     return given
 

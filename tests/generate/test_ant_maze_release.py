@@ -201,7 +201,7 @@ def test_bad_requests(tmp_path):
     hole.write_text("****\n*   \n****\n")
     for arguments, message in [
         (["--layout", str(hole)], "hole"),
-        (["--layout", "no-such"], "ant-maze-empty7x7"),
+        (["--layout", "no-such"], "empty7x7"),
         (["ant-maze-empty7x7", "--distractor", "dynamic"], "--goal"),
         (["ant-maze-empty7x7", "--goal", "seen"], "visible"),
         (["walker-walk", "--goal", "hidden"], "no effect outside mazes"),

@@ -417,10 +417,10 @@ def published(made):
 
 
 def test_a_light_release_is_validated_as_the_painted_one(made, tmp_path):
-    curves = {}
+    curves, trained = {}, ["--agents", "bc", "--threads", 1, "--precision", "float32"]
     for which in ("light", "painted"):
         out = tmp_path / which
-        result = run("validate", made / which, "--agents", "bc", "--threads", 1, "--out", out, "--json")
+        result = run("validate", made / which, *trained, "--out", out, "--json")
         assert result.exit_code == 0, result.output
         facts = json.loads((out / "report.json").read_text())
         curves[which] = [(cell["id"], cell["curve"][0]["loss"], cell["score"]["returns"]) for cell in facts["results"]]
