@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import lzma
+import re
 import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -24,6 +25,13 @@ if TYPE_CHECKING:
 
 _FOLDER = resources.files("dmcvb_gen.generate") / "data" / "manifests"
 ENDING = ".tar.xz"
+DIGESTS = "digests"
+"""Member of an archive with the 32 bytes of each digest of the others, as they come; in text, digests
+take more room even compressed."""
+_DIGEST = re.compile(rb"[0-9a-f]{64}")
+_NEW, _KNOWN = b"\0", b"\1"
+"""Bytes that JSON never holds: the next digest of `DIGESTS`, or the one whose number follows in three bytes."""
+_PLACES = re.compile(rb"\x00|\x01(...)", re.DOTALL)
 
 
 def shipped_manifests() -> tuple[str, ...]:
@@ -51,8 +59,8 @@ def manifest_source(source: str | Path) -> Iterator[Path]:
     if str(source) not in shipped_manifests():
         raise UnknownNameError("manifest", str(source), shipped_manifests())
     with tempfile.TemporaryDirectory() as folder, resources.as_file(_FOLDER / f"{source}{ENDING}") as archive:
-        with tarfile.open(archive) as file:
-            file.extractall(folder, filter="data")
+        for name, content in unpack(archive).items():
+            (Path(folder) / name).write_bytes(content)
         yield Path(folder)
 
 
@@ -93,11 +101,40 @@ def pack(members: Mapping[str, bytes], out: str | Path) -> int:
     Args:
       members: the bytes of manifest and index, by their names in a release.
     """
-    # One stream, because both hold the same digests; without times, so that equal releases give equal archives.
+    known: dict[bytes, int] = {}
+    shortened = {name: _without_digests(content, known) for name, content in members.items()}
+    shortened[DIGESTS] = b"".join(bytes.fromhex(digest.decode()) for digest in known)
+    # One stream, because both have much in common; without times, so that equal releases give equal archives.
     with lzma.open(out, "wb", preset=9 | lzma.PRESET_EXTREME) as packed:
         with tarfile.open(fileobj=packed, mode="w") as archive:
-            for name, content in members.items():
+            for name, content in shortened.items():
                 member = tarfile.TarInfo(name)
                 member.size = len(content)
                 archive.addfile(member, io.BytesIO(content))
     return Path(out).stat().st_size
+
+
+def unpack(archive: str | Path) -> dict[str, bytes]:
+    """The bytes of manifest and index of an archive, by their names in a release."""
+    with tarfile.open(archive) as file:
+        members = {member.name: file.extractfile(member).read() for member in file}  # type: ignore[union-attr]
+    data = members.pop(DIGESTS).hex().encode()
+    digests = [data[place : place + 64] for place in range(0, len(data), 64)]
+    fresh = iter(digests)
+
+    def digest(found: re.Match[bytes]) -> bytes:
+        return digests[int.from_bytes(found[1], "big")] if found[1] else next(fresh)
+
+    return {name: _PLACES.sub(digest, content) for name, content in members.items()}
+
+
+def _without_digests(content: bytes, known: dict[bytes, int]) -> bytes:
+    """JSON with a byte in place of each new digest, and a number in place of one that is known; see `DIGESTS`."""
+
+    def place(found: re.Match[bytes]) -> bytes:
+        if found[0] in known:
+            return _KNOWN + known[found[0]].to_bytes(3, "big")
+        known[found[0]] = len(known)
+        return _NEW
+
+    return _DIGEST.sub(place, content)

@@ -46,7 +46,7 @@ class LevelStatistics:
       subset: name of the subset whose first `EPISODES` episodes they are of.
       speed: mean horizontal speed of the root, m/s; None if the task has no root that moves.
       height: mean height of body or head in meters; None if the state has none.
-      success: share of episodes that reached their goal; None for tasks without one.
+      success: share of all episodes of the subset that reached their goal; None for tasks without one.
     """
 
     task: str
@@ -119,7 +119,7 @@ def level_statistics(release: Release) -> list[LevelStatistics]:
         height = None
         if field is not None:
             height = float(np.concatenate([rows[:, field] for rows in _episodes(subset, "state")]).mean())
-        success = float(subset.read("terminated")[:EPISODES].mean()) if task.goal_geoms else None
+        success = float(subset.read("terminated").mean()) if task.goal_geoms else None
         count = len(subset.episodes[:EPISODES])
         out.append(LevelStatistics(name, level, subset.name, count, _speed(task, subset), height, success))
     return out

@@ -15,7 +15,7 @@ from dmcvb_gen.files import json_bytes
 from dmcvb_gen.generate.join import join
 from dmcvb_gen.generate.recipe import load_recipe, make_recipe
 from dmcvb_gen.generate.regenerate import Regeneration
-from dmcvb_gen.generate.shipped import manifest_source, pack
+from dmcvb_gen.generate.shipped import manifest_source, pack, unpack
 from tests.conftest import roll_out, small_recipe
 
 WALKER = {"tasks": "walker-walk", "levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 20}
@@ -63,7 +63,9 @@ def test_a_shipped_release_joined_alone_is_itself(name):
 def test_a_part_of_what_was_joined_is_made_again_with_its_bytes(made, tmp_path, family):
     manifest, index = join(recipe("whole", *PATTERNS), [made / name for name in PATTERNS])
     pack({MANIFEST: json_bytes(manifest), INDEX: json_bytes(index)}, tmp_path / "whole.tar.xz")
-    shutil.unpack_archive(tmp_path / "whole.tar.xz", tmp_path / "bare")
+    (tmp_path / "bare").mkdir()
+    for name, content in unpack(tmp_path / "whole.tar.xz").items():
+        (tmp_path / "bare" / name).write_bytes(content)
     assert trusted_index(tmp_path / "bare", load_manifest(tmp_path / "bare")[1]) is not None
     name = next(record.name for record in manifest.subsets if ("maze" in record.task) == (family == "maze"))
     outcome = Regeneration(tmp_path / "bare", [name], (0, 1)).remake(tmp_path / "out")

@@ -15,7 +15,7 @@ from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.regenerate import Regeneration
-from dmcvb_gen.generate.shipped import manifest_source, shipped_manifests, write_archive
+from dmcvb_gen.generate.shipped import manifest_source, shipped_manifests, unpack, write_archive
 
 
 def run(*arguments):
@@ -45,8 +45,11 @@ def test_a_random_shard_of_each_has_the_released_bytes(name, tmp_path):
 def test_the_archive_of_a_release_makes_its_shards_and_finds_others(small_release, tmp_path):
     archive = tmp_path / "small.tar.xz"
     assert write_archive(small_release, archive) == archive.stat().st_size
-    shutil.unpack_archive(archive, tmp_path / "bare")
-    assert {path.name for path in (tmp_path / "bare").iterdir()} == {MANIFEST, INDEX}
+    members = unpack(archive)
+    assert members == {name: (small_release / name).read_bytes() for name in (MANIFEST, INDEX)}
+    (tmp_path / "bare").mkdir()
+    for name, content in members.items():
+        (tmp_path / "bare" / name).write_bytes(content)
     record = load_manifest(small_release)[1].subsets[0]
     outcome = Regeneration(tmp_path / "bare", [record.name], (0, 1)).remake(tmp_path / "part")
     assert [shard.equal for shard in outcome.shards] == [True]
