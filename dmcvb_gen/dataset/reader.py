@@ -196,8 +196,8 @@ class Subset:
     @property
     def _without_pictures(self) -> str:
         return (
-            f"{self.name} has no pictures for (all of) its episodes; paint them: `dmcvb-gen paint "
-            f"{public(self.root)}`, or open the release with paint=True"
+            f"{self.name} has episodes without images; add them: `dmcvb-gen paint {public(self.root)}` (in Python, "
+            "dmcvb_gen.open(..., paint=True) renders them as they are read)"
         )
 
     def _check_shape(self, array: zarr.Array, name: str) -> None:
