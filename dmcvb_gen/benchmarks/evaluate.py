@@ -24,7 +24,7 @@ from dmcvb_gen.generate.recipe import RendererChoice
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import SPLITS, GoalMode, SubsetSpec, parse_setting
+from dmcvb_gen.spec import LEVELS, SPLITS, GoalMode, SubsetSpec, parse_setting
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -148,8 +148,9 @@ class EvaluationScene:
         task, slash, setting = where.rpartition("/")
         if not slash or not setting:
             raise DmcvbError(f"{where!r} names no evaluation; give TASK/SETTING, e.g. walker-walk/dynamic")
-        if len(parts := where.split("/")) == 3:  # a subset's name
-            raise DmcvbError(f"{where!r} names a subset; an evaluation has no level: give {parts[0]}/{parts[2]}")
+        head, _, level = task.rpartition("/")
+        if level in LEVELS:
+            raise DmcvbError(f"{where!r} names a subset; an evaluation has no level: give {head}/{setting}")
         spec = SubsetSpec.parse(task, "random", setting)
         if options.get("backgrounds", cls.backgrounds) != cls.backgrounds and spec.distractor.kind == "none":
             raise DmcvbError(f"{where} shows no videos, so backgrounds have no effect: leave them out")

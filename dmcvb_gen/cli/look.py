@@ -17,7 +17,7 @@ from dmcvb_gen.cli.common import (
     print_table,
     remote_option,
 )
-from dmcvb_gen.storage.remote import public
+from dmcvb_gen.storage.remote import is_url, public
 from dmcvb_gen.text import pluralize
 
 
@@ -68,7 +68,8 @@ def info(path, options, as_json):
     if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
         click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
-        click.echo(f"No images are stored; add them: dmcvb-gen paint {public(path)}")
+        paint = f"fetch {public(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {path}"
+        click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
     if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
         click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {public(path)}")
     if facts["digest"]:

@@ -13,6 +13,7 @@ from dmcvb_gen import commands
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, print_table, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.dataset.manifest import MANIFEST
+from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import pluralize
 
@@ -53,10 +54,10 @@ def _verified(path, result):
         verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
         verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
-    yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; the rest is sound ({checked})"
+    yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; values were checked of {checked}"
     if result.digest:
         yield f"digest {result.digest}"
-    damaged = [found for found in result.findings if found.check == "files" and not found.message.startswith("is not")]
+    damaged = [found for found in result.findings if found.check == "files" and NOT_PART not in found.message]
     if any(found.subset != MANIFEST for found in damaged) and not is_url(str(path)):
         yield f"`dmcvb-gen regenerate {path}` makes damaged and missing shards again."
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+NOT_PART = "is not part of the release"
+"""What is said of a file that no digest speaks of."""
+
 
 @dataclass(frozen=True)
 class Issue:

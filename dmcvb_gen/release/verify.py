@@ -30,7 +30,7 @@ from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool
-from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.release.issue import NOT_PART, Issue
 from dmcvb_gen.storage.remote import storage_errors
 
 SHARDS = 8
@@ -129,8 +129,9 @@ def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue
             name = path.relative_to(root).as_posix()
             ours = name.startswith(PREVIEWS) or any(part.startswith(".") for part in name.split("/"))
             if not ours and name not in listed and path.is_file():
-                text = "is not part of the release; move it elsewhere"
-                yield Issue("files", subset_of(manifest, name), text)
+                place = subset_of(manifest, name)
+                told = NOT_PART if place == name else f"{name} {NOT_PART}"
+                yield Issue("files", place, f"{told}; move it elsewhere")
 
 
 def subset_of(manifest: Manifest, path: str) -> str:
