@@ -477,7 +477,7 @@ def test_what_was_painted_stays_when_more_is_fetched(made, published, tmp_path):
     assert subset.unpainted.tolist() == [False, False, True]
     table = dmcvb_gen.open(str(tmp_path / "r"))[subset.name]
     assert table.xarray([0, 1]).sizes["episode"] == 2
-    with pytest.raises(StoreError, match="no pictures"):
+    with pytest.raises(StoreError, match="without images"):
         table.xarray()
     with pytest.raises(StoreError, match="paints nothing"):
         dmcvb_gen.open(str(tmp_path / "r"), paint=True)[subset.name].xarray()
