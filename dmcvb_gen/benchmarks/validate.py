@@ -175,7 +175,7 @@ def validate(
     if not chosen.subsets:
         raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
     cells, missing = _plan(chosen, benchmarks, agents, release.subsets.keys() - chosen.subsets.keys())
-    if patterns:  # nobody misses what was not asked for
+    if patterns:  # a subset that was not asked for is not missing
         asked = [replace(one, subsets=tuple(n for n in one.subsets if matches(n, patterns))) for one in missing]
         missing = [one for one in asked if one.subsets or one.left_out]
     check_writable(setup.out)

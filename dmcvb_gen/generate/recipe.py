@@ -407,18 +407,20 @@ def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
 CURES = {
     "missing": "is missing",
     "tuple_type": "give a list; each entry begins with '- '",
-    "model_type": "give `backend: native` on a line of its own below it",
     "string_type": 'give text; quote what looks like a number, e.g. "1.0.0"',
 }
 """Kind of a pydantic error -> what to write instead."""
 
 
 def _cure(error: Mapping[str, Any]) -> str:
-    """What is wrong with a field of a recipe, and what to write instead."""
+    """The cure for a wrong field of a recipe, in words."""
     place, kind = error["loc"], error["type"]
     if kind == "extra_forbidden":
         model = Recipe if len(place) == 1 else SubsetPattern if place[0] == "subsets" else RendererChoice
         return str(UnknownNameError("field", place[-1], model.model_fields))
     if kind == "string_pattern_mismatch":
         return 'give three numbers, e.g. "1.0.0"' if place == ("version",) else "give letters, digits, '.', '_' or '-'"
+    if kind == "model_type":
+        fields = "backend: native" if place[0] == "renderer" else "tasks, levels, settings and episodes"
+        return f"give fields on lines of their own: {fields}"
     return CURES.get(kind, error["msg"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 NOT_PART = "is not part of the release"
-"""What is said of a file that no digest speaks of."""
+"""Message about a file that the index does not list."""
 
 
 @dataclass(frozen=True)

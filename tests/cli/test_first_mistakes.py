@@ -42,9 +42,10 @@ WRONG_RECIPES = {
     "subsets:\n  tasks: walker-walk": "subsets: give a list",
     "subsets:\n- {task: walker-walk, levels: random, settings: none, episodes: 1}": "unknown field 'task'.*'tasks'",
     "subsets:\n- {levels: random, settings: none, episodes: 1}": "subsets.0.tasks: is missing",
+    "subsets: [walker-walk]": "subsets.0: give fields on lines of their own: tasks, levels",
     "version: 1.0": 'version: give text; quote what looks like a number, e.g. "1.0.0"',
     "version: one": 'version: give three numbers, e.g. "1.0.0"',
-    "renderer: native": "renderer: give `backend: native`",
+    "renderer: native": "renderer: give fields on lines of their own: backend: native",
     "renderer: {backend: native, samples: 3}": "samples: Input should be 1, 2, 4 or 8",
     "renderer: {backend: native, sample: 2}": "unknown field 'sample'. Did you mean 'samples'",
 }
