@@ -9,6 +9,7 @@ from torch.utils.data import DataLoader, RandomSampler
 import dmcvb_gen
 
 STEPS = 100
+torch.manual_seed(0)
 subset = dmcvb_gen.open(sys.argv[1])[sys.argv[2]]
 source = subset.source(stack=3, pictures="agents")  # len(source), source[i]: numpy alone
 first = source[0]
@@ -22,7 +23,7 @@ encoder = nn.Sequential(
 )
 policy = nn.Sequential(encoder, nn.LazyLinear(256), nn.ReLU(), nn.Linear(256, len(first["action"])), nn.Tanh())
 policy(torch.zeros(1, channels, size, size))  # fixes the size of the lazy layer
-optimizer = torch.optim.Adam(policy.parameters(), lr=3e-4)
+optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)
 drawn = RandomSampler(source, replacement=True, num_samples=64 * STEPS)
 losses = []
 for batch in DataLoader(source, batch_size=64, sampler=drawn):

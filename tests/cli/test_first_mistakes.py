@@ -242,7 +242,7 @@ def test_a_function_of_ones_own_is_named_beside_its_returns(tmp_path, monkeypatc
 def test_a_selection_that_picks_nothing_says_why_wherever_one_looks(tmp_path):
     settings = [f"--set={pair}" for pair in ("warmup_steps=100", "compile=false", "batch_size=16")]
     folder = tmp_path / "run"
-    run("train-behaviour", "cheetah-run", "--steps", 160, "--evaluate-every", 80, *settings, "--out", folder)
+    run("train-behaviour", "cheetah-run", "--steps", 120, "--evaluate-every", 120, *settings, "--out", folder)
     found = json.loads(run("select-checkpoints", folder, "--json", "--episodes", 2, code=1), parse_constant=pytest.fail)
     assert found["convergence"]["error"] is None
     said = run("select-checkpoints", folder, "--episodes", 2, code=1)
