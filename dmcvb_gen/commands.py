@@ -251,7 +251,7 @@ def regenerate(
 
     Args:
       release (RELEASE): Folder of the release.
-      manifest (NAME|FILE): A shipped manifest or a manifest's file, instead of a release.
+      manifest (NAME|FILE): A shipped manifest, a manifest's file or the files.tar.xz of a card, instead of a release.
       only (PATTERN): Use only these subsets.
       episodes (RANGE): Use only the shards with episodes A to B - 1.
       check: Compare digests and change nothing.

@@ -17,12 +17,13 @@ HEAD = """# Data set cards
 
 Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
 description, a contact sheet, the report's tables where it was validated, and its manifest with the digest of every
-subset; any part of a release is made from its manifest alone, and compared with the digests. A manifest that is in
-the package too (`dmcvb-gen list` shows which) has a digest for every file and is found by its name:
+subset; any part of a release is made from its manifest alone, and compared with the digests. `files.tar.xz` has a
+digest for every file. A manifest that is in the package too (`dmcvb-gen list` shows which) has one for every shard and
+is found by its name:
 
 ```text
 dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --episodes 0:3 --out data/part
-dmcvb-gen regenerate --manifest dataset_cards/NAME/manifest.json --only 'SUBSET' --out FOLDER
+dmcvb-gen regenerate --manifest dataset_cards/NAME/files.tar.xz --only 'SUBSET' --out FOLDER
 ```
 
 | release | version | subsets | episodes | tasks | root digest |

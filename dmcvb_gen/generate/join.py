@@ -26,7 +26,7 @@ def join(recipe: Recipe, parts: Sequence[str | Path]) -> tuple[Manifest, Index]:
     be made on different days and machines, and the root digest is that of one rollout of the whole recipe.
 
     Args:
-      parts: folders of complete releases, or names of shipped manifests.
+      parts: folders of complete releases, or archives of their manifests and indexes.
 
     Raises:
       StoreError: a part is not complete, or was not made as the recipe says; a subset of the recipe is in no part.

@@ -50,6 +50,7 @@ from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.inputs import release_inputs
 from dmcvb_gen.generate.jobs import make_jobs
 from dmcvb_gen.generate.plan import copy_inputs, create_groups
+from dmcvb_gen.generate.shipped import read_shard_digests, shard_digest
 from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.remote import is_url, local_path, storage_errors
@@ -379,11 +380,15 @@ def _outcome(root, folder, record, commit, was, equal, repaired=False) -> ShardO
 
 
 class _Digests:
-    """The digests that a release promises: by its index or, if that cannot be trusted, by the commit records."""
+    """The digests that a release promises: by its index or, if that cannot be trusted, by the commit records.
+
+    A manifest of the package has a list of shards' digests instead of both.
+    """
 
     def __init__(self, root: Path, manifest: Manifest):
         self.root, self.manifest, index = root, manifest, trusted_index(root, manifest)
         self._digests = {file.path: file.sha256 for file in index.files} if index else {}
+        self._shards = read_shard_digests(root, manifest)
 
     def promised(self, record: SubsetRecord, shard: int) -> CommitRecord | None:
         """A shard's record; None if it is missing, damaged, not what it was, or of pictures that cannot be read."""
@@ -398,6 +403,8 @@ class _Digests:
         promised = self.promised(record, commit.shard)
         if promised is not None:
             return _agree(promised, commit)
+        if shards := self._shards.get(record.name):
+            return shard_digest(commit.files) == shards[commit.shard]
         made = [file for file in (*commit.files, *commit.pictures) if file.path in self._digests]
         return all(file.sha256 == self._digests[file.path] for file in made) if made else None
 

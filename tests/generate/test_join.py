@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -15,9 +16,10 @@ from dmcvb_gen.files import json_bytes
 from dmcvb_gen.generate.join import join
 from dmcvb_gen.generate.recipe import load_recipe, make_recipe
 from dmcvb_gen.generate.regenerate import Regeneration
-from dmcvb_gen.generate.shipped import manifest_source, pack, unpack
+from dmcvb_gen.generate.shipped import ENDING, manifest_source, pack, unpack
 from tests.conftest import roll_out, small_recipe
 
+CARDS = Path(__file__).parents[2] / "dataset_cards"
 WALKER = {"tasks": "walker-walk", "levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 20}
 MAZE = {"tasks": "ant-maze-empty7x7", "levels": "random", "episodes": 2, "episodes_per_shard": 1, "max_steps": 20}
 PATTERNS = {
@@ -50,13 +52,16 @@ def test_joined_parts_have_the_root_digest_of_the_whole(made):
 
 @pytest.mark.parametrize("name", ["dmcvb-mini", "dmcvb-v1-locomotion", "quickstart"])
 def test_a_shipped_release_joined_alone_is_itself(name):
-    with manifest_source(name) as folder:
+    archive = CARDS / name / f"files{ENDING}"
+    with manifest_source(archive) as folder:
         expected = load_manifest(folder)[1]
     if expected.additions:
         with pytest.raises(StoreError, match="grew"):
-            join(load_recipe(name), [name])
+            join(load_recipe(name), [archive])
     else:
-        assert join(load_recipe(name), [name])[0] == expected
+        assert join(load_recipe(name), [archive])[0] == expected
+    with pytest.raises(StoreError, match="no digests of the files"):
+        join(load_recipe(name), [name])
 
 
 @pytest.mark.parametrize("family", PATTERNS)
