@@ -134,7 +134,7 @@ def test_a_wrong_or_damaged_archive_is_refused_in_one_line(tmp_path):
         archive.addfile(link)
     for name in (*wrong, "strange", "link"):
         done = run("--manifest", tmp_path / f"{name}{ENDING}", "--out", tmp_path / "out")
-        assert done.exit_code == 1 and "no archive of a manifest" in done.output, (name, done.output)
+        assert done.exit_code == 2 and "no archive of a manifest" in done.output, (name, done.output)
         assert len(done.output.splitlines()) == 1 and not (tmp_path / "out").exists()
 
 
