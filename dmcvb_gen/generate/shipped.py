@@ -172,7 +172,7 @@ def unpack(archive: str | Path) -> dict[str, bytes]:
       StoreError: it is no such archive, or damaged.
     """
     try:
-        with tarfile.open(archive) as file:
+        with tarfile.open(archive, "r:xz") as file:
             members = {member.name: _content(file, member) for member in file}
         data = members.pop(DIGESTS).hex().encode()
         digests = [data[place : place + 64] for place in range(0, len(data), 64)]
