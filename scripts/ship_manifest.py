@@ -4,6 +4,7 @@ Their digests of files go into dataset_cards/NAME/files.tar.xz; the package has 
 
 python scripts/ship_manifest.py releases/quickstart
 python scripts/ship_manifest.py --join dmcvb-v1 dataset_cards/dmcvb-v1-*/files.tar.xz
+python scripts/ship_manifest.py --join dmcvb-v1 --folder releases/dmcvb-v1 releases/dmcvb-v1-*
 """
 
 import argparse
@@ -12,7 +13,7 @@ from pathlib import Path
 from dmcvb_gen.dataset.index import INDEX, Index
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 from dmcvb_gen.files import json_bytes
-from dmcvb_gen.generate.join import join
+from dmcvb_gen.generate.join import join, join_folders
 from dmcvb_gen.generate.recipe import load_recipe
 from dmcvb_gen.generate.shipped import ENDING, manifest_source, pack, read_complete, with_shard_digests
 
@@ -34,8 +35,14 @@ def ship(manifest: Manifest, index: Index) -> None:
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("releases", nargs="+", help="folders of finished releases, or archives of manifests and indexes")
 parser.add_argument("--join", metavar="RECIPE", help="make one manifest, of the release that this recipe gives")
+parser.add_argument("--folder", help="with --join: write the joined release there, of links to the files of its parts")
 arguments = parser.parse_args()
-if arguments.join:
+if arguments.folder and not arguments.join:
+    parser.error("--folder needs --join RECIPE")
+if arguments.folder:
+    join_folders(load_recipe(arguments.join), arguments.releases, arguments.folder)
+    ship(*read_complete(arguments.folder))
+elif arguments.join:
     ship(*join(load_recipe(arguments.join), arguments.releases))
 else:
     for release in arguments.releases:

@@ -7,13 +7,14 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from dmcvb_gen.dataset.index import Index, data_files, is_card, root_digest
-from dmcvb_gen.dataset.manifest import FileRecord, Manifest, SubsetRecord
+from dmcvb_gen.dataset.index import INDEX, Index, data_files, is_card, root_digest
+from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord, Manifest, SubsetRecord
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import json_bytes, sha256_bytes
+from dmcvb_gen.files import json_bytes, link_or_copy, sha256_bytes, write_bytes
 from dmcvb_gen.generate.plan import create_groups, describe
 from dmcvb_gen.generate.recipe import Recipe, expand
 from dmcvb_gen.generate.shipped import manifest_source, read_complete
+from dmcvb_gen.storage.remote import storage_errors
 
 DESCRIPTIONS = {"name", "version", "description", "license", "authors"}
 """Facts of a recipe that decide no bytes of an array."""
@@ -58,6 +59,30 @@ def join(recipe: Recipe, parts: Sequence[str | Path]) -> tuple[Manifest, Index]:
     files = tuple(listed[path] for path in sorted(listed))
     whole = whole.model_copy(update={"digest": root_digest(files, whole)})
     return whole, Index(manifest_sha256=sha256_bytes(json_bytes(whole)), files=files).with_checksum()
+
+
+def join_folders(recipe: Recipe, parts: Sequence[str | Path], out: str | Path) -> Manifest:
+    """Write the release of a recipe from folders of its parts. Files become hard links, or copies on another disk.
+
+    Raises:
+      StoreError: see `join`; `out` holds something already, or a part lacks a file.
+    """
+    manifest, index = join(recipe, parts)
+    out = Path(out)
+    if out.exists() and any(out.iterdir()):
+        raise StoreError(f"{out} is not empty; give another folder")
+    with storage_errors(out, "write to"):
+        create_groups(out, manifest, manifest.subsets)
+        for file in index.files:
+            if (out / file.path).exists():
+                continue
+            source = next((path for part in parts if (path := Path(part) / file.path).is_file()), None)
+            if source is None:
+                raise StoreError(f"{file.path} is in none of the parts; mend them first: dmcvb-gen regenerate PART")
+            link_or_copy(source, out / file.path)
+        write_bytes(out / INDEX, json_bytes(index))
+        write_bytes(out / MANIFEST, json_bytes(manifest))  # last: a folder without it is no release
+    return manifest
 
 
 def _check_part(manifest: Manifest, recipe: Recipe, part: str) -> None:

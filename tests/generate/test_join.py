@@ -7,16 +7,19 @@ from pathlib import Path
 
 import pytest
 
+import dmcvb_gen
 from dmcvb_gen.dataset.index import INDEX, read_index, root_digest, trusted_index
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.distractors.clips import make_clips
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import json_bytes
-from dmcvb_gen.generate.join import join
+from dmcvb_gen.generate.join import join, join_folders
 from dmcvb_gen.generate.recipe import load_recipe, make_recipe
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.shipped import ENDING, manifest_source, pack, unpack
+from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.diff import diff
 from tests.conftest import roll_out, small_recipe
 
 CARDS = Path(__file__).parents[2] / "dataset_cards"
@@ -62,6 +65,24 @@ def test_a_shipped_release_joined_alone_is_itself(name):
         assert join(load_recipe(name), [archive])[0] == expected
     with pytest.raises(StoreError, match="no digests of the files"):
         join(load_recipe(name), [name])
+
+
+def test_the_folder_of_joined_parts_is_the_release_of_one_rollout(made, tmp_path):
+    whole, parts, out = recipe("whole", *PATTERNS), [made / name for name in PATTERNS], tmp_path / "out"
+    manifest = join_folders(whole, parts, out)
+    assert manifest.digest == load_manifest(made / "whole")[1].digest
+    checked = dmcvb_gen.verify(out, progress=False)
+    assert checked.sound and checked.digest == manifest.digest
+    assert not diff(made / "whole", out)
+    action = "walker-walk/random/none.zarr/action/c/0/0/0"
+    assert (out / action).samefile(made / "walker" / action), "a release of links needs no room"
+    assert write_card(out) and not check_card(out)
+    with pytest.raises(StoreError, match="is not empty"):
+        join_folders(whole, parts, out)
+    shutil.copytree(made / "walker", tmp_path / "walker")
+    (tmp_path / "walker" / action).unlink()
+    with pytest.raises(StoreError, match="action/c/0/0/0 is in none of the parts"):
+        join_folders(whole, [tmp_path / "walker", made / "maze"], tmp_path / "lacking")
 
 
 @pytest.mark.parametrize("family", PATTERNS)
