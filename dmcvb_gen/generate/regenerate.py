@@ -388,7 +388,7 @@ class _Digests:
     def __init__(self, root: Path, manifest: Manifest):
         self.root, self.manifest, index = root, manifest, trusted_index(root, manifest)
         self._digests = {file.path: file.sha256 for file in index.files} if index else {}
-        self._shards = read_shard_digests(root, manifest)
+        self._shards = read_shard_digests(root)
 
     def promised(self, record: SubsetRecord, shard: int) -> CommitRecord | None:
         """A shard's record; None if it is missing, damaged, not what it was, or of pictures that cannot be read."""

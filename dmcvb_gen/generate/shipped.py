@@ -63,7 +63,7 @@ def shard_digest(files: Iterable[FileRecord]) -> str:
     return sha256_bytes("".join(f"{digest}  {path}\n" for path, digest in lines).encode())
 
 
-def read_shard_digests(root: Path, manifest: Manifest) -> Mapping[str, tuple[str, ...]]:
+def read_shard_digests(root: Path) -> Mapping[str, tuple[str, ...]]:
     """Subset -> digests of its shards, from the shards.json beside a manifest; empty if there is none for it."""
     try:
         found = ShardDigests.model_validate_json((root / SHARDS).read_bytes())
@@ -86,21 +86,22 @@ def manifest_source(source: str | Path) -> Iterator[Path]:
       UnknownNameError: a plain name that is neither a file nor a shipped manifest's.
       StoreError: there is no such file.
     """
-    path = Path(source)
-    if path.is_file() and not path.name.endswith(ENDING):
+    path, name = Path(source), str(source)
+    if path.is_file() and not name.endswith(ENDING):
         yield path
         return
     if path.is_dir():
         raise StoreError(f"{path} is a folder; give it without --manifest, or the file {path / MANIFEST}")
-    if not path.is_file() and (path.suffix or path.name != str(source)):
+    if not path.is_file() and (path.suffix or path.name != name):
         raise StoreError(f"{path} is not there; give a manifest's file or a name: {', '.join(shipped_manifests())}")
-    if not path.is_file() and str(source) not in shipped_manifests():
-        raise UnknownNameError("manifest", str(source), shipped_manifests())
+    if not path.is_file() and name not in shipped_manifests():
+        raise UnknownNameError("manifest", name, shipped_manifests())
     with contextlib.ExitStack() as stack:
+        if not path.is_file():
+            path = stack.enter_context(resources.as_file(_FOLDER / f"{name}{ENDING}"))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        shipped = resources.as_file(_FOLDER / f"{source}{ENDING}")
-        for name, content in unpack(path if path.is_file() else stack.enter_context(shipped)).items():
-            (folder / name).write_bytes(content)
+        for member, content in unpack(path).items():
+            (folder / member).write_bytes(content)
         yield folder
 
 
