@@ -238,6 +238,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
 def _policy_record(path: Path, task: Task) -> PolicyRecord:
     policy = load_policy(path, task)
     header = policy.header.without_local_paths().model_dump(mode="json")
+    header["training"].pop("curve", None)  # long, and in the policy's file
     if policy.header.algorithm == OWN_CODE:
         return PolicyRecord(name=str(path), digest=policy.digest, header=header)
     copy = f"{POLICIES}{policy.digest[:16]}.safetensors"

@@ -79,7 +79,8 @@ class PolicyHeader(_Model):
       way: widths of the hidden layers of the network that says where to head in a maze (`policies.open_maze`); None:
         the policy heads for its goal.
       clip_observation: normalized observations are clipped to +- this.
-      training: settings, seed, wall time, versions.
+      training: settings, seed, wall time, versions; of a picked policy also `selection`, what it was picked for, and
+        `curve`, the steps and returns of its run's evaluations.
       command: command that trains it again.
     """
 

@@ -320,11 +320,21 @@ def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies:
     for level, picks in selection.picks.items():
         for pick in picks:
             policy = policies[pick.path]
-            facts = {"level": level, "evaluation": pick.evaluation}
-            header: PolicyHeader = policy.header.without_local_paths().model_copy(update=facts)
+            header = selected_header(policy.header, level, pick, selection.convergence, curve)
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
     write_json_atomically(folder / "selection.json", selection_json(selection))
     plot_selection(curve, selection, folder / "curve.png")
+
+
+def selected_header(
+    header: PolicyHeader, level: str, pick: Pick, convergence: Convergence, curve: Sequence[Point]
+) -> PolicyHeader:
+    """The header of a picked policy: also what it was picked for, and the whole learning curve of its run."""
+    header = header.without_local_paths()
+    why = {"selection": {"target": pick.target, "convergence": round(convergence.value, 2)}}
+    shown = {"curve": {"steps": [step for step, _, _ in curve], "returns": [round(value, 2) for _, value, _ in curve]}}
+    facts = {"level": level, "evaluation": pick.evaluation, "training": header.training | why | shown}
+    return header.model_copy(update=facts)
 
 
 def selection_json(selection: Selection) -> dict:
@@ -352,16 +362,23 @@ def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> 
         axes.text(
             curve[0][0], selection.convergence.value, f" convergence {selection.convergence.value:.0f}", va="bottom"
         )
-        for level, picks in selection.picks.items():
-            axes.errorbar(
-                [pick.step for pick in picks],
-                [pick.evaluation.mean for pick in picks],
-                [pick.evaluation.std for pick in picks],
-                fmt="o",
-                color=colors[level],
-                capsize=2,
-                label=f"{level} (fresh episodes)",
-            )
+        axes.set_xscale("function", functions=(np.sqrt, np.square))  # medium is within the first tenth
+        axes.set_xlim(0, curve[-1][0])
+        # Medium is often the last of the mixed: its ring goes around that one.
+        for level, size, filled in (("mixed", 5, True), ("medium", 9, False), ("expert", 7, True)):
+            if picks := selection.picks.get(level):
+                axes.errorbar(
+                    [pick.step for pick in picks],
+                    [pick.evaluation.mean for pick in picks],
+                    [pick.evaluation.std for pick in picks],
+                    fmt="o",
+                    color=colors[level],
+                    markersize=size,
+                    markerfacecolor=colors[level] if filled else "none",
+                    capsize=2,
+                    zorder=3,
+                    label=f"{level} (fresh episodes)",
+                )
 
 
 def plot_curve(folder: str | Path, expert: float | None = None) -> Path:
@@ -395,6 +412,7 @@ def _curve_figure(curve: Sequence[Point], task: str, path: Path) -> Iterator[Axe
     axes.plot(steps, smooth(returns), color="tab:blue", label="smoothed")
     yield axes
     axes.set(xlabel="agent steps", ylabel="episode return", title=task_folder(task) if task else "")
+    axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

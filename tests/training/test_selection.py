@@ -250,6 +250,15 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             header = read_header(path)
             assert header.level == level and header.evaluation.episodes == 3
             assert header.agent_step == pick["step"] and header.evaluation.mean == pick["evaluation"]["mean"]
+            assert header.training["selection"] == {
+                "target": pick["target"],
+                "convergence": round(found["convergence"]["value"], 2),
+            }
+            points = read_curve(run_folder)
+            assert header.training["curve"] == {
+                "steps": [step for step, _, _ in points],
+                "returns": [round(value, 2) for _, value, _ in points],
+            }
 
 
 def test_a_short_run_may_be_told_where_a_longer_one_ends(run_folder):
