@@ -9,6 +9,7 @@ of 2. Core-minutes are processor time of one thread, evaluations and compilation
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import datetime
 import shlex
 import subprocess
@@ -29,6 +30,8 @@ from dmcvb_gen.training.sac import precision_setting
 from dmcvb_gen.training.training import open_run
 
 SHARE, EPISODES, SEED = 0.95, 100, 20_000
+CLOSE = 2000
+"""Agent steps between evaluations near the goal; training takes no notice of them."""
 
 
 class Reached(Exception):
@@ -59,7 +62,8 @@ def main() -> None:
     goal, task = SHARE * expert["mean"], get_task(given.task)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(given.out or scratch) / "run"
-        run = open_run(folder, run_config(given.task, "sac", settings, steps=given.steps, seed=given.seed), False)
+        config = run_config(given.task, "sac", settings, steps=given.steps, seed=given.seed)
+        run = open_run(folder, dataclasses.replace(config, evaluate_sparse=CLOSE), False)
         began = time.process_time()
 
         def report(progress) -> None:
