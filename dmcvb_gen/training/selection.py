@@ -364,6 +364,7 @@ def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> 
         )
         axes.set_xscale("function", functions=(np.sqrt, np.square))  # medium is within the first tenth
         axes.set_xlim(0, curve[-1][0])
+        axes.locator_params(axis="x", nbins=5)
         # Medium is often the last of the mixed: its ring goes around that one.
         for level, size, filled in (("mixed", 5, True), ("medium", 9, False), ("expert", 7, True)):
             if picks := selection.picks.get(level):
