@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -264,7 +265,7 @@ def card_text(
     rules: dict[str, Any] = dict(
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined
     )
-    return (
+    text = (
         Environment(loader=loader, **rules)
         .get_template("card.md.jinja")
         .render(
@@ -293,6 +294,7 @@ def card_text(
             citation=CITATION,
         )
     )
+    return re.sub(r"\n{3,}", "\n\n", text)
 
 
 def _arrays(release: Release) -> dict[tuple, list[str]]:

@@ -44,7 +44,7 @@ def test_the_header_is_what_hugging_face_reads(carded):
     fields = yaml.safe_load(header)
     assert fields["license"] == "cc-by-4.0" and fields["size_categories"] == ["1K<n<10K"]
     assert "reinforcement-learning" in fields["task_categories"] and fields["pretty_name"] == "small 1.0.0"
-    assert text.startswith("\n# small 1.0.0")
+    assert text.startswith("\n# small 1.0.0") and "\n\n\n" not in text
 
 
 def test_the_numbers_are_the_datas_and_the_papers(carded):
