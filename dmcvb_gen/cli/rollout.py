@@ -77,7 +77,7 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     _tell_what_is_there(plan, shared=dry_run or init or bool(options["part"]))
     if dry_run:
         return _show_plan(plan, workers, as_json)
-    plan = prepare_rollout(plan, options, init)
+    plan = prepare_rollout(plan, options, init, lambda line: click.echo(line, err=True))
     if init:
         return _tell_begun(plan, as_json)
     _run(plan, workers, as_json, whole=not options["part"])

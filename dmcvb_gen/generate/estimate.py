@@ -13,7 +13,7 @@ import os
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -271,11 +271,27 @@ def _painting_key(record: SubsetRecord) -> tuple:
 
 
 def raw_bytes(plan: Plan) -> float:
-    """A cautious bound for the disk check: pictures at half their raw size."""
-    total = 0.0
+    """Bytes that a plan's arrays would take without compression, if no episode ended early."""
+    total = 0
     for job in plan.jobs:
         for record in job.subsets:
-            specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
-            pictures = sum(spec.picture for spec in specs)
-            total += len(job.episodes) * record.max_steps * pictures * record.size**2 * 3
-    return float(np.ceil(total * 0.5))
+            step = 0
+            for spec in subset_specs(EpisodeShape.of(get_task(record.task)), record):
+                entries = 3 * record.size**2 if spec.picture else math.prod(spec.shape)
+                step += entries * np.dtype(spec.dtype).itemsize * spec.steps
+            total += len(job.episodes) * (record.max_steps + 1) * step
+    return float(total)
+
+
+def room_needed(plan: Plan, free: float, workers: int = 1, notify: Callable[[str], None] = ignore) -> float:
+    """Bytes of disk that a plan's jobs will take at most; measured, as `estimate` does, if the raw arrays do not fit.
+
+    Args:
+      free: bytes of the disk that are free.
+      workers: processes that measure side by side.
+      notify: told that it measures, which takes seconds for each task.
+    """
+    if (raw := raw_bytes(plan)) <= free:
+        return raw
+    notify(f"{free / 1e9:.1f} GB are free and arrays take up to {raw / 1e9:.1f} GB; measuring how much they will take.")
+    return estimate(plan, workers).disk_bytes

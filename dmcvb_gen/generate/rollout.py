@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any
 
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.generate.engine import JobResult
-from dmcvb_gen.generate.estimate import raw_bytes
+from dmcvb_gen.generate.estimate import room_needed
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.plan import Plan, finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import Recipe
@@ -75,13 +76,18 @@ def rollout_plan(options: Options, request: Recipe | None, target: Target) -> Pl
     return make_plan(request, target, only, device, options["episode_range"], part, options["pixels"])
 
 
-def prepare_rollout(plan: Plan, options: Options, begin: bool = False) -> Plan:
+def prepare_rollout(plan: Plan, options: Options, begin: bool = False, notify: Callable[[str], None] = ignore) -> Plan:
     """Make a plan's release ready for its jobs; see `plan.prepare`.
 
     Args:
       begin: other machines make the shards, so this one needs no room for them.
+      notify: told what takes seconds.
     """
-    room = 0 if begin or plan.target.uploads else raw_bytes(plan)
+    room, folder = 0.0, plan.target.folder
+    if folder and not begin:
+        there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+        workers = options["workers"] if isinstance(options["workers"], int) else 1
+        room = room_needed(plan, shutil.disk_usage(there).free, workers, notify)
     return prepare(plan, room, options["other_versions"], begin or bool(options["part"]))
 
 

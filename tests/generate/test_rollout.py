@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,10 +24,11 @@ from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.generate import estimate as estimating
-from dmcvb_gen.generate.estimate import estimate, measurements
+from dmcvb_gen.generate.estimate import estimate, measurements, raw_bytes
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.rollout import prepare_rollout
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
@@ -179,6 +181,30 @@ def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, 
 def test_more_than_the_disk_holds_is_refused_before_any_work(tmp_path):
     with pytest.raises(StoreError, match="GB are needed"):
         prepare(make_plan(small_recipe(), tmp_path / "r"), expected_bytes=1e18)
+
+
+@pytest.mark.parametrize("family", ["walker", "mazes"])
+@pytest.mark.parametrize("pixels", [True, False])
+def test_a_disk_that_is_smaller_than_raw_arrays_is_measured_for(tmp_path, monkeypatch, family, pixels):
+    task, setting = {"walker": ("walker-walk", "dynamic"), "mazes": (TINY_MAZE, "visible")}[family]
+    subsets = [{"tasks": task, "levels": "random", "settings": setting, "episodes": 3, "max_steps": 60}]
+    plan = make_plan(small_recipe(subsets=subsets), tmp_path / "r", pixels=pixels)
+    needed, raw, told = estimate(plan).disk_bytes, raw_bytes(plan), []
+    assert 0 < needed < raw
+    options = {"workers": 1, "other_versions": False, "part": None}
+
+    def free(amount):
+        monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=amount))
+
+    free(needed * 0.5)
+    with pytest.raises(StoreError, match=r"^about .* GB are needed and .* GB are free"):
+        prepare_rollout(plan, options, notify=told.append)
+    free((needed + raw) / 2)
+    prepare_rollout(plan, options, notify=told.append)
+    assert len(told) == 2 and all("measuring" in line for line in told)
+    free(raw)
+    prepare_rollout(plan, options, notify=told.append)
+    assert len(told) == 2
 
 
 def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path):
