@@ -256,6 +256,12 @@ def _alive(process: int, started: str | None) -> bool:
     return started in (None, _start_of(process) or started)
 
 
+def free_bytes(folder: str | Path) -> int:
+    """Bytes that are free on the disk where a folder is, or would be."""
+    path = Path(folder).absolute()
+    return shutil.disk_usage(next(place for place in (path, *path.parents) if place.exists())).free
+
+
 def sha256_file(path: str | Path) -> str:
     """SHA-256 of a file's bytes, in hex."""
     with Path(path).open("rb") as file:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ from dmcvb_gen.dataset.shards import chosen_shards
 from dmcvb_gen.dataset.writer import create_subset, finish_release, finish_together, mark_created, start_release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
-from dmcvb_gen.files import copy_file, json_bytes, sha256_bytes, sha256_file, write_bytes
+from dmcvb_gen.files import copy_file, free_bytes, json_bytes, sha256_bytes, sha256_file, write_bytes
 from dmcvb_gen.generate.inputs import BUILTIN, Inputs
 from dmcvb_gen.generate.jobs import Job, left_to_do, make_jobs, part_of
 from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
@@ -319,16 +318,15 @@ def check_versions(manifest: Manifest) -> None:
 
 def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
     kept = there is not None and merged(there, plan.manifest, str(root)) is there
-    if there is not None and kept and (shared or _is_done(there, plan)):
-        manifest = there
-    else:
-        manifest = start_release(root, plan.manifest)
-    free = shutil.disk_usage(root).free
-    if expected_bytes > free:
+    if expected_bytes > (free := free_bytes(root)):
         raise StoreError(
             f"about {expected_bytes / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free "
             f"at {root}; make room, choose another --out or fewer --episodes"
         )
+    if there is not None and kept and (shared or _is_done(there, plan)):
+        manifest = there
+    else:
+        manifest = start_release(root, plan.manifest)
     wanted = {record.name for job in plan.jobs for record in job.subsets}
     records = [
         record

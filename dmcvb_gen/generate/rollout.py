@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.manifest import Manifest
+from dmcvb_gen.files import free_bytes
 from dmcvb_gen.generate.engine import JobResult
 from dmcvb_gen.generate.estimate import room_needed
 from dmcvb_gen.generate.executors import run_jobs
@@ -85,9 +85,8 @@ def prepare_rollout(plan: Plan, options: Options, begin: bool = False, notify: C
     """
     room, folder = 0.0, plan.target.folder
     if folder and not begin:
-        there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
         workers = options["workers"] if isinstance(options["workers"], int) else 1
-        room = room_needed(plan, shutil.disk_usage(there).free, workers, notify)
+        room = room_needed(plan, free_bytes(folder), workers, notify)
     return prepare(plan, room, options["other_versions"], begin or bool(options["part"]))
 
 

@@ -199,6 +199,7 @@ def test_a_disk_that_is_smaller_than_raw_arrays_is_measured_for(tmp_path, monkey
     free(needed * 0.5)
     with pytest.raises(StoreError, match=r"^about .* GB are needed and .* GB are free"):
         prepare_rollout(plan, options, notify=told.append)
+    assert not (tmp_path / "r").exists()
     free((needed + raw) / 2)
     prepare_rollout(plan, options, notify=told.append)
     assert len(told) == 2 and all("measuring" in line for line in told)
