@@ -19,11 +19,14 @@ from dmcvb_gen.policies.paper import paper_task
 from dmcvb_gen.registry import Registry
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, LEVELS, VISIBLE, is_maze, subset_name
+from dmcvb_gen.tasks import get_task
 
 FIXED_GOALS = 5
 """Fixed (start, goal) pairs a layout, as the paper made them."""
 DEFAULT_EPISODES = 100
 """Episodes that a command asks for if the release has none to go by."""
+DEFAULT_SIZE = 64
+"""Pixels a side if a rollout is not told another size."""
 
 
 @dataclass(frozen=True)
@@ -182,14 +185,24 @@ class SubsetFinder:
         settings = dict.fromkeys(setting for _, setting in have + lacking)
         counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
         count = max(counts, default=DEFAULT_EPISODES)
+        shape = self._shape(task)
         rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
         out = f"--out releases/{slug(benchmark)}"
         if not is_maze(task):
-            return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count} {out}"
+            return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count}{shape} {out}"
         goals = [setting for setting in settings if setting != FIXED]
-        lines = [f"{rollout} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}"] if goals else []
-        lines += [f"{rollout} --fixed-goals {FIXED_GOALS}"] if FIXED in settings else []
+        lines = [f"{rollout} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}{shape}"] if goals else []
+        lines += [f"{rollout} --fixed-goals {FIXED_GOALS}{shape}"] if FIXED in settings else []
         return "; ".join(f"{line} {out}-{number}" for number, line in enumerate(lines))
+
+    def _shape(self, task: str) -> str:
+        """Options that give new subsets the images' size and the time limit of what there is of a task."""
+        shapes = {(r.size, r.max_steps) for r in self._records.values() if r.task == task}
+        if len(shapes) != 1:
+            return ""
+        size, limit = shapes.pop()
+        options = f" --size {size}" if size != DEFAULT_SIZE else ""
+        return options + (f" --max-steps {limit}" if limit != get_task(task).max_steps else "")
 
 
 class Benchmark(abc.ABC):

@@ -31,7 +31,7 @@ from dmcvb_gen.parallel.ray_pool import share_of_node
 from dmcvb_gen.tasks import get_task
 
 
-def release_of(*names, episodes=100, committed=None, **facts):
+def release_of(*names, episodes=100, committed=None, shape=(), **facts):
     """A release of subsets without data, enough to plan with; its shards of ten are committed, or the first few."""
     subsets = {}
     for name in names:
@@ -40,7 +40,8 @@ def release_of(*names, episodes=100, committed=None, **facts):
         if task.startswith("ant-maze"):
             views = get_task(task).views
             own = own | dict(family="ant-maze", views=views, hidden_goal=setting != "visible")
-        own = own | dict(task=task, level=level, setting=setting, episodes=episodes, episodes_per_shard=10, size=64)
+        own = own | dict(task=task, level=level, setting=setting, episodes=episodes, episodes_per_shard=10)
+        own = dict(size=64, max_steps=get_task(task).max_steps) | dict(shape) | own
         record = SubsetRecord(name=name, **own)
         shards = range((committed or episodes) // 10)
         commits = {
@@ -99,6 +100,15 @@ def test_b2_without_mixed_says_how_to_make_it():
     assert {cell.policy_label for cell in cells} == {"expert", "20 expert"}
     assert missing.subsets == ("walker-walk/mixed/none",)
     assert missing.command.startswith("dmcvb-gen rollout walker-walk --level expert --level mixed --distractor none")
+
+
+@pytest.mark.parametrize("task, setting", [("walker-walk", "none"), ("ant-maze-empty7x7", "visible")])
+def test_what_is_missing_gets_the_shape_of_what_is_there(task, setting):
+    names = [f"{task}/expert/{setting}"]
+    _, [missing] = plan_benchmark("b1", release_of(*names))
+    assert "--size" not in missing.command and "--max-steps" not in missing.command
+    _, [missing] = plan_benchmark("b1", release_of(*names, shape=dict(size=32, max_steps=60)))
+    assert "--episodes 100 --size 32 --max-steps 60 --out" in missing.command
 
 
 def test_subsets_that_the_user_left_out_are_not_said_to_be_missing():
