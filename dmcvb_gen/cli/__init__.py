@@ -84,9 +84,18 @@ class LazyGroup(click.Group):
     def resolve_command(self, ctx, args):
         if args and args[0] not in COMMANDS | ALIASES and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
-            hint = f" Did you mean {near[0]!r}?" if near else " `dmcvb-gen --help` lists the commands."
-            ctx.fail(f"unknown command {args[0]!r}.{hint}")
+            hint = f"Did you mean {near[0]!r}?" if near else "`dmcvb-gen --help` lists the commands."
+            ctx.fail(f"unknown command {args[0]!r}. {hint}")
         return super().resolve_command(ctx, args)
+
+    def make_context(self, *args, **kwargs):
+        try:
+            return super().make_context(*args, **kwargs)
+        except click.exceptions.NoArgsIsHelpError:
+            raise
+        except click.UsageError as error:
+            click.echo(f"error: {_wrong_usage(error)}", err=True)
+            raise click.exceptions.Exit(error.exit_code) from None
 
     def format_commands(self, ctx, formatter):
         for heading, commands in GROUPS.items():
@@ -104,6 +113,8 @@ class LazyGroup(click.Group):
             if _asked_to_stop.is_set():  # Ctrl-C within foreign code comes out as that code's own kind of error
                 _end_interrupted(ctx)
             what = str(error) if isinstance(error, DmcvbError) else None
+            if isinstance(error, click.UsageError):
+                what = _wrong_usage(error)
             if isinstance(error, ModuleNotFoundError):
                 what = install_hint(error.name or "")
             if what is None:
@@ -112,7 +123,7 @@ class LazyGroup(click.Group):
             ctx.exit(2)
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group("dmcvb-gen", cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="dmcvb-gen")
 def main():
     """Make, check, share and use DMC-VB style data sets.
@@ -139,6 +150,19 @@ def _name_glfw_library() -> None:
         library = Path(found.origin).with_name(variant) / "libglfw.so"
         if library.exists():
             os.environ.setdefault("PYGLFW_LIBRARY", str(library))
+
+
+def _wrong_usage(error: click.UsageError) -> str:
+    """Say in one line what is wrong with a command line. Messages of click get the help to read; ours name the cure."""
+    command = error.ctx.command_path if error.ctx else "dmcvb-gen"
+    if isinstance(error, click.NoSuchOption):
+        near = difflib.get_close_matches(error.option_name, error.possibilities or [], n=1)
+        hint = f"Did you mean {near[0]!r}?" if near else f"`{command} --help` lists the options."
+        return f"unknown option {error.option_name!r}. {hint}"
+    ours = type(error) is click.UsageError and not error.message.startswith("Got unexpected")
+    message = error.format_message().rstrip(".")
+    message = message[:1].lower() + message[1:]
+    return error.message if ours else f"{message}; see `{command} --help`"
 
 
 def _end_interrupted(context: click.Context) -> NoReturn:

@@ -139,6 +139,11 @@ def broken_policy(tmp_path, kind):
         (["preview", "EMPTY"], "holds no release"),
         (["verify", "EMPTY"], "holds no release"),
         (["backgrounds", "--videos", "0"], "x>=1"),
+        (["--fast"], "`dmcvb-gen --help` lists the options"),
+        (["rollout", "--zzz"], "`dmcvb-gen rollout --help` lists the options"),
+        (["info"], "see `dmcvb-gen info --help`"),
+        (["diff", "a", "b", "c"], "see `dmcvb-gen diff --help`"),
+        (["rollout", "walker-walk", "--seed"], "--seed"),
     ],
 )
 def test_bad_input_ends_with_2_one_line_and_nothing_written(tmp_path, arguments, words):
@@ -155,8 +160,7 @@ def test_bad_input_ends_with_2_one_line_and_nothing_written(tmp_path, arguments,
     result = run(*arguments)
     assert result.exit_code == 2, result.output
     assert words in result.output and "Traceback" not in result.output and not (tmp_path / "out").exists()
-    if result.output.startswith("error:"):
-        assert result.output.count("\n") == 1
+    assert result.output.startswith("error:") and result.output.count("\n") == 1
 
 
 def test_an_out_that_cannot_be_written_is_said(tmp_path):
