@@ -17,20 +17,27 @@ WORTH = 0.95
 """bfloat16 is chosen if it takes less than this share of float32's time: its results are less precise."""
 
 
-def choose_precision(asked: str, product: Callable[[torch.dtype], object], device: str = "cpu") -> str:
+def choose_precision(
+    asked: str, product: Callable[[torch.dtype], object], device: str = "cpu", threads: int | None = None
+) -> str:
     """ "float32" or "bfloat16".
 
     Args:
       asked: "float32", "bfloat16", or "auto", which takes the faster one.
       product: computes a typical product in a precision; called several times with each.
       device: "cpu" is probed; "cuda" is asked whether it supports bfloat16.
+      threads: threads that the training will have; None: those that torch has now.
     """
     if asked != "auto":
         return asked
     if device.startswith("cuda"):
         return "bfloat16" if torch.cuda.is_bf16_supported() else "float32"
-    with torch.no_grad():
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    try:
         seconds = fastest(product, (torch.float32, torch.bfloat16))
+    finally:
+        torch.set_num_threads(before)
     return "bfloat16" if seconds[torch.bfloat16] < WORTH * seconds[torch.float32] else "float32"
 
 
@@ -52,10 +59,3 @@ def dense_product(hidden: int, batch: int) -> Callable[[torch.dtype], object]:
     """The product of SAC's critics: two networks' hidden layers, weights converted as in training."""
     inputs, weights = torch.randn(2, batch, hidden), torch.randn(2, hidden, hidden)
     return lambda precision: torch.bmm(inputs.to(precision), weights.to(precision)).float()
-
-
-def image_product(channels: int = 64, size: int = 16, batch: int = 64) -> Callable[[torch.dtype], object]:
-    """A convolution of an encoder, (batch, channels, size, size), weights converted as autocast does."""
-    images = torch.randn(batch, channels, size, size).contiguous(memory_format=torch.channels_last)
-    weights = torch.randn(channels, channels, 3, 3)
-    return lambda precision: torch.nn.functional.conv2d(images.to(precision), weights.to(precision), padding=1).float()

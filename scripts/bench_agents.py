@@ -17,10 +17,10 @@ import torch
 
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, make_pretrainer, parse_agent
 from dmcvb_gen.agents.data import PAD, TrainingData
-from dmcvb_gen.agents.networks import NETWORKS
+from dmcvb_gen.agents.networks import NETWORKS, encoder_product
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.dataset.steps import StepTable
-from dmcvb_gen.precision import choose_precision, image_product
+from dmcvb_gen.precision import choose_precision
 
 AGENTS = "state-bc,state-td3-bc,bc,td3-bc,id+bc,lfd+bc,ae+bc,state+bc"
 
@@ -68,7 +68,7 @@ def main() -> None:
     data = random_data(options.device)
     how = f"{options.threads} threads, batch {options.batch_size}, {options.network} network"
     print(f"torch {torch.__version__}, {options.device}, {how}")
-    auto = choose_precision("auto", image_product(batch=options.batch_size), options.device)
+    auto = choose_precision("auto", encoder_product(NETWORKS[options.network]), options.device)
     print(
         f"networks that see pictures: `--precision auto` takes {auto} here; agents that see states compute in float32"
     )

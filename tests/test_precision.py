@@ -33,16 +33,24 @@ def test_the_probe_runs_the_product_in_both_precisions():
     assert set(seen) == set(seconds) == {torch.float32, torch.bfloat16} and all(s < 1 for s in seconds.values())
 
 
+def test_the_probe_has_the_threads_of_the_training():
+    seen, before = set(), torch.get_num_threads()
+    precision.choose_precision("auto", lambda dtype: seen.add(torch.get_num_threads()), threads=before + 1)
+    assert seen == {before + 1} and torch.get_num_threads() == before
+
+
 def test_a_processor_without_bfloat16_computes_in_float32():
     code = (
-        "from dmcvb_gen.precision import choose_precision, dense_product, image_product\n"
-        "print(choose_precision('auto', dense_product(256, 256)), choose_precision('auto', image_product()))"
+        "from dmcvb_gen.agents.networks import NETWORKS, encoder_product\n"
+        "from dmcvb_gen.precision import choose_precision, dense_product\n"
+        "products = [dense_product(256, 256), *map(encoder_product, NETWORKS.values())]\n"
+        "print(*(choose_precision('auto', product) for product in products))"
     )
     only_avx2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "DNNL_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
     run = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | only_avx2, capture_output=True, text=True, check=True
     )
-    assert run.stdout.split() == ["float32", "float32"]
+    assert run.stdout.split() == ["float32"] * 4
 
 
 @pytest.mark.parametrize("fast", ["float32", "bfloat16"])

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from dmcvb_gen.agents.catalog import parse_agent
+from dmcvb_gen.agents.networks import encoder_product
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.profiles import get_profile
@@ -25,7 +26,7 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
-from dmcvb_gen.precision import choose_precision, image_product
+from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import matches, select
 from dmcvb_gen.storage.remote import local_path
@@ -130,13 +131,17 @@ def make_setup(
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    sizes = get_profile(profile).scaled(scale)
+    threads = threads or (default_threads(workers) if isinstance(workers, int) else 1)
+    if training:
+        precision = choose_precision(precision, encoder_product(sizes.network), device, threads)
     return Setup(
         root=str(path),
         out=str(out or Path("reports") / Path(path).name),
-        profile=get_profile(profile).scaled(scale),
+        profile=sizes,
         device=device,
-        precision=choose_precision(precision, image_product(), device) if training else "float32",
-        threads=threads or (default_threads(workers) if isinstance(workers, int) else 1),
+        precision=precision if training else "float32",
+        threads=threads,
         memory=None if memory is None else int(memory * 1e9),
         dino_weights=None if dino_weights is None else str(dino_weights),
         **fields,

@@ -92,12 +92,12 @@ def train_behaviour(
     algorithm = algo or (found.algorithm if found else "guided" if layout else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
     changed = parse_settings(as_names(settings), config, algorithm)
+    torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
     chosen = _precision(precision, algorithm, changed, found)
     configuration = run_config(task, algorithm, changed | chosen, found, **given)  # type: ignore[arg-type]
     run = open_run(folder, configuration, resume)
     if chosen and precision == "auto":
         notify(f"Computing in {'bfloat16' if chosen['bfloat16'] else 'float32'}, the faster one on this processor.")
-    torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
     saved, expert = run.saved(), paper_returns(task, "expert")
     if resume and not saved:
         notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
