@@ -17,7 +17,7 @@ from dmcvb_gen.policies.bundled import bundled_levels, bundled_policies
 from dmcvb_gen.policies.evaluation import maze_scores, running_speed
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task, task_ids
-from dmcvb_gen.training.defaults import parse_settings
+from dmcvb_gen.training.defaults import default_run, parse_settings
 from dmcvb_gen.training.training import RunConfig, command_of
 
 
@@ -111,3 +111,21 @@ def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
 def test_a_folder_without_picks_says_what_to_run(tmp_path):
     result = CliRunner().invoke(main, ["evaluate-behaviour", "--behaviour", str(tmp_path)])
     assert result.exit_code == 2 and "select-checkpoints" in result.output
+
+
+@pytest.mark.parametrize("task", ["cartpole-swingup", "finger-spin"])
+def test_a_task_without_a_setting_of_its_own_goes_from_nothing_to_data(tmp_path, task):
+    cut = {"warmup_steps": 24, "simulations": 4, "batch_size": 16, "compile": False}
+    words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]
+    run = CliRunner().invoke(main, ["train-behaviour", task, "--steps", "80", "--out", str(tmp_path / "run"), *words])
+    assert run.exit_code == 0, run.output
+    settings = json.loads((tmp_path / "run/run.json").read_text())["settings"]
+    common = default_run("humanoid-walk")["settings"]  # DMC-VB's tasks have no setting of their own either
+    assert {name: settings[name] for name in common if name not in cut} == {
+        n: v for n, v in common.items() if n not in cut
+    }
+    out = ["--episodes", "1", "--max-steps", "30", "--size", "32", "--out", str(tmp_path / "data")]
+    behaviour = ["--level", "expert", "--behaviour", str(tmp_path / "run/checkpoints/0000000080.safetensors")]
+    made = CliRunner().invoke(main, ["rollout", task, *behaviour, *out])
+    assert made.exit_code == 0, made.output
+    assert CliRunner().invoke(main, ["verify", str(tmp_path / "data")]).exit_code == 0

@@ -336,6 +336,17 @@ def test_a_run_that_is_made_shorter_says_so(tmp_path):
     assert said == ["The run ends at step 200 now, not at 400."]
 
 
+def test_a_run_of_which_nothing_is_saved_yet_begins_at_step_0_and_says_so(tmp_path):
+    whole, again = (train(tmp_path / name, steps=80) for name in ("whole", "run"))
+    for rest in ("resume", "checkpoints"):  # as a run that was killed before it saved anything
+        shutil.rmtree(tmp_path / "run" / rest)
+    (tmp_path / "run/progress.csv").unlink()
+    said: list[str] = []
+    train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, progress=False, notify=said.append)
+    assert any("so the run begins at step 0" in line for line in said)
+    assert_same_run(whole, again)
+
+
 def test_a_saved_state_that_holds_code_or_rubbish_is_refused(tmp_path):
     run = open_run(tmp_path / "run", config(), False)
     (tmp_path / "run" / "resume").mkdir()
