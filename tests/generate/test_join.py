@@ -53,7 +53,7 @@ def test_joined_parts_have_the_root_digest_of_the_whole(made):
     assert root_digest(index.files, manifest) == root_digest(read_index(made / "whole").files, expected)
 
 
-@pytest.mark.parametrize("name", ["dmcvb-mini", "dmcvb-v1-locomotion", "quickstart"])
+@pytest.mark.parametrize("name", ["dmcvb-mini", "dmcvb-v1", "dmcvb-v1-locomotion", "quickstart"])
 def test_a_shipped_release_joined_alone_is_itself(name):
     archive = CARDS / name / f"files{ENDING}"
     with manifest_source(archive) as folder:
@@ -65,6 +65,14 @@ def test_a_shipped_release_joined_alone_is_itself(name):
         assert join(load_recipe(name), [archive])[0] == expected
     with pytest.raises(StoreError, match="no digests of the files"):
         join(load_recipe(name), [name])
+
+
+def test_the_whole_benchmark_is_its_shipped_parts():
+    with manifest_source(CARDS / "dmcvb-v1" / f"files{ENDING}") as folder:
+        expected = load_manifest(folder)[1]
+    parts = sorted(CARDS.glob(f"dmcvb-v1-*/files{ENDING}"))
+    assert len(parts) == 8
+    assert join(load_recipe("dmcvb-v1"), parts)[0].digest == expected.digest
 
 
 def test_the_folder_of_joined_parts_is_the_release_of_one_rollout(made, tmp_path):
