@@ -19,8 +19,8 @@ from dmcvb_gen.training.behaviour import train_behaviour as train
 def train_behaviour(layout, as_json, **options):
     """Train a behaviour policy online on states.
 
-    Ctrl-C saves the run and prints the command that resumes it. A process that is killed loses half a minute at most, and
-    the evaluation that it was in.
+    Ctrl-C saves the run and prints the command that resumes it. A process that is killed loses half a minute at most,
+    and the evaluation that it was in.
 
     \b
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
