@@ -7,6 +7,7 @@ The rows are those of `dataset.steps.StepTable`. Pictures stay uint8 until they 
 from __future__ import annotations
 
 import math
+import mmap
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -74,7 +75,8 @@ class HeldFrames:
     """The frames of a table that was read with a border of `PAD`, as a tensor.
 
     A shifted line of pixels is `size` bytes that stand together, so that picking frames, stacking them and moving them
-    is one gather of lines, for any number of stacks. The borders take an eighth more bytes.
+    is one gather of lines, for any number of stacks. The borders take an eighth more bytes. Frames in a file are asked
+    for before they are gathered, so that the disk reads a batch's stacks at once.
 
     Attributes:
       table: (row, channel, size, size + 2 PAD) uint8.
@@ -84,6 +86,9 @@ class HeldFrames:
     def __init__(self, frames: np.ndarray, device: str | torch.device = "cpu"):
         self.mapped = isinstance(frames, np.memmap)
         self.table = torch.from_numpy(frames).to("cpu" if self.mapped else device)
+        self._file = frames.base if isinstance(frames.base, mmap.mmap) else None
+        if self._file is not None:
+            _advise(self._file, "RANDOM", 0, frames.nbytes)  # what stands beside a stack is not read with it
         _, self.channels, self.size, _ = frames.shape
         mirror = np.pad(np.arange(self.size), PAD, mode="symmetric")  # which pixel stands where, after padding
         self._mirror = torch.from_numpy(mirror).to(self.table.device)
@@ -96,6 +101,10 @@ class HeldFrames:
     def shifted(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         """(batch, frames) rows, (batch,) offsets in 0..2 PAD -> (batch, frames x channels, size, size) uint8."""
         rows, down, right = (values.to(self._mirror.device) for values in (rows, down, right))
+        if self._file is not None:
+            frame = self.table[0].numel()
+            for first, last in rows[:, [0, -1]].tolist():
+                _advise(self._file, "WILLNEED", first * frame, (last + 1) * frame)
         (batch, frames), wide = rows.shape, self.size + 2 * PAD
         line = self._mirror[down[:, None] + torch.arange(self.size, device=rows.device)]  # (batch, size)
         plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=rows.device)
@@ -104,6 +113,14 @@ class HeldFrames:
         flat = self.table.view(-1)
         lines = flat.as_strided((len(flat) - self.size + 1, self.size), (1, 1)).index_select(0, index.reshape(-1))
         return lines.view(batch, frames * self.channels, self.size, self.size)
+
+
+def _advise(file: mmap.mmap, use: str, start: int, stop: int) -> None:
+    """Tell the system how bytes start..stop of a mapped file will be used, if it can be told."""
+    advice = getattr(mmap, f"MADV_{use}", None)
+    if advice is not None:
+        start -= start % mmap.PAGESIZE
+        file.madvise(advice, start, stop - start)
 
 
 def normalize_pixels(

@@ -16,7 +16,7 @@ from dmcvb_gen.training.behaviour import train_behaviour as train
 
 
 @command_of(train)
-def train_behaviour(layout, as_json, **options):
+def train_behaviour(as_json, **options):
     """Train a behaviour policy online on states.
 
     Ctrl-C saves the run and prints the command that resumes it. A process that is killed loses half a minute at most,
@@ -34,32 +34,20 @@ def train_behaviour(layout, as_json, **options):
     from dmcvb_gen.training.selection import selection_json
 
     try:
-        run = train(layout=layout, notify=functools.partial(click.echo, err=True), **options)
+        run = train(notify=functools.partial(click.echo, err=True), **options)
     except Stopped as stopped:
         click.echo(stopped, err=True)
         click.get_current_context().exit(INTERRUPTED)
-    selecting = f"dmcvb-gen select-checkpoints {run.folder}"
-    try:
-        picked = _select(run.folder, as_json) if layout else None
-    except KeyboardInterrupt:
-        click.echo(f"Interrupted. The run is trained; select its checkpoints: {selecting}", err=True)
-        click.get_current_context().exit(INTERRUPTED)
+    picked, layout = run.selection, options["layout"]
     if as_json:
         facts = dict(out=str(run.folder), steps=run.steps, seconds=round(run.seconds, 1), curve=str(run.curve))
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
     click.echo(f"{run.folder}: trained to {run.steps:,} agent steps; its curve is {run.curve}.")
     if not picked:
-        return click.echo(f"Next: {selecting}")
+        return click.echo(f"Next: dmcvb-gen select-checkpoints {run.folder}")
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
         click.echo(f"Next: dmcvb-gen rollout --layout {layout} --level expert --behaviour {run.folder} --goal visible")
-
-
-def _select(folder, as_json, episodes=100, seed=20_000, sample=False, converged=None):
-    from dmcvb_gen.training.selection import select_checkpoints
-
-    with ProgressBar(not as_json, unit=" checkpoints", desc="selection") as bar:
-        return select_checkpoints(folder, episodes, seed, not sample, converged, bar)
 
 
 @click.command("select-checkpoints")
@@ -83,9 +71,11 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     dmcvb-gen select-checkpoints runs/walker-walk
     dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk --episodes 20
     """
+    from dmcvb_gen.training.selection import select_checkpoints as select
     from dmcvb_gen.training.selection import selection_json
 
-    picked = _select(run, as_json, episodes, seed, sample, converged)
+    with ProgressBar(not as_json, unit=" checkpoints", desc="selection") as bar:
+        picked = select(run, episodes, seed, not sample, converged, bar)
     if as_json:
         print_json(selection_json(picked))
     else:

@@ -3,13 +3,20 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.spec import MazeName, task_folder
 from dmcvb_gen.text import as_names
+
+if TYPE_CHECKING:
+    from dmcvb_gen.training.selection import Selection
+
+
+SELECTION_EPISODES = 100
+"""Fresh episodes that each pick of an own maze is measured on."""
 
 
 @dataclass(frozen=True)
@@ -19,12 +26,14 @@ class TrainedRun:
     Attributes:
       folder: folder of the run. curve: picture of its evaluations.
       steps: agent steps. seconds: of training, on the clock.
+      selection: the picked checkpoints of a maze of one's own; None for a task, see `select_checkpoints`.
     """
 
     folder: Path
     curve: Path
     steps: int
     seconds: float
+    selection: "Selection | None" = None
 
 
 def train_behaviour(
@@ -62,9 +71,10 @@ def train_behaviour(
       resume: Resume the run in --out with its own settings.
 
     `notify` is called with what the person should know: the precision, a resumed run without a saved state, a stop.
+    For a layout one bar counts the steps of training, evaluations and selection together.
 
     Raises:
-      Stopped: by Ctrl-C; the run is saved.
+      Stopped: by Ctrl-C; the run is saved, and the message has the command that goes on.
       DmcvbError: an unknown name, a setting that is wrong, or a folder that holds another run or none to resume.
     """
     import torch  # here, so that --help works without it
@@ -76,14 +86,14 @@ def train_behaviour(
     from dmcvb_gen.tasks.ant_maze import layout_task_id
     from dmcvb_gen.training.defaults import parse_settings, run_config
     from dmcvb_gen.training.runs import read_config
-    from dmcvb_gen.training.selection import plot_curve
+    from dmcvb_gen.training.selection import MAZE_CHECKPOINTS, plot_curve
     from dmcvb_gen.training.training import open_run
 
     if (task is None) == (layout is None):
         raise DmcvbError("give a TASK, or the file of a maze with --layout")
     task = task or layout_task_id(layout or "")
     allow([task])  # a person typed its name, so its code may run
-    get_task(task)
+    max_steps = get_task(task).max_steps
     maze = MazeName.parse(task) if layout else None
     folder = Path(out or Path("runs") / (maze.layout if maze else task))
     found = read_config(folder) if resume else None
@@ -107,13 +117,45 @@ def train_behaviour(
         raise DmcvbError(f"{folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
     if found and total < found.steps:
         notify(f"The run ends at step {total:,} now, not at {found.steps:,}.")
-    with ProgressBar(progress, total=total, initial=done, unit=" steps", unit_scale=True, desc=name) as bar:
+    # Evaluations and selection take most of the time of a maze, so its bar counts their steps as well.
+    each, selecting = 1.0, 0
+    if maze:
+        each, selecting = 1 + run.evaluation_steps(), MAZE_CHECKPOINTS * SELECTION_EPISODES * max_steps
+    work = dict(total=total * each + selecting, initial=done * each, unit=" steps", unit_scale=True, smoothing=0)
+    picked = None
+    with ProgressBar(progress, **work, desc=name) as bar:
 
         def report(progress: Any) -> None:
             bar.set_postfix_str(_standing(progress, expert), refresh=False)
+            if maze:
+                bar.update(progress.evaluation.episodes * max_steps)
 
         run.train(report, bar.update, lambda: notify("\nStopping: the run is being saved."))
-    return TrainedRun(folder, plot_curve(folder, expert and expert["mean"]), run.step, run.seconds)
+        if maze:
+            picked = _select(folder, name, bar, SELECTION_EPISODES * max_steps)
+    curve = picked and folder / "curve.png"
+    return TrainedRun(folder, curve or plot_curve(folder, expert and expert["mean"]), run.step, run.seconds, picked)
+
+
+def _select(folder: Path, name: str, bar: Any, steps: int) -> "Selection":
+    """Select a run's checkpoints; the bar goes on by `steps` for each one that is measured."""
+    from dmcvb_gen.training.runs import Stopped
+    from dmcvb_gen.training.selection import select_checkpoints
+
+    before = bar.n
+
+    class Rest:
+        def __call__(self, checkpoint: str) -> None:
+            bar.advance(f"{name}, selection", steps)
+
+        def expect(self, count: float) -> None:
+            bar.expect(before + count * steps)
+
+    try:
+        return select_checkpoints(folder, SELECTION_EPISODES, progress=Rest())
+    except KeyboardInterrupt:
+        command = f"dmcvb-gen select-checkpoints {folder}"
+        raise Stopped(f"interrupted; the run is trained, select its checkpoints: {command}") from None
 
 
 def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:

@@ -42,6 +42,8 @@ PAPER_TOLERANCE = 0.2
 """How far (as a share of it) a maze's medium may be from the paper's return."""
 CANDIDATES = 8
 """Checkpoints near a medium's return that are measured on fresh episodes."""
+MAZE_CHECKPOINTS = 2 * CANDIDATES
+"""Checkpoints of a maze that are measured, about: near its expert's return and near its medium's."""
 BASE_EPISODES = 20
 """Episodes of random actions in a maze, of which none finds its goal but by chance."""
 COST_SLACK = 0.3
@@ -287,7 +289,7 @@ def select_checkpoints(
 
     def measure(path: Path) -> Evaluation:
         if path not in measured:
-            expect(progress, max(len(measured) + 1, 1 + CANDIDATES // 2 + (0 if mazes else MIXED_COUNT)))
+            expect(progress, max(len(measured) + 1, MAZE_CHECKPOINTS if mazes else 1 + CANDIDATES // 2 + MIXED_COUNT))
             progress(f"step {int(path.stem):,}")
             policy = load_policy(path, task)
             measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic)[0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from dmcvb_gen.agents import data as agents_data
 from dmcvb_gen.agents import trainer
 from dmcvb_gen.agents.bc import BehaviorCloning
 from dmcvb_gen.agents.data import PAD, Source, TrainingData, batches, load_data, normalize_pixels
@@ -168,6 +169,22 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
         torch.manual_seed(0)
         losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), data.sizes), data, settings)[-1]["loss"])
     assert losses[0] == losses[1]
+
+
+def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_release, tmp_path, monkeypatch):
+    data = load_data([Source(open_release(small_release)["walker-walk/random/none"])], memory=0, scratch=tmp_path)
+    asked: list[tuple[int, int]] = []
+    advise = agents_data._advise
+
+    def recorded(file, use, start, stop):
+        asked.append((start, stop))
+        advise(file, use, start, stop)
+
+    monkeypatch.setattr(agents_data, "_advise", recorded)
+    rows, frame = torch.tensor([0, 1, 7, 501, 500, len(data.state) - 1]), data.frames.table[0].numel()
+    data.observe(rows)
+    first = [0, 0, 5, 501, 498, len(data.state) - 3]  # an episode's first frames have none before them
+    assert asked == [(one * frame, (int(row) + 1) * frame) for one, row in zip(first, rows, strict=True)]
 
 
 def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch):
