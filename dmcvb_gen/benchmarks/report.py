@@ -394,9 +394,11 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
                 f"Evaluations are cut at {evaluated:,} agent steps, the data at {data:,}: their returns cannot be "
                 "compared where the end is not reached before."
             )
-    for precision in sorted({result["machine"]["precision"] for result in results}):
-        notes.append(f"Networks that see pictures computed in {precision}, agents that see states in float32.")
-    for data, evaluation in sorted({(r["renderers"]["data"], r["renderers"]["evaluation"]) for r in results}):
+    pictured = [result for result in results if "size" in result["evaluation"]]
+    others = ", agents that see states in float32" if len(pictured) < len(results) else ""
+    for precision in sorted({result["machine"]["precision"] for result in pictured}):
+        notes.append(f"Networks that see pictures computed in {precision}{others}.")
+    for data, evaluation in sorted({(r["renderers"]["data"], r["renderers"]["evaluation"]) for r in pictured}):
         if data != evaluation:
             notes.append(
                 f"The data were painted elsewhere ({data}), the evaluations here by renderer {evaluation}: agents with "

@@ -217,7 +217,9 @@ def test_subsets_left_out_by_only_are_called_so_and_not_missing(small_release, t
     assert result.exit_code == 0, result.output
     [left_out] = [line for line in result.output.splitlines() if "left out by --only" in line]
     assert "walker-walk/random/dynamic" in left_out and "not in the release" not in result.output
-    assert "in the release, left out by --only" in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "in the release, left out by --only" in page
+    assert "computed in" not in page, "no network saw pictures"
 
 
 def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
