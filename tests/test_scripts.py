@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import dmcvb_gen
+
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 
@@ -20,6 +22,18 @@ def run(name: str, *arguments: str) -> str:
 @pytest.mark.slow
 def test_both_precisions_are_timed():
     assert "auto takes" in run("bench_training.py", "--precisions", "--updates", "3")
+
+
+@pytest.mark.slow
+def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path):
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
+        release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
+        options = ("--profile", "smoke", "--scale", "2", "--scores", "3", "--folder", str(tmp_path / "curve" / task))
+        printed = run("learning_curve.py", str(tmp_path / task), "--subset", next(iter(release)), *options)
+        assert [line.split()[0] for line in printed.splitlines()] == ["2", "4", "6"]
+        rows = (tmp_path / "curve" / task / "curve.csv").read_text().splitlines()
+        assert len(rows) == 4 and (tmp_path / "curve" / task / "curve.png").exists()
 
 
 @pytest.mark.slow

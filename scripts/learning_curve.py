@@ -1,0 +1,98 @@
+"""The return of one agent along a long training, as a table and a picture.
+
+    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --scale 18 --folder runs/cheetah-curve
+    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --folder runs/paper-cell
+
+The agent trains as in `validate` with that profile, `--scale` times as long, on one thread. It is scored on 30 fresh
+episodes at even distances, and each score is printed. A stopped training goes on if the command is given again. At the
+end the folder has curve.csv and curve.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import torch
+
+from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
+from dmcvb_gen.agents.data import Source, load_data
+from dmcvb_gen.agents.trainer import TrainSettings, train
+from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
+from dmcvb_gen.dataset import open_release
+
+COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
+
+
+def write_curve(folder: Path, points: list[dict], of_data: float) -> None:
+    """Write curve.csv and curve.png of the scored points."""
+    with open(folder / "curve.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(points)
+    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    minutes = [point["seconds"] / 60 for point in points]
+    axes.errorbar(minutes, [p["return"] for p in points], [p["error"] for p in points], marker="o", label="agent")
+    axes.axhline(of_data, color="gray", linestyle="--", label="data")
+    axes.set(xlabel="minutes of one core", ylabel="return", ylim=(0, None))
+    axes.legend()
+    figure.savefig(folder / "curve.png", dpi=120)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("release")
+    parser.add_argument("--subset", required=True)
+    parser.add_argument("--folder", type=Path, required=True, help="Where the training and its curve are kept.")
+    parser.add_argument("--agent", default="bc")
+    parser.add_argument("--profile", default="quick", choices=list(PROFILES))
+    parser.add_argument("--scale", type=float, default=1.0, help="Times the profile's steps.")
+    parser.add_argument("--scores", type=int, default=12, help="Evaluations along the training.")
+    parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    agent, profile = parse_agent(options.agent), get_profile(options.profile).scaled(options.scale)
+    if agent.pretrain or agent.sees_state:
+        parser.error("--agent: one that trains its own encoder on pictures")
+    subset = open_release(options.release)[options.subset]
+    data = load_data([Source(subset)], seed=options.seed, stack=agent.stack)
+    torch.manual_seed(options.seed)
+    encoder = make_encoder(agent, data.sizes, None, profile.network)
+    learner = make_policy(agent, encoder, data.sizes, profile.network)
+    evaluator = Evaluator(
+        subset, normalization=data.normalization, stack=agent.stack, episodes=30, max_steps=profile.episode_steps
+    )
+
+    done = [0]
+
+    def count(steps: int) -> None:
+        done[0] += steps
+
+    def evaluate(policy) -> dict[str, float]:
+        score = evaluator(policy)
+        print(f"{done[0]:>9,} of {settings.steps:,} steps: {score.mean:7.1f} +- {score.stderr:.1f}", flush=True)
+        return {"return": score.mean, "error": score.stderr}
+
+    settings = TrainSettings(
+        steps=profile.pixel_steps,
+        batch_size=profile.batch_size,
+        evaluate_every=-(-profile.pixel_steps // options.scores),
+        points=options.scores,
+        half=options.precision == "bfloat16",
+        rate=profile.rate,
+        shift=profile.shift,
+        decay=profile.decay,
+    )
+    options.folder.mkdir(parents=True, exist_ok=True)
+    curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
+    evaluator.close()
+    write_curve(options.folder, [point for point in curve if "return" in point], float(subset.returns.mean()))
+
+
+if __name__ == "__main__":
+    main()
