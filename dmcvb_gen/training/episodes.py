@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 
-from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.task import SPAWN_NOISE
@@ -19,21 +19,25 @@ HURRY = 0.1
 """Cost of a step in a maze, as the reward is 0 in the whole goal cell; lying on the back costs 1 more."""
 
 
+HINTED = "humanoid-walk"
+"""The task that a hint helps, besides mazes."""
+
+
 def shaping_of(task: Task) -> Callable[[np.ndarray], np.ndarray]:
-    """(n, state) -> (n,): a hint that a learner may be given; humanoid-walk and mazes have one, others 0.
+    """(n, state) -> (n,): a hint that a learner may be given; humanoid-walk and mazes have one.
 
     Humanoid-walk's reward is zero on the floor; the hint, in [0, 1], is how high and upright it is. It is full once the
     humanoid stands, so it does not change which gait is best. An ant on its back never gets up again; the hint, in
     [-1.1, -0.1], is how far it has tipped over, and that time passes.
     """
     slices = task.state_slices
-    if task.id == "humanoid-walk":
+    if task.id == HINTED:
         height, vertical = slices["head_height"].start, slices["torso_vertical"].start + 2
         return lambda state: np.clip(state[:, height] / 1.4, 0, 1) ** 2 * (1 + state[:, vertical]) / 2
     if is_maze(task.id):
         upright = slices["world_zaxis"].start + 2
         return lambda state: (state[:, upright] - 1) / 2 - HURRY
-    return lambda state: np.zeros(len(state))
+    raise AssertionError(f"no hint for {task.id}")
 
 
 def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -46,6 +50,21 @@ def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndar
         data.qvel[:] = rng.normal(0, 0.05, task.model.nv)
         mujoco.mj_getState(task.model, data, row, PHYSICS_SPEC)
     return rows
+
+
+def useless_setting(task: Task, settings: Any) -> str | None:
+    """Say which setting has no meaning for a task, and the cure; None if all have one."""
+    maze = is_maze(task.id)
+    fits = {
+        "progress": (maze, "only for ant mazes"),
+        "sunken_starts": (maze, "only for ant mazes"),
+        "shaping": (maze or task.id == HINTED, f"only for {HINTED} and ant mazes"),
+        "standing_starts": (not maze, "not for ant mazes, which start at their own places"),
+    }
+    for name, (fit, what) in fits.items():
+        if getattr(settings, name, 0) and not fit:
+            return f"setting {name} is {what}; {task.id} has no use for it, so remove it"
+    return None
 
 
 class Episodes:
@@ -61,8 +80,6 @@ class Episodes:
         self.size, self._limit = settings.simulations, settings.train_episode_steps or run.task.max_steps
         self.batch = run.task.batch(self.size)
         if getattr(settings, "progress", 0):
-            if not hasattr(self.batch, "track_paths"):
-                raise DmcvbError(f"setting progress is for ant-maze tasks; {run.task.id} has no path to a goal")
             self.batch.track_paths()
         # The first episodes are cut short at different steps, so that ends do not fall together.
         self.elapsed = (np.arange(self.size) * self._limit) // self.size
@@ -78,8 +95,6 @@ class Episodes:
             self.batch.set_physics(standing_states(self._task, self._rng, len(standing)), standing)
         sunken = ids[self._rng.random(len(ids)) < getattr(run.settings, "sunken_starts", 0.0)]
         if len(sunken):
-            if not is_maze(self._task.id):
-                raise DmcvbError(f"setting sunken_starts is for ant mazes, nothing sinks in {self._task.id}")
             self.batch.sink(sunken, self._rng.uniform(-SPAWN_NOISE, -SPAWN_NOISE / 2, len(sunken)))
         return self.batch.behaviour_observation()
 

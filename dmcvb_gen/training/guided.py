@@ -12,12 +12,14 @@ from __future__ import annotations
 import functools
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import copy_file
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import WAY_SIZE
@@ -35,6 +37,8 @@ from dmcvb_gen.training.settings import Count, Natural, NonNegative, Positive, S
 
 GUIDE = "ant-maze-empty7x7"
 """The task whose bundled expert walks if --init-from names none."""
+
+WALKER = "walker.safetensors"
 
 MOST_CELLS = 15
 """Rows or columns of the largest maze that is learned: an ant runs about twenty cells in an episode (1.6 m/s, 30 s)."""
@@ -93,9 +97,13 @@ class GuidedRun(Run):
         """The policy that walks; it does not know where to."""
         if not is_maze(self.task.id):
             raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {self.task.id}")
-        source = self.config.init_from
-        path = resolve_policies(self.task.id if source else GUIDE, "expert", source)[0]
-        return load_policy(path, self.task)
+        return load_policy(self._walker_file(), self.task)
+
+    def _walker_file(self) -> Path:
+        kept, source = self.folder / "resume" / WALKER, self.config.init_from
+        if kept.exists():
+            return kept
+        return resolve_policies(self.task.id if source else GUIDE, "expert", source)[0]
 
     def network(self) -> dict[str, Any]:
         header, settings = self.walker.header, self.settings
@@ -125,6 +133,8 @@ class GuidedRun(Run):
 
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
         settings, config = self.settings, self.config
+        if not (kept := self.folder / "resume" / WALKER).exists():
+            copy_file(self._walker_file(), kept)  # what --init-from names may be gone later
         learner, next_evaluation = Student(self), config.evaluate_every
         if saved:
             learner.load_state(saved["learner"])

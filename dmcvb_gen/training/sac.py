@@ -246,9 +246,8 @@ class RowBuffer:
             self.arrays = {name: map_rows(paths[name], size, shape)[:size] for name, shape in shapes.items()}
         self.size = size
 
-    def restore(self, position: int, full: bool, rows: int | None = None) -> None:
-        """Continue where a run was saved, whose buffer had `rows` rows (as many as the files held, if not known)."""
-        rows = rows or self.found
+    def restore(self, position: int, full: bool, rows: int) -> None:
+        """Continue where a run was saved, whose buffer had `rows` rows."""
         # A full buffer that has grown since is not full any more: what is new lies behind the old rows.
         self.position, self.full = (rows, False) if full and self.size > rows else (position, full)
 
@@ -297,11 +296,11 @@ class ReplayBuffer(RowBuffer):
         }
         super().__init__(size, shapes, folder)
 
-    def restore(self, position: int, full: bool, rows: int | None = None) -> None:
+    def restore(self, position: int, full: bool, rows: int) -> None:
         super().restore(position, full, rows)
         # If it has grown after it wrapped, rows do not follow each other any more where the ring was closed.
         if full and not self.full and position:
-            for end in (position, rows or self.found):
+            for end in (position, rows):
                 self.arrays["ended"][max(end - self._simulations, 0) : end] = 1
 
     def sample_steps(
@@ -470,12 +469,12 @@ class Sac(ReplayLearner):
 
     def begin_round(self, step: int) -> None:
         super().begin_round(step)
-        self.sharpen(step)
         if self.settings.rate_half_life:
             rate = self.settings.learning_rate / math.sqrt(1 + step / self.settings.rate_half_life)
             for optimizer in (self.actor_optimizer, self.critic_optimizer):
                 for group in optimizer.param_groups:
                     group["lr"] = rate
+        self.sharpen(step)  # last, as its rate stands in for the falling one
 
     def sharpen(self, step: int) -> None:
         """Aim at the lower entropy, by smaller steps, from the agent step on that the settings name."""

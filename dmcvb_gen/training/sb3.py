@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.state_file import STATE
 from dmcvb_gen.training.networks import Actor, as_tensors
 from dmcvb_gen.training.row_files import map_rows, rows_in
 from dmcvb_gen.training.runs import ProgressCallback, Report, Run, read_config
@@ -77,9 +78,20 @@ class Sb3Run(Run):
     def warmup(self) -> int:
         return self.settings.learning_starts if isinstance(self.settings, OffPolicySettings) else 0
 
-    def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
-        config, settings = self.config, self.settings
-        env = TaskVecEnv(self.task, settings.simulations, config.seed)
+    def problem(self) -> str | None:
+        """Say what SB3, or what the run starts from, refuses; before anything is written."""
+        if (self.folder / "resume" / STATE).exists():
+            return None
+        try:
+            self._begin()
+        except DmcvbError as error:
+            return str(error)
+        return None
+
+    def _begin(self, saved: bool = False) -> tuple[TaskVecEnv, VecNormalize | None, BaseAlgorithm]:
+        """Simulations, what normalizes them if anything does, and a model; unless saved, of what it starts from."""
+        settings, source = self.settings, self.config.init_from
+        env = TaskVecEnv(self.task, settings.simulations, self.config.seed)
         normalize = None
         if settings.normalize_observation or settings.normalize_reward:
             normalize = VecNormalize(
@@ -90,13 +102,18 @@ class Sb3Run(Run):
                 gamma=settings.gamma,
             )
         model = self._model(normalize or env)
+        if source and not saved:
+            self._start_from(source, model, normalize)
+        return env, normalize, model
+
+    def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
+        config, settings = self.config, self.settings
+        env, normalize, model = self._begin(saved is not None)
         buffer = self._map_buffer(model) if isinstance(settings, OffPolicySettings) else None
         next_evaluation = config.evaluate_every
         if saved:
             self._restore(saved, model, env, normalize, buffer)
             next_evaluation = saved["next_evaluation"]
-        elif config.init_from:
-            self._start_from(config.init_from, model, normalize)
 
         def state() -> dict[str, Any]:
             return self._state(model, env, normalize, buffer) | {"next_evaluation": next_evaluation}
@@ -262,14 +279,21 @@ class Sb3Run(Run):
                 reason = " ".join(str(error).split())[:200]
                 raise DmcvbError(f"--init-from {source} does not fit these settings and task ({reason})") from None
 
+        unnormalized = f"--init-from {source} normalizes observations; give --set normalize_observation=true"
         config, name = read_config(source), self.config.algorithm
         if config:
             saved = type(self)(source, config).saved() if config.algorithm == name else None
             if not saved:
                 raise DmcvbError(f"--init-from {source}: no run of {name} is saved there; give its folder or a policy")
             fit(lambda: model.policy.load_state_dict(saved["parameters"]["policy"]))
-            if normalize and normalize.norm_obs and "obs_rms" in saved.get("normalize", {}):
-                _set_statistics(normalize.obs_rms, saved["normalize"]["obs_rms"])
+            statistics = saved.get("normalize", {}).get("obs_rms")
+            if normalize and normalize.norm_obs:
+                if statistics:
+                    _set_statistics(normalize.obs_rms, statistics)
+                else:  # its networks saw observations as they are
+                    normalize.obs_rms.count = 1e5
+            elif statistics:
+                raise DmcvbError(unnormalized)
             return
         weights = as_tensors(load_policy(source).weights)
         fit(lambda: model.policy.load_state_dict({name: weights[ours] for ours, name in self._names().items()}, False))
@@ -280,7 +304,7 @@ class Sb3Run(Run):
             normalize.obs_rms.mean = weights["observation_mean"].numpy().astype(float)
             normalize.obs_rms.var, normalize.obs_rms.count = std**2, 1e5
         elif weights["observation_mean"].any() or (weights["observation_std"] != 1).any():
-            raise DmcvbError(f"--init-from {source} normalizes observations; give --set normalize_observation=true")
+            raise DmcvbError(unnormalized)
 
 
 def _statistics(running: RunningMeanStd) -> dict[str, Any]:

@@ -3,8 +3,8 @@
 Paper, section 3.1: expert is the first checkpoint with 95 % of the return at convergence, medium the one with 50 %,
 mixed eight checkpoints evenly spaced, in training steps, from the start to medium. Mean actions are judged, as the data
 are made of them. Returns of mazes are negative, so an expert costs at most 1 / 0.95 of what the return at convergence
-does, and medium is the checkpoint whose mean return is nearest to the paper's row of its group; the paper has no mixed
-data of mazes.
+does, and medium is the checkpoint whose mean return is nearest to the paper's row of its group (half of the way in a
+maze of one's own, which has no row); the paper has no mixed data of mazes.
 """
 
 from __future__ import annotations
@@ -176,6 +176,7 @@ def pick_checkpoints(
     task: str = "",
     levels: Sequence[str] = TRAINED_LEVELS,
     medium: float | None = None,
+    costs: bool = False,
 ) -> Selection:
     """Pick levels from a curve; every pick is measured on fresh episodes before it is accepted.
 
@@ -185,6 +186,7 @@ def pick_checkpoints(
       measure: evaluates a policy file on fresh episodes.
       levels: levels to pick, out of `TRAINED_LEVELS`.
       medium: return that medium is to have; None: half of the way.
+      costs: returns are negative, as in mazes: an expert's is `convergence` over the share, not so much of the way.
     """
     way, check = convergence.value - base, functools.cache(measure)
     curve = [point for point in curve if point[2] is not None]
@@ -192,12 +194,11 @@ def pick_checkpoints(
         reason = convergence.reason or "the run has no evaluated checkpoint yet"
         return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
     found: dict[str, tuple[Pick, ...] | str] = {}
-    if medium is None:
-        found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check)
-    else:
-        # Returns of mazes are costs: 95 % of the way from the random policy's would be half again as much as the end's.
+    if costs and convergence.value < 0:  # 95 % of the way from the random policy's return would cost half again as much as the end's
         goal = convergence.value / EXPERT_SHARE
         found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check)
+    else:
+        found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check)
     if not convergence.converged:
         found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
     last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
@@ -300,7 +301,7 @@ def select_checkpoints(
         if converged is not None:
             end = Convergence(converged, 0.0, True)
         levels = MAZE_TRAINED_LEVELS if mazes else TRAINED_LEVELS
-        return pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id))
+        return pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id), mazes)
 
     for attempt in range(5):
         try:

@@ -22,7 +22,7 @@ from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.state_file import STATE, read_state
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.training.episodes import Episodes, shaping_of
+from dmcvb_gen.training.episodes import Episodes, shaping_of, useless_setting
 from dmcvb_gen.training.networks import as_tensors
 from dmcvb_gen.training.runs import (
     Progress,
@@ -65,8 +65,7 @@ class ReplayRun(Run):
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
         loop, next_evaluation = ReplayLoop(self, saved), self.config.evaluate_every
         if saved:
-            next_evaluation = (self.step // self.config.evaluate_every + 1) * self.config.evaluate_every
-            next_evaluation = saved.get("next_evaluation", next_evaluation)
+            next_evaluation = saved["next_evaluation"]
 
         def state() -> dict[str, Any]:
             return loop.state() | {"next_evaluation": next_evaluation}
@@ -116,16 +115,18 @@ class ReplayLoop:
         self._owed = 0.0  # updates
         if saved:
             place = saved["buffer"]
-            if self.buffer.found < min(place["size"], rows):
+            kept = {"owed", "episodes", "rng", "next_evaluation"} <= saved.keys() and "size" in place
+            if not kept or self.buffer.found < min(place["size"], rows):
                 raise DmcvbError(f"{run.folder} was trained by an earlier version; start again in another --out")
             _fit(f"{run.folder} cannot be resumed", self.learner.load_state, saved["learner"])
-            self.buffer.restore(place["position"], place["full"], place.get("size"))
+            self.buffer.restore(place["position"], place["full"], place["size"])
             self.rng.bit_generator.state = json.loads(saved["rng"])
-            self._owed = saved.get("owed", 0.0)
+            self._owed = saved["owed"]
         elif config.init_from:
             _start_from(self.learner, config.algorithm, config.init_from)
-        self.episodes, self._shaping = Episodes(run, self.rng), shaping_of(task)
-        if saved and "episodes" in saved:
+        self.episodes = Episodes(run, self.rng)
+        self._shaping = shaping_of(task) if settings.shaping else None
+        if saved:
             self.observation = self.episodes.restore(saved["episodes"])
         else:
             self.observation = self.episodes.start(np.arange(settings.simulations))
@@ -158,7 +159,7 @@ class ReplayLoop:
         reward = result.reward
         if settings.progress:
             reward = reward + settings.progress * (before - batch.path_length())
-        if settings.shaping:
+        if self._shaping:
             reward = reward + settings.shaping * self._shaping(result.state)
         reached, ended = batch.behaviour_observation(), self.episodes.ending(result.terminated)
         self.learner.returns.update(reward, ended)
@@ -256,6 +257,8 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         raise DmcvbError(f"--init-from {config.init_from} is neither a run folder nor a policy file")
     config = dataclasses.replace(config, init_sha256=found.init_sha256 if found else _digest(config.init_from))
     run = run_class(config.algorithm)(folder, config)
+    if problem := useless_setting(run.task, run.settings):
+        raise DmcvbError(problem)
     if config.steps <= run.warmup():
         raise DmcvbError(
             f"{config.steps} steps are all warm-up ({run.warmup()} steps), nothing would be learned; give more "

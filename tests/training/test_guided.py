@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -26,6 +29,18 @@ def config(task="ant-maze-easy7x7a", steps=640, **changes):
     settings = dict(simulations=8, batch_size=64, updates_per_step=0.5) | changes.pop("settings", {})
     fields = dict(algorithm="guided", seed=0, evaluate_every=steps, evaluate_sparse=steps)
     return RunConfig(task=task, steps=steps, settings=settings, **fields | changes)
+
+
+def test_a_run_goes_on_when_its_guide_is_gone(tmp_path, monkeypatch):
+    guide = tmp_path / "guide.safetensors"
+    shutil.copy(bundled_policies("ant-maze-empty7x7", "expert")[0], guide)
+    monkeypatch.setattr(runs, "EVALUATION_STEPS", {"ant-maze": 0.5})
+    asked = config(steps=16, init_from=str(guide))
+    open_run(tmp_path / "run", asked, False).train()
+    guide.unlink()
+    run = open_run(tmp_path / "run", dataclasses.replace(asked, steps=32), True)
+    run.train()
+    assert run.step == 32 and run.walker.digest == run.header.training["walker"]
 
 
 def walked(task, steps=30, size=6):

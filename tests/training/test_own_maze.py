@@ -42,7 +42,7 @@ def quick_selection(monkeypatch):
     select = selection.select_checkpoints
 
     def select_fast(folder, episodes, progress):
-        return select(folder, 5, converged=-70.0, progress=progress)
+        return select(folder, 5, converged=-80.0, progress=progress)
 
     monkeypatch.setattr(selection, "select_checkpoints", select_fast)
     monkeypatch.setattr(selection, "MEDIUM_TOLERANCE", 0.6)

@@ -41,7 +41,7 @@ def train(folder, algorithm, **changes):
 @pytest.mark.parametrize("algorithm", TINY)
 def test_an_exported_policy_acts_as_the_model_it_comes_from(tmp_path, models, algorithm):
     run = train(tmp_path / "run", algorithm)
-    policy, model = load_policy(run.folder / "checkpoints" / "0000000080.safetensors"), models[0]
+    policy, model = load_policy(run.folder / "checkpoints" / "0000000080.safetensors"), models[-1]
     observation = np.random.default_rng(0).normal(0, 3, (200, run.task.behaviour_size)).astype(np.float32)
     env = model.get_env()
     seen = env.normalize_obs(observation) if isinstance(env, VecNormalize) else observation
@@ -89,6 +89,9 @@ def test_a_warm_start_takes_the_networks_of_a_run_or_a_policy(tmp_path, models, 
         save_policy(tmp_path / "normal.safetensors", normal.header, arrays)
         unnormal = TINY[algorithm] | {"normalize_observation": False}
         train(tmp_path / "unnormal", algorithm, init_from=str(tmp_path / "normal.safetensors"), settings=unnormal)
+    if algorithm == "ppo":  # its runs normalize by default
+        with pytest.raises(DmcvbError, match="normalizes observations; give --set normalize_observation=true"):
+            train(tmp_path / "unnormal", algorithm, init_from=str(first.folder), settings=unnormal)
     with pytest.raises(DmcvbError, match="neither a run folder nor a policy file"):
         train(tmp_path / "none", "td3", init_from=str(tmp_path / "nowhere"))
-    assert not (tmp_path / "none").exists()
+    assert not any((tmp_path / name).exists() for name in ("wide", "td3", "unnormal", "none")), "refused in time"

@@ -158,7 +158,7 @@ def test_a_maze_medium_is_nearest_to_the_papers_row():
     for task_id in ("ant-maze-empty7x7", "ant-maze-easy7x7b", "ant-maze-medium7x7c"):
         goal = medium_return(task_id)
         end = converge(STEPS, returns, -450.0)
-        found = pick_checkpoints(curve, -450.0, end, measure, levels=MAZE_LEVELS, medium=goal)
+        found = pick_checkpoints(curve, -450.0, end, measure, levels=MAZE_LEVELS, medium=goal, costs=True)
         assert found.picks["medium"][0].evaluation.mean == pytest.approx(goal, abs=10)
         assert -50 / 0.95 <= found.picks["expert"][0].evaluation.mean <= -50  # 95 % of the way would be -70
         picked[task_id] = goal
@@ -307,5 +307,8 @@ def test_mazes_have_no_mixed_level():
         return Evaluation(mean=curve[int(path.name)][1], std=0, episodes=100, mode="mean", seed=0)
 
     convergence = converge([p[0] for p in curve], [p[1] for p in curve], -450)
-    found = pick_checkpoints(curve, -450, convergence, measure, levels=MAZE_LEVELS)
+    found = pick_checkpoints(curve, -450, convergence, measure, levels=MAZE_LEVELS, costs=True)
     assert set(found.picks) == {"expert", "medium"} and not found.reasons
+    # A maze of one's own has no row in the paper: its expert is a maze's all the same, its medium at half of the way.
+    assert found.picks["expert"][0].target == f"return {convergence.value / 0.95:.1f}"
+    assert found.picks["medium"][0].target == f"return {(convergence.value - 450) / 2:.1f}"

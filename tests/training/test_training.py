@@ -231,6 +231,15 @@ def test_a_sharpened_learner_takes_smaller_steps():
     assert 0 < (sac.critic.head - before).abs().max() < 1.1e-5  # Adam's first step is the learning rate
 
 
+def test_the_sharp_rate_stands_in_for_the_falling_one():
+    sac = learner(sharpen_after=10, sharp_learning_rate=1e-5, rate_half_life=1000)
+    sac.begin_round(9)
+    assert 9e-4 < sac.actor_optimizer.param_groups[0]["lr"] < sac.settings.learning_rate
+    sac.begin_round(100)
+    optimizers = (sac.actor_optimizer, sac.critic_optimizer, sac.alpha_optimizer)
+    assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == [1e-5] * 3
+
+
 def test_running_statistics_are_those_of_all_values():
     rng, norm, seen = np.random.default_rng(0), RunningNorm(3), []
     for count in (1, 7, 100, 30):
@@ -404,14 +413,29 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
     assert share * defaults / 500 > 4  # enough episodes for a curve that medium is picked from
 
 
+@pytest.mark.parametrize(
+    ("task", "setting", "words"),
+    [
+        ("walker-walk", "sunken_starts", "only for ant mazes"),
+        ("cheetah-run", "progress", "only for ant mazes"),
+        ("cheetah-run", "shaping", "only for humanoid-walk and ant mazes"),
+        ("ant-maze-easy7x7b", "standing_starts", "not for ant mazes"),
+    ],
+)
+@pytest.mark.parametrize("algorithm", ["sac", "mpo"])
+def test_a_setting_that_the_task_has_no_use_for_begins_no_run(tmp_path, task, setting, words, algorithm):
+    asked = config(task=task, algorithm=algorithm, settings={setting: 0.01})
+    with pytest.raises(DmcvbError, match=f"setting {setting} is {words}.* remove it"):
+        open_run(tmp_path / "run", asked, False)
+    assert not (tmp_path / "run").exists()
+
+
 def test_what_only_mazes_have(tmp_path):
     """Ants may start sunken in the floor, walkers may not; a share of the simulations acts by the mean."""
     settings = TINY | dict(mean_share=0.5, sunken_starts=1.0, shaping=1.0, train_episode_steps=6)
     asked = config(task="ant-maze-easy7x7a", steps=96, evaluate_every=96, settings=settings)
     open_run(tmp_path / "run", asked, False).train()
     assert len(list((tmp_path / "run" / "checkpoints").iterdir())) == 1
-    with pytest.raises(DmcvbError, match="mazes"):
-        open_run(tmp_path / "walker", config(settings=TINY | {"sunken_starts": 1.0}), False).train()
     sac = learner(mean_share=0.5)
     observation = np.zeros((8, 3), np.float32)
     first, second = sac.act(observation), sac.act(observation)
