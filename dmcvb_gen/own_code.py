@@ -6,11 +6,13 @@ command line does, for what is typed there) or in an environment variable are ru
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
@@ -25,6 +27,12 @@ _OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 def is_own(name: str) -> bool:
     """Return True if a name has the form "<module>:<function>"."""
     return _OWN_ID.fullmatch(name) is not None
+
+
+def source_digest(module: str) -> str:
+    """SHA-256 of an imported module's file; "" for code without a file."""
+    file = getattr(sys.modules[module], "__file__", None)
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
 
 
 def allow(names: Iterable[str], variable: str = TASKS) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -37,10 +38,24 @@ def write_curve(folder: Path, points: list[dict], of_data: float) -> None:
     minutes = [point["seconds"] / 60 for point in points]
     axes.errorbar(minutes, [p["return"] for p in points], [p["error"] for p in points], marker="o", label="agent")
     axes.axhline(of_data, color="gray", linestyle="--", label="data")
-    axes.set(xlabel="minutes of one core", ylabel="return", ylim=(0, None))
+    axes.set(xlabel="minutes of one core", ylabel="return")
+    if of_data > 0:
+        axes.set_ylim(bottom=0)
     axes.legend()
     figure.savefig(folder / "curve.png", dpi=120)
     plt.close(figure)
+
+
+def keep_options(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Write the options into the folder; refuse a folder whose training had others."""
+    asked = {name: str(value) for name, value in vars(options).items() if name != "folder"}
+    path = options.folder / "options.json"
+    if path.exists():
+        if json.loads(path.read_text()) != asked:
+            parser.error(f"{options.folder} holds a training with other options, see {path}; choose another --folder")
+        return
+    options.folder.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(asked, indent=1) + "\n")
 
 
 def main() -> None:
@@ -55,9 +70,10 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    keep_options(options, parser)
     torch.set_num_threads(1)
     agent, profile = parse_agent(options.agent), get_profile(options.profile).scaled(options.scale)
-    if agent.pretrain or agent.sees_state:
+    if agent.own or agent.pretrain or agent.sees_state:
         parser.error("--agent: one that trains its own encoder on pictures")
     subset = open_release(options.release)[options.subset]
     data = load_data([Source(subset)], seed=options.seed, stack=agent.stack)
@@ -78,17 +94,17 @@ def main() -> None:
         print(f"{done[0]:>9,} of {settings.steps:,} steps: {score.mean:7.1f} +- {score.stderr:.1f}", flush=True)
         return {"return": score.mean, "error": score.stderr}
 
+    steps = -(-profile.pixel_steps // options.scores) * options.scores  # so that the last score is of a whole stretch
     settings = TrainSettings(
-        steps=profile.pixel_steps,
+        steps=steps,
         batch_size=profile.batch_size,
-        evaluate_every=-(-profile.pixel_steps // options.scores),
+        evaluate_every=steps // options.scores,
         points=options.scores,
         half=options.precision == "bfloat16",
         rate=profile.rate,
         shift=profile.shift,
         decay=profile.decay,
     )
-    options.folder.mkdir(parents=True, exist_ok=True)
     curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
     evaluator.close()
     write_curve(options.folder, [point for point in curve if "return" in point], float(subset.returns.mean()))

@@ -34,6 +34,10 @@ def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path)
         assert [line.split()[0] for line in printed.splitlines()] == ["2", "4", "6"]
         rows = (tmp_path / "curve" / task / "curve.csv").read_text().splitlines()
         assert len(rows) == 4 and (tmp_path / "curve" / task / "curve.png").exists()
+        other = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", next(iter(release))]
+        other += [*options, "--seed", "1"]
+        refused = subprocess.run(other, capture_output=True, text=True)
+        assert refused.returncode == 2 and "choose another --folder" in refused.stderr
 
 
 @pytest.mark.slow

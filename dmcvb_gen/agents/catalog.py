@@ -21,6 +21,7 @@ from dmcvb_gen.agents.data import FRAMES, Sizes
 from dmcvb_gen.agents.learners import PARTS, Learner, Policy, ReadyEncoder
 from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, observation_encoder, state_encoder
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.own_code import source_digest
 
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A user's own agent: "module:name"."""
@@ -110,6 +111,12 @@ class Agent:
     def options_of(self, part: str | None) -> dict[str, int | bool]:
         """Those of its options that one of its parts takes."""
         return {name: value for name, value in self.options if part and name in PARTS.get(part).options}
+
+    def foreign_code(self) -> dict[str, str]:
+        """Part -> SHA-256 of its module's file, of parts from other packages: one that changed is trained again."""
+        parts = (part for part in (self.policy, self.pretrain) if part and not self.own)
+        modules = {part: PARTS.get(part).__module__ for part in parts}
+        return {part: source_digest(module) for part, module in modules.items() if not module.startswith("dmcvb_gen.")}
 
     def facts(self) -> dict[str, Any]:
         """All of it as plain values, under the names that results of earlier versions have."""

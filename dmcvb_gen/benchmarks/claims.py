@@ -1,8 +1,9 @@
 """Test the paper's claims on our scores of one or more seeds.
 
-Results that differ in nothing but the seed are taken together: the mean of all their episodes; its standard error is
-that of the episodes, or of the seeds' means if these lie further apart. A difference counts from two of its
-standard errors on; what lies nearer is left open, whatever its sign.
+Results that differ in nothing but the seed are taken together: the mean of all their episodes. All seeds are evaluated
+from the same starts, so the standard error is that over starts, each with its mean over seeds, or that of the
+seeds' means if it is larger. A difference counts from two of its standard errors on; what lies nearer is left open,
+whatever its sign.
 """
 
 from __future__ import annotations
@@ -140,9 +141,9 @@ def _place(result: Mapping[str, Any]) -> Place:
 
 
 def _pool(results: Sequence[Mapping[str, Any]]) -> Pooled:
-    returns = np.concatenate([result["score"]["returns"] for result in results])
-    seeds = np.array([np.mean(result["score"]["returns"]) for result in results])
-    within = returns.std(ddof=1) / math.sqrt(len(returns)) if len(returns) > 1 else math.inf
+    returns = np.array([result["score"]["returns"] for result in results])  # (seed, start)
+    seeds, starts = returns.mean(axis=1), returns.mean(axis=0)
+    within = starts.std(ddof=1) / math.sqrt(len(starts)) if len(starts) > 1 else math.inf
     between = seeds.std(ddof=1) / math.sqrt(len(seeds)) if len(seeds) > 1 else 0.0
     data = float(np.mean([result["data"]["mean"] for result in results]))
     like_data = all(result["score"].get("limit") == result["data"].get("limit") for result in results)

@@ -204,7 +204,7 @@ def _row_of(result: dict[str, Any], facts: dict[str, Any], release: Release) -> 
         made=facts["made"][:10],
         generator=result["generator"],
         processor=facts["versions"]["cpu"],
-        precision=result["machine"]["precision"],
+        precision="float32" if cell["agent"]["sees_state"] else result["machine"]["precision"],
         evaluation=Evaluation(
             episodes=len(score["returns"]),
             steps=evaluation["steps"],

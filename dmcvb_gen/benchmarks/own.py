@@ -7,18 +7,17 @@ attributes of the named object, if it has them, say what its policy sees: `stack
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
 import os
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.benchmarks.evaluate import Act
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.source import StepSource
+from dmcvb_gen.own_code import source_digest
 
 
 @dataclass(frozen=True)
@@ -102,5 +101,4 @@ class OwnAgent:
     @property
     def digest(self) -> str:
         """SHA-256 of the module's file, so that a changed agent is scored again; "" for code without a file."""
-        file = getattr(sys.modules[self.name.partition(":")[0]], "__file__", None)
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
+        return source_digest(self.name.partition(":")[0])

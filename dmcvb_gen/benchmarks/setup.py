@@ -28,6 +28,7 @@ from dmcvb_gen.benchmarks.profiles import Profile
 from dmcvb_gen.benchmarks.suites import Cell, Part, slug
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.files import write_json
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, PaintedSubset, Painting, painted_release
 from dmcvb_gen.spec import is_maze
 
@@ -128,7 +129,7 @@ def sees_pictures(agent: Agent) -> bool:
 
 
 def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str:
-    """SHA-256 of everything that decides a result, the machine aside.
+    """SHA-256 of everything that decides a result; of the machine, the precision alone.
 
     Raises:
       DmcvbError: an encoder's weights or background videos are needed and not there.
@@ -142,6 +143,10 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
         "seed": setup.seed,
         "data": {name: subset_digest(release[name].commits) for name in sorted(subsets)},
     }
+    if not (work.agent.sees_state or work.agent.own):
+        facts["precision"] = setup.precision
+    if code := work.agent.foreign_code():
+        facts["code"] = code
     if isinstance(work, Cell):
         subset, pair = release[work.policy[0].subset], work.policy[0].goal_pair
         facts["evaluation"] = protocol(
@@ -160,6 +165,22 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
         if work.agent.ready_encoder:
             facts[work.agent.pretrain] = work.agent.ready_encoder.digest(setup.dino_weights)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+PRECISION_FILE = "precision.json"
+"""What `--precision auto` took when the report was begun: a report that goes on keeps to it."""
+
+
+def kept_precision(out: str | Path, device: str) -> str | None:
+    """The precision in which a report's networks compute on a device; None if it has not begun."""
+    found = (read_result(Path(out) / PRECISION_FILE) or {}).get(device)
+    return found if found in ("float32", "bfloat16") else None
+
+
+def keep_precision(setup: Setup) -> None:
+    """Note the precision of a report that begins."""
+    path = Path(setup.out) / PRECISION_FILE
+    write_json(path, (read_result(path) or {}) | {setup.device: setup.precision})
 
 
 def read_result(path: Path, wanted: str | None = None) -> dict[str, Any] | None:

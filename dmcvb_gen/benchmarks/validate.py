@@ -19,7 +19,7 @@ from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.profiles import get_profile
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
-from dmcvb_gen.benchmarks.setup import Setup, open_data
+from dmcvb_gen.benchmarks.setup import Setup, keep_precision, kept_precision, open_data
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Missing, plan_benchmark
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.distractors import load_backgrounds
@@ -121,7 +121,7 @@ def make_setup(
       out: folder of the report, by default reports/<the release's folder>.
       profile: "smoke", "brief", "quick" or "paper". scale: factor of its steps.
       workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
-      precision: "auto" times float32 and bfloat16 and takes the faster one.
+      precision: "auto" times float32 and bfloat16 and takes the faster one; a report that goes on keeps to its own.
       memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
       training: False if only the structure is checked, which needs no probe of the precision.
       fields: others of `Setup`.
@@ -131,13 +131,14 @@ def make_setup(
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
-    sizes = get_profile(profile).scaled(scale)
+    sizes, out = get_profile(profile).scaled(scale), out or Path("reports") / Path(path).name
     threads = threads or (default_threads(workers) if isinstance(workers, int) else 1)
     if training:
-        precision = choose_precision(precision, encoder_product(sizes.network), device, threads)
+        kept = kept_precision(out, device) if precision == "auto" else None
+        precision = kept or choose_precision(precision, encoder_product(sizes.network), device, threads)
     return Setup(
         root=str(path),
-        out=str(out or Path("reports") / Path(path).name),
+        out=str(out),
         profile=sizes,
         device=device,
         precision=precision if training else "float32",
@@ -187,6 +188,8 @@ def validate(
     structure = check_structure(chosen, setup.backgrounds, progress.checking, workers)
     results = []
     if structure.sound or train_unsound:
+        if cells:
+            keep_precision(setup)
         progress.total(planned_steps(setup.profile, cells))
         for cell, result in run_cells(setup, cells, workers, progress.training):
             progress.done(cell, result)

@@ -40,9 +40,12 @@ def validate(own, strict, as_json, **options):
     if options["checks_only"]:
         refuse(context, TRAINING, "--checks-only trains nothing")
     options["agents"] = _agents(options["agents"], own)
+    from dmcvb_gen.benchmarks.setup import kept_precision
+
     setup = commands.validation_setup(options)
     if options["precision"] == "auto" and not options["checks_only"]:
-        click.echo(f"Networks that see images compute in {setup.precision}, the faster one here.", err=True)
+        why = "as before" if kept_precision(setup.out, setup.device) else "the faster one here"
+        click.echo(f"Networks that see images compute in {setup.precision}, {why}.", err=True)
     on_score = (lambda *_: None) if as_json else functools.partial(_show_score, setup.profile)
     result = commands.run_validation(setup, options, on_score)
     code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1

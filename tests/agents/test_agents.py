@@ -625,4 +625,4 @@ def test_every_agent_can_be_made_and_acts(name):
     policy = make_policy(agent, encoder, data.sizes)
     action = policy.act(data.observe(data.train_rows[:3]))
     assert action.shape == (3, 2) and action.abs().max() <= 1
-    assert policy.encoder.features == (64 if not agent.sees_state else policy.encoder.features)
+    assert policy.encoder.features == 64

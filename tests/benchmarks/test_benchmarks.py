@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +13,18 @@ from PIL import Image
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.data import Normalization, Source, default_memory, load_data, normalize_pixels
+from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.benchmarks import experiments, report
+from dmcvb_gen.benchmarks import validate as validate_module
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.experiments import _DataCache, run_cell, train_settings
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
-from dmcvb_gen.benchmarks.setup import Setup, fingerprint, open_data, pretraining_of
+from dmcvb_gen.benchmarks.setup import Setup, fingerprint, keep_precision, open_data, pretraining_of
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
+from dmcvb_gen.benchmarks.validate import make_setup
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import training_pictures
@@ -29,6 +34,8 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.parallel import Needs, Ray, SerialPool
 from dmcvb_gen.parallel.ray_pool import share_of_node
 from dmcvb_gen.tasks import get_task
+
+EXAMPLES = Path(__file__).parents[2] / "docs" / "examples" / "extending"
 
 
 def release_of(*names, episodes=100, committed=None, shape=(), **facts):
@@ -377,6 +384,45 @@ def test_what_a_score_hangs_on_besides_the_data_is_in_its_fingerprint(small_rele
     save_file({"x": torch.ones(1)}, str(weights))
     after = fingerprint(plain, release, by_agent["dino+bc"]), fingerprint(plain, release, by_agent["bc"])
     assert before[0] != after[0] and before[1] == after[1]
+
+
+def test_the_precision_of_pictures_is_in_the_fingerprint_of_what_sees_them(small_release, tmp_path):
+    release = open_release(small_release)
+    cells = {cell.agent.name: cell for cell in plan_benchmark("b1", release, ["bc", "id+bc", "state-bc"])[0]}
+    exact = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+    rounded = dataclasses.replace(exact, precision="bfloat16")
+
+    def differ(work):
+        return fingerprint(exact, release, work) != fingerprint(rounded, release, work)
+
+    assert differ(cells["bc"]) and differ(pretraining_of(cells["id+bc"])) and not differ(cells["state-bc"])
+
+
+def test_a_report_that_goes_on_keeps_the_precision_that_auto_took(monkeypatch, tmp_path):
+    taken = iter(("bfloat16", "float32"))
+    monkeypatch.setattr(
+        validate_module, "choose_precision", lambda asked, *_: next(taken) if asked == "auto" else asked
+    )
+    first = make_setup("release", out=tmp_path)
+    keep_precision(first)
+    again, asked = make_setup("release", out=tmp_path), make_setup("release", out=tmp_path, precision="float32")
+    assert (first.precision, again.precision, asked.precision) == ("bfloat16", "bfloat16", "float32")
+    assert make_setup("release", out=tmp_path / "other").precision == "float32"
+
+
+def test_an_agent_of_another_package_that_changed_is_another_one(small_release, tmp_path, monkeypatch):
+    release, file = open_release(small_release), tmp_path / "theirs.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(PARTS, "_things", dict(PARTS.all()))
+    monkeypatch.setattr(PARTS, "_code", dict(PARTS._code))
+    file.write_text((EXAMPLES / "agent.py").read_text().replace("linear-bc", "their-bc"))
+    importlib.import_module("theirs")
+    cells = {cell.agent.name: cell for cell in plan_benchmark("b1", release, ["their-bc", "bc"])[0]}
+    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
+    before = {name: fingerprint(setup, release, cell) for name, cell in cells.items()}
+    file.write_text(file.read_text() + "\n# changed\n")
+    after = {name: fingerprint(setup, release, cell) for name, cell in cells.items()}
+    assert before["their-bc"] != after["their-bc"] and before["bc"] == after["bc"]
 
 
 def test_workers_share_the_memory_for_pictures(small_release):

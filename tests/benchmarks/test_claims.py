@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -103,6 +104,16 @@ def test_seeds_that_lie_apart_widen_the_error():
     assert score.mean == 70 and score.seeds == (50, 90) and score.stderr == pytest.approx(20)
     (alone,) = pool([one]).values()
     assert alone.stderr == pytest.approx(1 / 3**0.5)
+
+
+def test_starts_that_all_seeds_share_do_not_average_out():
+    rng, errors, means = np.random.default_rng(0), [], []
+    for _ in range(200):
+        starts = rng.normal(0, 100, 30)
+        (score,) = pool(result("bc", "none", list(starts + rng.normal(0, 30, 30))) for _ in range(5)).values()
+        errors.append(score.stderr)
+        means.append(score.mean)
+    assert np.mean(errors) == pytest.approx(np.std(means), rel=0.15)
 
 
 def test_numbers_that_claim_no_score_answer_nothing():

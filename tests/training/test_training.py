@@ -403,7 +403,6 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
         return evaluate(policy, task, 2, **given)
 
     monkeypatch.setattr(runs, "evaluate", counted)
-    monkeypatch.setattr(SacRun, "_base", 0.0, raising=False)
     run = open_run(tmp_path / "run", config(task=task_id, steps=1600, evaluate_every=400, evaluate_sparse=400), False)
     run.train()
     share = runs.EVALUATION_STEPS[run.task.family]
