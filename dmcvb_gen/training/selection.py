@@ -194,9 +194,7 @@ def pick_checkpoints(
         reason = convergence.reason or "the run has no evaluated checkpoint yet"
         return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
     found: dict[str, tuple[Pick, ...] | str] = {}
-    if (
-        costs and convergence.value < 0
-    ):  # 95 % of the way from the random policy's return would cost half again as much as the end's
+    if costs and convergence.value < 0:  # 95 % of the way from a random policy's return costs half again as much
         goal = convergence.value / EXPERT_SHARE
         found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check)
     else:
