@@ -101,7 +101,7 @@ def rollout(
       vary (PART,...): Vary only these parts: camera, color, background, shake, light. [default: the first three]
       video_count: Background videos in use. [default: by the difficulty]
       correlated (RHO): dynamic: also show a spurious cue that correlates with the last action.
-      goals: Mazes: visible or hidden. [default: visible]
+      goals: Mazes: visible, hidden or fixed. [default: visible]
       fixed_goals: Mazes: this many fixed (start, goal) pairs (B3).
       episodes_per_goal: Mazes: episodes of each fixed pair. [default: 10]
       layouts: Mazes: name or text file of a layout, instead of TASK.
@@ -208,10 +208,10 @@ def repaint(
     Args:
       release (RELEASE): Folder of the release.
       only (PATTERN): Use only these subsets.
-      distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: as each subset has]
-      difficulty: Strength of the distractors. [default: as each subset has]
-      size: Width and height in pixels. [default: as each subset has]
-      renderer: native, warp or opengl. [default: as each subset has]
+      distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: the subset's own]
+      difficulty: Strength of the distractors. [default: the subset's own]
+      size: Width and height in pixels. [default: the subset's own]
+      renderer: native, warp or opengl. [default: the subset's own]
       samples: Samples per pixel: 1, 2, 4 or 8.
       backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
       split: Background videos and maze styles. [default: the recipe's]

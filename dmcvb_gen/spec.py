@@ -34,9 +34,12 @@ class Level(enum.StrEnum):
         """The level of a name.
 
         Raises:
-          UnknownNameError: there is no such level.
+          DmcvbError: there is no such level.
         """
         if name not in LEVELS:
+            if set(parts := name.split(",")) <= set(LEVELS):
+                each = " ".join(f"--level {part}" for part in parts)
+                raise DmcvbError(f"unknown level {name!r}: give one name each time: {each}")
             raise UnknownNameError("level", name, LEVELS)
         return cls(name)
 

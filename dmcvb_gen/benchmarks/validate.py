@@ -16,6 +16,7 @@ from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.networks import encoder_product
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
+from dmcvb_gen.benchmarks.own import OwnAgent
 from dmcvb_gen.benchmarks.profiles import get_profile
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
@@ -232,6 +233,9 @@ def _plan(
         cells += found
         missing += lacking
     used = {cell.agent for cell in cells}
+    for agent in used:
+        if agent.own:
+            OwnAgent.load(agent.own)  # a wrong name is told before any work
     idle = [name for name in agents if (agent := parse_agent(name)).pretrain is None and agent not in used]
     if benchmarks and idle:
         raise DmcvbError(

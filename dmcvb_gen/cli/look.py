@@ -66,7 +66,7 @@ def info(path, options, as_json):
         size += f" ({format_bytes(facts['disk_bytes'])} on disk)"
     click.echo(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}")
     if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
-        click.echo("* Episodes end sooner than the paper's, so their returns do not compare.")
+        click.echo("* Episodes end sooner than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
         paint = f"fetch {public(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {path}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
@@ -188,7 +188,7 @@ def status(place, options, as_json):
         ],
         title=f"{found.name}: {found.done:,} of {found.total:,} shards",
     )
-    if found.steps_per_second:
+    if found.steps_per_second and found.done < found.total:
         last, left = format_duration(found.silence), format_duration(found.seconds_left)
         rate = f"{found.steps_per_second:,.0f} steps/s"
         click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")

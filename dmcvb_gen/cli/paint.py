@@ -54,7 +54,7 @@ def _whole_shards(out, episodes):
     here = {name: len(subset.episodes) for name, subset in open_release(out).subsets.items()}
     name = max(here, key=here.get, default=None)
     if name and here[name] > (asked := episodes[1] - episodes[0]):
-        yield f"Shards come whole: {name} has {here[name]} episodes here, and {asked} were asked for."
+        yield f"A shard is fetched whole: {name} has {here[name]} episodes now; you asked for {asked}."
 
 
 def _tell(text):

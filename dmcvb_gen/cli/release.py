@@ -68,7 +68,7 @@ def regenerate(release, out, as_json, **options):
 
     Without --check and --out it repairs damaged and missing shards in place. If only a part was fetched, it repairs
     that part. Exit code 1 if a shard comes out different: the command then says what differs in the environment, and
-    how far the values are apart. With --check, exit code 3 if all shards here are right and others are not here.
+    how far the values are apart. With --check, exit code 3 if all shards here match, but some shards are missing.
 
     \b
     dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
@@ -102,7 +102,7 @@ def _regenerated(place, outcome):
 
 @command_of(commands.repaint)
 def repaint(release, out, as_json, **options):
-    """Give episodes new pixels, from their stored physics states: nothing is simulated.
+    """Render stored episodes again from their physics states. Nothing is simulated.
 
     \b
     dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\

@@ -47,8 +47,8 @@ OPTION_GROUPS = {
 def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options):
     """Roll out behaviour policies into a release of episodes.
 
-    Rerun the same command to resume: finished shards are kept. With --recipe, the options TASK, --level, --distractor
-    and --goal select a part of the recipe, and other options override its values. Without TASK and --recipe, the
+    Rerun the same command to resume: finished shards are kept. With --recipe, TASK, --level, --distractor and
+    --goal select a part of the recipe, and other options override its values. Without TASK and --recipe, the
     release at --out resumes from its own manifest.
 
     On many machines: run --init once, then --part 1/N to --part N/N anywhere, then --finish; see docs/scale.md.

@@ -111,9 +111,9 @@ def claims(reports, as_json):
     """Test the paper's claims on reports that validate wrote.
 
     Is none above static above dynamic? Does BC(state) stay near its data? Does ID+BC beat the others? Does more data
-    help? Reports that differ in their seed are taken together. A difference counts from two standard errors on (of the
-    episodes, or of the seeds' means if these lie further apart); what lies nearer is open. Last comes Spearman's rho
-    between the scores and the paper's, as shares of their data's returns, with a 95 % bootstrap interval.
+    help? Reports that differ in their seed are taken together. A difference counts if it is at least two standard
+    errors; a smaller one stays open. Last comes Spearman's rho between the scores and the paper's, as shares of their
+    data's returns, with a 95 % bootstrap interval.
 
     \b
     dmcvb-gen validate releases/mini --profile quick --agents bc,state-bc,id+bc --seed 0 --out reports/seed0

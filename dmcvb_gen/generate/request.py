@@ -227,7 +227,9 @@ def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
 
 def _check_given_to_mazes(given: Mapping[str, Any]) -> None:
     if given.get("distractors"):
-        raise RecipeError("--distractor has no effect in mazes, which vary in style: use --goal visible|hidden")
+        raise RecipeError(
+            "--distractor has no effect in mazes, which vary in style: use --goal visible, hidden or fixed"
+        )
     for name in _STRENGTHS:
         if name in given:
             flag = f"--{name.replace('_', '-')}"

@@ -9,7 +9,7 @@ from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file
-from dmcvb_gen.spec import TRAINED_LEVELS
+from dmcvb_gen.spec import TRAINED_LEVELS, is_maze
 
 CONVERTED = (".zip", ".pt", ".pth")
 """Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
@@ -43,9 +43,10 @@ def bundled_policies(task_id: str, level: str) -> list[Path]:
     names = bundled_names(task_id, level)
     if not names:
         have = ", ".join([*bundled_levels(task_id), "random"])
+        command = f"dmcvb-gen train-behaviour {task_id}" + (" --algo guided" if is_maze(task_id) else "")
         raise DmcvbError(
-            f"no {level} policy of {task_id} is bundled (there is: {have}); train one with `dmcvb-gen train-behaviour "
-            f"{task_id}` and `dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
+            f"no {level} policy of {task_id} is bundled (there is: {have}); train one with `{command}` and "
+            "`dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
         )
     return [bundled_file(name) for name in names]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.storage.base import Storage
-from dmcvb_gen.storage.remote import file_system, is_url
+from dmcvb_gen.storage.remote import check_place, file_system, is_url
 
 
 def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) -> Storage:
@@ -24,6 +24,7 @@ def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) ->
 
     url = str(place)
     if not is_url(url):
+        check_place(url)
         return LocalStorage(Path(place))
     protocol, pairs = url.split(":", 1)[0], tuple(sorted((options or {}).items()))
     if protocol == "hf":

@@ -47,17 +47,29 @@ def is_url(path: str) -> bool:
     return "://" in path or path.startswith("file:")
 
 
+def check_place(place: str) -> None:
+    """Refuse a URL with a slash too few, which would silently name a folder "s3:".
+
+    Raises:
+      StoreError: it is one.
+    """
+    if not is_url(place) and (found := re.match(r"([A-Za-z][\w+.-]+):/", place)):
+        meant = public(f"{found[1]}://{place[found.end() :]}")
+        raise StoreError(f"{public(place)} is neither a folder nor a URL; did you mean {meant}?")
+
+
 def local_path(path: str | Path) -> Path:
     """A folder or file here, to be written to: what takes no URLs checks its `out` with this.
 
     Raises:
       StoreError: it is a URL; a `Path` would silently make a folder "s3:".
     """
-    if is_url(str(path)) or re.match(r"[A-Za-z][\w+.-]+:/", str(path)):  # `Path` makes s3:/x of s3://x
+    if is_url(str(path)) or (isinstance(path, Path) and re.match(r"[A-Za-z][\w+.-]+:/", str(path))):  # Path("s3://x")
         raise StoreError(
             f"{public(str(path))} is a URL, and this is written to folders; give a local one and copy it there (a "
             "release: `dmcvb-gen publish FOLDER URL`)"
         )
+    check_place(str(path))
     return Path(path)
 
 

@@ -59,11 +59,11 @@ def train_behaviour(
       task (TASK): Task to learn.
       layout (FILE): Text file of a maze of your own, instead of TASK: learns to walk it (guided) and selects
         checkpoints.
-      out: Folder of the run. [default: runs/TASK]
+      out: Folder of the run. [default: runs/TASK; with --layout: runs/LAYOUT]
       steps: Agent steps (at action repeat 2). [default: the task's]
       seed: Random seed. [default: 0]
       algo: sac, mpo, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo. [default: sac; --layout: guided]
-      settings (KEY=VALUE): Override a setting.
+      settings (KEY=VALUE): Override a setting, e.g. learning_rate=0.0003.
       config (FILE): A YAML file of settings.
       init_from (RUN|FILE): Run or policy file to start from; guided: the guide.
       evaluate_every: Agent steps between evaluations while returns are low.

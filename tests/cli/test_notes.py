@@ -65,8 +65,8 @@ def test_episodes_that_come_with_their_shard_are_counted(release, tmp_path):
     place = f"file:{tmp_path / 'published'}"
     run("publish", release, place)
     said = run("fetch", place, "--episodes", "0:1", "--out", tmp_path / "part")
-    assert "Shards come whole: walker-walk/random/none has 3 episodes here, and 1 were asked for." in said
-    assert "Shards come whole" not in run("fetch", place, "--episodes", "0:3", "--out", tmp_path / "all")
+    assert "A shard is fetched whole: walker-walk/random/none has 3 episodes now; you asked for 1." in said
+    assert "fetched whole" not in run("fetch", place, "--episodes", "0:3", "--out", tmp_path / "all")
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -82,7 +82,7 @@ def test_videos_that_are_kept_for_evaluation_are_counted(tmp_path, count):
 
 def test_returns_of_short_episodes_are_marked(release, tmp_path):
     said = run("info", release)
-    assert "walker-walk/random/none *" in said and "their returns do not compare" in said
+    assert "walker-walk/random/none *" in said and "their returns cannot be compared" in said
     assert json.loads(run("info", release, "--json"))["subsets"][0]["shorter"] is True
     run("rollout", "walker-walk", "--level", "random", "--episodes", 1, "--no-pixels", "--out", tmp_path / "whole")
     assert "*" not in run("info", tmp_path / "whole")

@@ -124,6 +124,15 @@ def test_no_function_makes_a_folder_of_a_url(small_release, elsewhere, call):
     assert not list(elsewhere.iterdir())
 
 
+@pytest.mark.parametrize("command", ["publish", "fetch"])
+def test_a_url_with_a_slash_too_few_is_no_folder(small_release, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    words = {"publish": [str(small_release), "s3:/bucket/demo"], "fetch": ["s3:/bucket/demo", "--out", "here"]}[command]
+    done = CliRunner().invoke(main, [command, *words])
+    assert done.exit_code == 2 and "did you mean s3://bucket/demo?" in done.output and done.output.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_is_no_url_is_a_path():
     for given in ("x", "/x/y", "C:/x", "./s3:/x", "a:b/c"):
         assert local_path(given) == Path(given)
