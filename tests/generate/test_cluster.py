@@ -210,7 +210,9 @@ def test_two_who_begin_in_one_new_folder_both_stay(tmp_path, monkeypatch):
     assert names == {record.name for record in (*first.subsets, *second.subsets)}
 
 
-@pytest.mark.parametrize("place,words", [("s3:/bucket/x", "did you mean s3://bucket/x"), ("memory://x", "lost when this process ends")])
+@pytest.mark.parametrize(
+    "place,words", [("s3:/bucket/x", "did you mean s3://bucket/x"), ("memory://x", "lost when this process ends")]
+)
 def test_places_that_would_go_astray_are_refused(place, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StoreError, match=words):
