@@ -63,6 +63,7 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
     assert [release[name].group["length"].shape for name in release] == [(20,), (20,)]
 
 
+@pytest.mark.slow
 def test_one_bar_counts_training_evaluations_and_selection(in_folder, quick_selection, monkeypatch):
     bars = []
 
