@@ -494,9 +494,14 @@ def validate(
 
 def validation_setup(options: Mapping[str, Any]) -> "Setup":
     """Make the settings that all cells of a validation share from the arguments of `validate`."""
+    from dmcvb_gen.agents.catalog import parse_agent
     from dmcvb_gen.benchmarks.run import default_workers
     from dmcvb_gen.benchmarks.validate import make_setup
+    from dmcvb_gen.dataset import open_release
 
+    open_release(options["release"])  # a wrong name is told before the precision is timed
+    for agent in as_names(options["agents"]):
+        parse_agent(agent)
     given = {name: options[name] for name in ("out", "profile", "scale", "threads", "device", "precision", "compile")}
     given |= {name: options[name] for name in ("memory", "seed", "dino_weights", "backgrounds")}
     workers = options["workers"] or default_workers(options["device"])

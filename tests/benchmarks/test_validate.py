@@ -209,6 +209,12 @@ def test_many_histograms_and_learning_curves_stand_in_several_figures(release, s
     assert [len(figure.axes) for figure in figures] == [2 * CURVE_LINES, 2 * CURVE_LINES, 2]
 
 
+@pytest.mark.parametrize("words", [("nowhere",), ("RELEASE", "--agents", "bcc")])
+def test_a_wrong_name_is_told_before_the_precision_is_timed(small_release, words):
+    result = run("validate", *(small_release if word == "RELEASE" else word for word in words))
+    assert result.exit_code == 2 and result.output.count("\n") == 1 and "compute in" not in result.output
+
+
 def test_subsets_left_out_by_only_are_called_so_and_not_missing(small_release, tmp_path):
     result = run(
         *("validate", small_release, "--only", "walker-walk/random/none", "--agents", "state-bc", "--threads", 1),
