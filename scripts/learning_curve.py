@@ -38,7 +38,7 @@ def write_curve(folder: Path, points: list[dict], of_data: float) -> None:
     minutes = [point["seconds"] / 60 for point in points]
     axes.errorbar(minutes, [p["return"] for p in points], [p["error"] for p in points], marker="o", label="agent")
     axes.axhline(of_data, color="gray", linestyle="--", label="data")
-    axes.set(xlabel="minutes of one core", ylabel="return")
+    axes.set(xlabel="minutes, evaluations included", ylabel="return")
     if of_data > 0:
         axes.set_ylim(bottom=0)
     axes.legend()
@@ -70,12 +70,12 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    keep_options(options, parser)
     torch.set_num_threads(1)
     agent, profile = parse_agent(options.agent), get_profile(options.profile).scaled(options.scale)
     if agent.own or agent.pretrain or agent.sees_state:
         parser.error("--agent: one that trains its own encoder on pictures")
     subset = open_release(options.release)[options.subset]
+    keep_options(options, parser)  # after what may refuse them
     data = load_data([Source(subset)], seed=options.seed, stack=agent.stack)
     torch.manual_seed(options.seed)
     encoder = make_encoder(agent, data.sizes, None, profile.network)

@@ -34,6 +34,9 @@ def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path)
         assert [line.split()[0] for line in printed.splitlines()] == ["2", "4", "6"]
         rows = (tmp_path / "curve" / task / "curve.csv").read_text().splitlines()
         assert len(rows) == 4 and (tmp_path / "curve" / task / "curve.png").exists()
+        wrong = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", "none", *options[:-1]]
+        assert subprocess.run([*wrong, str(tmp_path / "wrong")], capture_output=True).returncode != 0
+        assert not (tmp_path / "wrong").exists()
         other = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", next(iter(release))]
         other += [*options, "--seed", "1"]
         refused = subprocess.run(other, capture_output=True, text=True)

@@ -47,13 +47,16 @@ def is_url(path: str) -> bool:
     return "://" in path or path.startswith("file:")
 
 
+_ONE_SLASH = re.compile(r"([A-Za-z][\w+.-]+):/")
+
+
 def check_place(place: str) -> None:
     """Refuse a URL with a slash too few, which would silently name a folder "s3:".
 
     Raises:
       StoreError: it is one.
     """
-    if not is_url(place) and (found := re.match(r"([A-Za-z][\w+.-]+):/", place)):
+    if not is_url(place) and (found := _ONE_SLASH.match(place)):
         meant = public(f"{found[1]}://{place[found.end() :]}")
         raise StoreError(f"{public(place)} is neither a folder nor a URL; did you mean {meant}?")
 
@@ -64,7 +67,7 @@ def local_path(path: str | Path) -> Path:
     Raises:
       StoreError: it is a URL; a `Path` would silently make a folder "s3:".
     """
-    if is_url(str(path)) or (isinstance(path, Path) and re.match(r"[A-Za-z][\w+.-]+:/", str(path))):  # Path("s3://x")
+    if is_url(str(path)) or (isinstance(path, Path) and _ONE_SLASH.match(str(path))):  # `Path` makes s3:/x of s3://x
         raise StoreError(
             f"{public(str(path))} is a URL, and this is written to folders; give a local one and copy it there (a "
             "release: `dmcvb-gen publish FOLDER URL`)"

@@ -117,13 +117,13 @@ def train_behaviour(
         raise DmcvbError(f"{folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
     if found and total < found.steps:
         notify(f"The run ends at step {total:,} now, not at {found.steps:,}.")
-    # Evaluations and selection take most of the time of a maze, so its bar counts their steps as well.
-    each, selecting = 1.0, 0
-    if maze:
-        each, selecting = 1 + run.evaluation_steps(), MAZE_CHECKPOINTS * SELECTION_EPISODES * max_steps
-    work = dict(total=total * each + selecting, initial=done * each, unit=" steps", unit_scale=True, smoothing=0)
+    work: dict[str, float] = dict(total=total, initial=done)
+    if maze:  # evaluations and selection take most of its time, so their steps count as well
+        each = 1 + run.evaluation_steps()
+        selecting = MAZE_CHECKPOINTS * SELECTION_EPISODES * max_steps
+        work = dict(total=total * each + selecting, initial=done * each, smoothing=0)  # by turns they have other paces
     picked = None
-    with ProgressBar(progress, **work, desc=name) as bar:
+    with ProgressBar(progress, **work, unit=" steps", unit_scale=True, desc=name) as bar:
 
         def report(progress: Any) -> None:
             bar.set_postfix_str(_standing(progress, expert), refresh=False)
