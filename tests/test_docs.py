@@ -16,7 +16,7 @@ from dmcvb_gen.cli import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r'^```(\w*)(?: title="([^"]+)")?[^\n]*\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 RUN = {"bash", "python"}
 SHOWN = {"text", "yaml", "toml", "console", ""}
 """What is not run: layouts and formulas, and set-up that needs another machine (console)."""
@@ -25,19 +25,17 @@ SET_UP = ("pip install ", "bash scripts/", ". .venv/", "uvx ", "sbatch ", "ray "
 
 @dataclass(frozen=True)
 class Block:
+    """A block of code; `file` if it shows a whole one."""
+
     language: str
+    file: str
     code: str
     line: int
 
 
 def blocks(page: Path) -> list[Block]:
-    """Of a page, but for files that are shown whole: they have tests of their own."""
     text = page.read_text()
-    return [
-        Block(found[1], found[2], text[: found.start()].count("\n") + 1)
-        for found in BLOCK.finditer(text)
-        if "--8<--" not in found[2]
-    ]
+    return [Block(found[1], found[2], found[3], text[: found.start()].count("\n") + 1) for found in BLOCK.finditer(text)]
 
 
 @pytest.fixture
@@ -70,7 +68,7 @@ def bucket(monkeypatch):
 def test_every_block_of_a_page_runs(page, tmp_path, bucket):
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     for block in blocks(page):
-        if block.language not in RUN:
+        if block.language not in RUN or block.file:  # files have tests of their own
             continue
         start = ["bash", "-euo", "pipefail", "-c"] if block.language == "bash" else [sys.executable, "-c"]
         done = subprocess.run([*start, block.code], cwd=tmp_path, env=environment, capture_output=True, text=True)
@@ -85,6 +83,18 @@ def test_what_a_page_does_not_run_is_set_up_or_layout(page):
         if block.language == "console":
             commands = [line for line in block.code.splitlines() if line.strip() and not line.startswith("#")]
             assert all(line.startswith(SET_UP) for line in commands), f"{page.name}:{block.line}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_file_that_a_page_shows_is_the_one_in_the_repository(page):
+    for block in blocks(page):
+        if block.file:
+            assert block.code == (ROOT / block.file).read_text(), f"{page.name}:{block.line}: copy {block.file}"
+
+
+def test_the_pages_show_every_example():
+    shown = {block.file for page in PAGES for block in blocks(page) if block.file}
+    assert shown == {str(path.relative_to(ROOT)) for path in (ROOT / "docs/examples").rglob("*.py")}
 
 
 @pytest.mark.slow

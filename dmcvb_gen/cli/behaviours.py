@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import json
 import math
+import shutil
 from pathlib import Path
 
 import click
 
 from dmcvb_gen.cli.common import INTERRUPTED, OutPath, answer, json_option, print_json, print_table
 from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.training.behaviour import train_behaviour as train
 
 
 @command_of(train)
-def train_behaviour(as_json, **options):
+@click.option("--list-settings", is_flag=True, help="List what --set changes, with the task's values, and train nothing.")
+def train_behaviour(as_json, list_settings, **options):
     """Train a behaviour policy online on states.
 
     Ctrl-C saves the run and prints the command that resumes it. A process that is killed loses half a minute at most,
@@ -25,6 +30,7 @@ def train_behaviour(as_json, **options):
     \b
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
+    dmcvb-gen train-behaviour cheetah-run --algo tqc --list-settings
     dmcvb-gen train-behaviour cheetah-run --algo tqc --set gradient_steps=8 --out runs/cheetah-tqc
     dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant-maze-medium7x7a
     dmcvb-gen train-behaviour --layout ring.txt --out runs/ring
@@ -33,6 +39,8 @@ def train_behaviour(as_json, **options):
     from dmcvb_gen.training.runs import Stopped
     from dmcvb_gen.training.selection import selection_json
 
+    if list_settings:
+        return _list_settings(as_json, **options)
     try:
         run = train(notify=functools.partial(click.echo, err=True), **options)
     except Stopped as stopped:
@@ -48,6 +56,25 @@ def train_behaviour(as_json, **options):
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
         click.echo(f"Next: dmcvb-gen rollout --layout {layout} --level expert --behaviour {run.folder} --goal visible")
+
+
+def _list_settings(as_json, *, task, layout, algo, settings, config, **others):
+    """Print every setting, its value for the task and what it means."""
+    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.training.behaviour import task_of
+    from dmcvb_gen.training.defaults import default_run, parse_settings
+    from dmcvb_gen.training.settings import check_settings, describe_settings
+
+    refuse(click.get_current_context(), tuple(others), "--list-settings trains nothing")
+    task, algorithm = get_task(task_of(task, layout)).id, algo or ("guided" if layout else "sac")
+    given = parse_settings(settings, config, algorithm)
+    values = dataclasses.asdict(check_settings(algorithm, default_run(task, algorithm)["settings"] | given))
+    meanings = describe_settings(algorithm)
+    if as_json:
+        return print_json({name: {"value": values[name], "meaning": text} for name, text in meanings.items()})
+    formatter = click.HelpFormatter(width=shutil.get_terminal_size().columns)
+    formatter.write_dl([(f"{name}={json.dumps(values[name])}", text) for name, text in meanings.items()])
+    click.echo(formatter.getvalue(), nl=False)
 
 
 @click.command("select-checkpoints")

@@ -79,20 +79,15 @@ def train_behaviour(
     """
     import torch  # here, so that --help works without it
 
-    from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.tasks import get_task
-    from dmcvb_gen.tasks.ant_maze import layout_task_id
     from dmcvb_gen.training.defaults import parse_settings, run_config
     from dmcvb_gen.training.runs import read_config
     from dmcvb_gen.training.selection import MAZE_CHECKPOINTS, plot_curve
     from dmcvb_gen.training.training import open_run
 
-    if (task is None) == (layout is None):
-        raise DmcvbError("give a TASK, or the file of a maze with --layout")
-    task = task or layout_task_id(layout or "")
-    allow([task])  # a person typed its name, so its code may run
+    task = task_of(task, layout)
     max_steps = get_task(task).max_steps
     maze = MazeName.parse(task) if layout else None
     folder = Path(out or Path("runs") / (maze.layout if maze else task))
@@ -165,6 +160,22 @@ def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:
         return f"return {mean:.1f}, {pace}"
     share = f" ({100 * mean / expert['mean']:.0f} %)" if expert["mean"] > 0 else ""  # mazes' returns are costs
     return f"return {mean:.1f} of the paper's {expert['mean']:.0f}{share}, {pace}"
+
+
+def task_of(task: str | None, layout: str | Path | None) -> str:
+    """The id of the task that a person asked for, whose code may run from now on.
+
+    Raises:
+      DmcvbError: a task and a maze are given, or neither.
+    """
+    from dmcvb_gen.own_code import allow
+    from dmcvb_gen.tasks.ant_maze import layout_task_id
+
+    if (task is None) == (layout is None):
+        raise DmcvbError("give a TASK, or the file of a maze with --layout")
+    task = task or layout_task_id(layout or "")
+    allow([task])  # a person typed its name
+    return task
 
 
 def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: Any) -> dict[str, bool]:

@@ -62,6 +62,8 @@ class GuidedSettings:
       simulations: episodes stepped side by side.
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       buffer_size: agent steps remembered.
+      batch_size: places an update.
+      learning_rate: largest learning rate.
       ramp: agent steps in which the learning rate rises to `learning_rate`: so that there are checkpoints on the way to
         an expert, which medium is picked from.
       half_life: agent steps in which the learning rate halves.

@@ -24,42 +24,34 @@ from torch.nn.functional import softplus
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.training.sac import CriticEnsemble, ReplayLearner
-from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, Share
+from dmcvb_gen.training.settings import Count, Positive, ReplaySettings
 
 SMALLEST = 1e-8
 """Added to temperature and multipliers, which must not be zero."""
 
 
 @dataclass(frozen=True)
-class MpoSettings:
+class MpoSettings(ReplaySettings):
     """Settings of `Mpo`.
 
     Attributes:
-      simulations: episodes stepped side by side.
-      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
-      warmup_steps: agent steps of uniform random actions before the first update.
+      critics: number of critics; their mean is used.
+      n_step: rewards summed before a target bootstraps, on the way that the episode really took.
+      reward_scale: multiplies rewards before learning.
       action_samples: actions drawn from the target policy for each state.
       epsilon: bound on the KL divergence of the weighted actions from the target policy (E-step).
-      epsilon_mean, epsilon_std: bounds on the M-step's KL divergences, through the mean and through the deviation.
+      epsilon_mean, epsilon_std: bound on the M-step's KL divergence through the mean, and through the deviation.
+      initial_temperature: temperature of the action weights at the start; it is learned.
+      initial_multiplier_mean, initial_multiplier_std: multiplier of the M-step's bound on the mean, and on the
+        deviation, at the start; it is learned.
       dual_learning_rate: learning rate of temperature and multipliers.
       target_period: updates after which the target networks become copies of policy and critics.
-      critics: number of critics; their mean is used.
-      reward_scale: multiplies rewards before learning.
-      n_step, shaping, progress, standing_starts, sunken_starts, mean_share, train_episode_steps: see `SacSettings`.
-      compile: compile the update. Without a C++ compiler a warning says that it runs uncompiled.
     """
 
-    simulations: Count = 8
-    batch_size: Count = 256
-    actor_hidden: tuple[Count, ...] = (256, 256)
-    critic_hidden: tuple[Count, ...] = (256, 256)
     learning_rate: Positive = 3e-4
-    dual_learning_rate: Positive = 1e-2
-    discount: Decay = 0.99
-    n_step: Count = 1
     updates_per_step: Positive = 0.5
-    warmup_steps: Natural = 5000
-    target_period: Count = 100
+    n_step: Count = 1
+    reward_scale: Positive = 1.0
     action_samples: Count = 20
     epsilon: Positive = 0.1
     epsilon_mean: Positive = 0.01
@@ -67,16 +59,8 @@ class MpoSettings:
     initial_temperature: Positive = 1.0
     initial_multiplier_mean: Positive = 1.0
     initial_multiplier_std: Positive = 10.0
-    critics: Count = 2
-    reward_scale: Positive = 1.0
-    shaping: NonNegative = 0.0
-    progress: NonNegative = 0.0
-    standing_starts: Share = 0.0
-    sunken_starts: Share = 0.0
-    mean_share: Share = 0.0
-    train_episode_steps: Natural = 0
-    buffer_size: Count = 1_000_000
-    compile: bool = True
+    dual_learning_rate: Positive = 1e-2
+    target_period: Count = 100
 
 
 def temperature_loss(values: torch.Tensor, temperature: torch.Tensor, epsilon: float) -> torch.Tensor:

@@ -23,18 +23,17 @@ from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
 from dmcvb_gen.precision import choose_precision, dense_product
 from dmcvb_gen.training.networks import Actor
 from dmcvb_gen.training.row_files import map_rows, rows_in
-from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, Share
+from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, ReplaySettings
 
 
 @dataclass(frozen=True)
-class SacSettings:
+class SacSettings(ReplaySettings):
     """Settings of `Sac`; the defaults of a task are in data/defaults.yaml.
 
     Attributes:
-      simulations: episodes stepped side by side.
-      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
-      warmup_steps: agent steps of uniform random actions before the first update.
       actor_every: an actor update every so many critic updates.
+      target_decay: share of the target critics that an update keeps.
+      initial_temperature: weight of the entropy bonus at the start; it is learned.
       target_entropy_scale: the target entropy is minus this times the action size.
       sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` and the learning rate
         `sharp_learning_rate` (0: never). A policy that explores loses return to its own noise, one that learns fast
@@ -51,57 +50,28 @@ class SacSettings:
         that their range does not depend on the action size, and entropy only regularizes the actor.
       rate_half_life: agent steps after which learning rates have fallen to 1 / sqrt(2); they fall with the square root
         of the steps (0: never).
-      shaping: weight of the task's shaping term added to the training reward (never to an evaluation).
-      progress: mazes: weight of the meters of shortest path covered in a step, added to the training reward (never to
-        an evaluation). DMC-VB's own reward is flat in the whole goal cell.
-      standing_starts: share of training episodes that start in the model's own pose (humanoid: standing)
-        instead of the task's initial states; evaluations always start as the task does.
-      sunken_starts: mazes: share of training episodes that start deep in the floor, which flings an ant up; what it
-        does in the air decides whether it comes down on its feet.
-      mean_share: share of the simulations that act by the mean, as data are made: a policy that only ever collects
-        with noise never sees the places where its mean stands still.
-      train_episode_steps: cut training episodes off after so many agent steps (0: the task's limit).
-      critics: number of critics.
       clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
         tasks want).
       weight_decay: weight decay of AdamW, on actor and critics.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32); see `precision_setting`.
-      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
-    simulations: Count = 8
-    batch_size: Count = 256
-    actor_hidden: tuple[Count, ...] = (256, 256)
-    critic_hidden: tuple[Count, ...] = (256, 256)
-    learning_rate: Positive = 1e-3
-    discount: Decay = 0.99
-    target_decay: Decay = 0.995
-    updates_per_step: Positive = 1.0
-    warmup_steps: Natural = 5000
     actor_every: Count = 2
+    target_decay: Decay = 0.995
+    initial_temperature: Positive = 0.1
     target_entropy_scale: float = 0.5
     sharpen_after: Natural = 0
     sharp_entropy_scale: float = 1.5
     sharp_learning_rate: NonNegative = 0.0
-    initial_temperature: Positive = 0.1
     n_step: Count = 1
     n_step_half_life: Natural = 0
     bins: Natural = 0
     reward_scale: NonNegative = 0.5
     soft_values: bool = True
     rate_half_life: Natural = 0
-    shaping: NonNegative = 0.0
-    progress: NonNegative = 0.0
-    standing_starts: Share = 0.0
-    sunken_starts: Share = 0.0
-    mean_share: Share = 0.0
-    train_episode_steps: Natural = 0
-    buffer_size: Count = 1_000_000
-    critics: Count = 2
     clipped: bool = True
     weight_decay: NonNegative = 0.0
     bfloat16: bool = False
-    compile: bool = True
 
 
 def precision_setting(settings: Mapping[str, Any], asked: str = "auto") -> dict[str, bool]:

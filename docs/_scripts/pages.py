@@ -1,18 +1,14 @@
-"""Pages that the site makes from the code: one for each command, their index, and the table of export formats."""
+"""Pages that the site makes from the code: one for each command, and their index."""
 
 from __future__ import annotations
 
 import html
 import inspect
-from pathlib import Path
 
 import click
 import mkdocs_gen_files
 
 from dmcvb_gen.cli import COMMANDS, main
-from dmcvb_gen.release.export.registry import format_table
-
-DOCS = Path(__file__).resolve().parents[1]
 
 
 def cell(text: str) -> str:
@@ -56,8 +52,6 @@ def write_pages() -> None:
             page.write(command_page(name, command))
     with mkdocs_gen_files.open("cli/index.md", "w") as index:
         index.write("\n".join(lines) + "\n")
-    with mkdocs_gen_files.open("exports.md", "w") as page:
-        page.write((DOCS / "exports.md").read_text().replace("<!-- formats -->", format_table()))
 
 
 write_pages()

@@ -92,12 +92,3 @@ def get_format(name: str) -> Format:
       UnknownNameError: there is none; the message lists those that there are.
     """
     return FORMATS.get(name)
-
-
-def format_table() -> str:
-    """The formats as a Markdown table: which program reads them, what they keep and what they leave out."""
-    lines = ["| `--to` | read by | keeps | leaves out | needs |", "|---|---|---|---|---|"]
-    for name, kind in all_formats().items():
-        needs = ", ".join(f"`{module}`" for module in kind.modules)
-        lines.append(f"| `{name}` | {kind.reader} | {kind.keeps} | {kind.drops} | {needs} |")
-    return "\n".join(lines)
