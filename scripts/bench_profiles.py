@@ -21,6 +21,7 @@ from dmcvb_gen.agents.data import Source, load_data
 from dmcvb_gen.agents.networks import NARROW, PAPER, PATCHES, Architecture
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.profiles import PROFILES
 from dmcvb_gen.dataset import open_release
 
 WARM, TIMED = 20, 100
@@ -29,12 +30,12 @@ WARM, TIMED = 20, 100
 
 @dataclass(frozen=True)
 class Variant:
-    """What is otherwise than in the profile quick."""
+    """What is otherwise than in the profile quick; `shift` None: by quick's rule."""
 
     network: Architecture = PATCHES
     batch: int = 64
     rate: float = 1.0
-    shift: bool = True
+    shift: bool | None = None
     half: bool = False
     compiled: bool = False
 
@@ -45,7 +46,8 @@ VARIANTS = {
     "batch 128": Variant(batch=128),
     "half the rate": Variant(rate=0.5),
     "twice the rate": Variant(rate=2.0),
-    "brief": Variant(shift=False),
+    "shifted": Variant(shift=True),
+    "unshifted": Variant(shift=False),
     "narrow": Variant(NARROW),
     "narrow, unshifted": Variant(NARROW, rate=2.0, shift=False),
     "half as wide": Variant(replace(PATCHES, channels=(32, 32, 32))),
@@ -64,7 +66,8 @@ def make(variant: Variant, data, agent):
     return make_policy(agent, make_encoder(agent, data.sizes, None, variant.network), data.sizes, variant.network)
 
 
-def settings(variant: Variant, steps: int) -> TrainSettings:
+def settings(variant: Variant, steps: int, transitions: int) -> TrainSettings:
+    by_rule = PROFILES["quick"].shifts(steps * variant.batch // PROFILES["quick"].batch_size, transitions)
     return TrainSettings(
         steps=steps,
         batch_size=variant.batch,
@@ -72,7 +75,7 @@ def settings(variant: Variant, steps: int) -> TrainSettings:
         half=variant.half,
         compile=variant.compiled,
         rate=variant.rate,
-        shift=variant.shift,
+        shift=by_rule if variant.shift is None else variant.shift,
         decay=True,
     )
 
@@ -80,8 +83,9 @@ def settings(variant: Variant, steps: int) -> TrainSettings:
 def steps_in(seconds: float, variant: Variant, data, agent) -> int:
     """Adam steps that a variant makes in so many seconds of the processor, which count alike on a busy machine."""
     learner = make(variant, data, agent)
-    train(learner, data, settings(variant, WARM))
-    timed = replace(settings(variant, TIMED), points=1)  # as seldom as in a long training are held-out losses taken
+    train(learner, data, settings(variant, WARM, len(data)))
+    # Held-out losses are taken as seldom as in a long training.
+    timed = replace(settings(variant, TIMED, len(data)), points=1)
     started = time.process_time()
     train(learner, data, timed)
     return max(1, round(TIMED * seconds / (time.process_time() - started)))
@@ -104,7 +108,7 @@ def main() -> None:
         steps = steps_in(60 * options.minutes, variant, data, agent)
         learner = make(variant, data, agent)
         started = time.process_time()
-        train(learner, data, settings(variant, steps))
+        train(learner, data, settings(variant, steps, len(data)))
         cpu = time.process_time() - started
         score = evaluator(learner)
         quick = score.mean if name == "quick" else quick

@@ -102,7 +102,7 @@ def main() -> None:
         points=options.scores,
         half=options.precision == "bfloat16",
         rate=profile.rate,
-        shift=profile.shift,
+        shift=profile.shifts(steps, len(data)),
         decay=profile.decay,
     )
     curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)

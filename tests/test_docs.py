@@ -28,14 +28,15 @@ class Block:
     """A block of code; `file` if it shows a whole one."""
 
     language: str
-    file: str
+    file: str | None
     code: str
     line: int
 
 
 def blocks(page: Path) -> list[Block]:
     text = page.read_text()
-    return [Block(found[1], found[2], found[3], text[: found.start()].count("\n") + 1) for found in BLOCK.finditer(text)]
+    return [Block(*found.groups(), text[: found.start()].count("
+") + 1) for found in BLOCK.finditer(text)]
 
 
 @pytest.fixture

@@ -82,16 +82,21 @@ UNIT_EPISODES = 100
 
 
 def train_settings(
-    setup: Setup, steps: int, pixels: bool = True, evaluations: int = 1, frozen: bool = False
+    setup: Setup, steps: int, transitions: int, pixels: bool = True, evaluations: int = 1, frozen: bool = False
 ) -> TrainSettings:
-    """Return a profile's training settings for a part of a cell; `frozen`: on an encoder that does not learn."""
+    """Return a profile's training settings for a part of a cell.
+
+    Args:
+      transitions: number of those that it learns from.
+      frozen: on an encoder that does not learn.
+    """
     return TrainSettings(
         steps=steps,
         batch_size=setup.profile.batch_size if pixels else setup.profile.state_batch_size,
         evaluate_every=-(-steps // evaluations),
         half=pixels and setup.precision == "bfloat16",
         rate=setup.profile.rate if pixels else 1.0,
-        shift=setup.profile.frozen_shift if frozen else setup.profile.shift,
+        shift=setup.profile.frozen_shift if frozen else setup.profile.shifts(steps, transitions),
         decay=setup.profile.decay,
         compile=setup.compile,
         workers=1 if setup.device != "cpu" else 0,
@@ -130,7 +135,7 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: ProgressCallback = ig
     curve = train(
         learner,
         data,
-        train_settings(setup, setup.profile.pretrain_steps),
+        train_settings(setup, setup.profile.pretrain_steps, len(data)),
         seed=setup.seed,
         folder=folder,
         tick=lambda steps: tick(f"{work.agent.pretrain} encoder of {work.task}", steps),
@@ -292,7 +297,8 @@ def _train_policy(
 
     label = f"{cell.agent.name} on {cell.task} {cell.policy_label}/{cell.setting}"
     frozen = cell.agent.pretrain is not None
-    settings = train_settings(setup, policy_steps(profile, cell.agent), pixels, profile.evaluations, frozen)
+    steps = policy_steps(profile, cell.agent)
+    settings = train_settings(setup, steps, len(data), pixels, profile.evaluations, frozen)
     if frozen:
         data = encoded(setup, policy.encoder, data, settings.steps * settings.batch_size, tick)
     started = time.perf_counter()
@@ -426,7 +432,7 @@ def inspect(
         "observation": ObservationProbe(encoder, data.sizes, setup.profile.network),
         "state": StateProbe(encoder, data.sizes),
     }
-    settings = train_settings(setup, setup.profile.readout_steps, frozen=True)
+    settings = train_settings(setup, setup.profile.readout_steps, len(data), frozen=True)
     inspected = min(len(data.hold_out_rows), INSPECTED)
     draws = len(readouts) * (settings.steps * settings.batch_size + inspected) + inspected  # states' errors count twice
     data = encoded(setup, encoder, data, draws, tick)

@@ -26,9 +26,10 @@ class Profile:
       state_batch_size: the same of agents that see states.
       network: the convolutions of every encoder and decoder.
       rate: times the paper's learning rate of 1e-3, of agents that see pictures.
-      shift: pictures are shifted at random while agents learn, as the paper's.
-      frozen_shift: likewise while a policy or decoder learns on a frozen encoder. Without shifts every observation is
-        encoded once, and its latent kept.
+      shift_from: passes over the data from which on a training shifts its pictures at random. 0: always, as the
+        paper's. Unshifted pictures are learned several times as fast, and after more than ten passes known by heart.
+      frozen_shift: pictures are shifted while a policy or decoder learns on a frozen encoder. Without shifts every
+        observation is encoded once, and its latent kept.
       decay: the learning rate falls to zero over each training, instead of staying as the paper's.
       scores: True if its scores mean anything.
       note: printed wherever a score stands.
@@ -46,12 +47,16 @@ class Profile:
     state_batch_size: int = 256
     network: Architecture = PAPER
     rate: float = 1.0
-    shift: bool = True
+    shift_from: float = 0.0
     frozen_shift: bool = True
     decay: bool = False
     episode_steps: int | None = None
     scores: bool = True
     note: str = ""
+
+    def shifts(self, steps: int, transitions: int) -> bool:
+        """True if an agent shifts its pictures while it learns for so many steps from so many transitions."""
+        return steps * self.batch_size >= self.shift_from * transitions
 
     def scaled(self, factor: float) -> Profile:
         """The same with every training `factor` times as long, and a name that says so."""
@@ -84,8 +89,7 @@ PROFILES = {
             note="smoke: a few steps to see that everything runs; its numbers are not scores",
         ),
         # Encoders and policies take as many steps as BC does end to end, so that agents are compared at equal updates;
-        # a policy on a frozen encoder costs a seventh of an update, as its latents are computed once. Unshifted
-        # pictures are learned several times as fast, and after 10,000 of quick's steps known by heart.
+        # a policy on a frozen encoder costs a seventh of an update, as its latents are computed once.
         Profile(
             "brief",
             pixel_steps=5_000,
@@ -98,11 +102,12 @@ PROFILES = {
             batch_size=64,
             network=PATCHES,
             rate=2.0,
-            shift=False,
+            shift_from=10.0,
             frozen_shift=False,
             decay=True,
             note="brief: a small network of 4x4 patches and frame differences, 0.3 % of the paper's samples (2.5 % of "
-            "states), no random shifts, twice the rate, falling; scores are not comparable with the paper's",
+            "states), random shifts only from ten passes over the data on, twice the rate, falling; scores are not "
+            "comparable with the paper's",
         ),
         Profile(
             "quick",
@@ -115,10 +120,12 @@ PROFILES = {
             episodes=30,
             batch_size=64,
             network=PATCHES,
+            shift_from=10.0,
             frozen_shift=False,
             decay=True,
             note="quick: a small network of 4x4 patches and frame differences, 1 % of the paper's samples (10 % of "
-            "states), a falling rate; scores are not comparable with the paper's",
+            "states), random shifts only from ten passes over the data on, a falling rate; scores are not comparable "
+            "with the paper's",
         ),
         Profile(
             "paper",

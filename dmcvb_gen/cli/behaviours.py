@@ -20,7 +20,9 @@ from dmcvb_gen.training.behaviour import train_behaviour as train
 
 
 @command_of(train)
-@click.option("--list-settings", is_flag=True, help="List what --set changes, with the task's values, and train nothing.")
+@click.option(
+    "--list-settings", is_flag=True, help="List what --set changes, with the task's values, and train nothing."
+)
 def train_behaviour(as_json, list_settings, **options):
     """Train a behaviour policy online on states.
 

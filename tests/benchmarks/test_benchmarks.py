@@ -595,10 +595,11 @@ def test_data_that_grew_or_look_otherwise_are_read_again(small_release):
 
 def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
     setup = Setup(root="r", out="o", profile=PROFILES["brief"])
-    pixels, states = train_settings(setup, 10), train_settings(setup, 10, pixels=False)
-    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, False, False)
+    pixels, states = train_settings(setup, 10, 64), train_settings(setup, 10, 64, pixels=False)
+    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, True, False)
+    assert not train_settings(setup, 10, 65).shift  # fewer than ten passes over the data
     assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
-    whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10)
+    whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10, 10**9)
     assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
 
 
@@ -624,4 +625,4 @@ def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
 
 def test_only_networks_that_see_pictures_compute_in_bfloat16():
     setup = Setup(root="r", out="o", profile=PROFILES["brief"], precision="bfloat16")
-    assert train_settings(setup, 10).half and not train_settings(setup, 10, pixels=False).half
+    assert train_settings(setup, 10, 64).half and not train_settings(setup, 10, 64, pixels=False).half
