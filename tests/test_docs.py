@@ -35,8 +35,7 @@ class Block:
 
 def blocks(page: Path) -> list[Block]:
     text = page.read_text()
-    return [Block(*found.groups(), text[: found.start()].count("
-") + 1) for found in BLOCK.finditer(text)]
+    return [Block(*found.groups(), text[: found.start()].count("\n") + 1) for found in BLOCK.finditer(text)]
 
 
 @pytest.fixture
