@@ -342,6 +342,7 @@ def _facts(
         "paper": paper and {"mean": paper[0], "stderr": paper[1]},
         "data": dataclasses.asdict(data_score(subset, data)),
         "episodes": len(data.lengths),
+        "transitions": len(data),
         "evaluation": protocol(
             subset,
             None if cell.policy[0].goal_pair is None else goal_cells(subset, cell.policy[0].goal_pair),

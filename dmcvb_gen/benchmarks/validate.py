@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -17,7 +18,7 @@ from dmcvb_gen.agents.networks import encoder_product
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.own import OwnAgent
-from dmcvb_gen.benchmarks.profiles import get_profile
+from dmcvb_gen.benchmarks.profiles import Profile, get_profile
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
 from dmcvb_gen.benchmarks.run import default_threads, planned_steps, run_cells
 from dmcvb_gen.benchmarks.setup import Setup, keep_precision, kept_precision, open_data
@@ -31,6 +32,7 @@ from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import matches, select
 from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.text import pluralize
 
 STATE_BC_SHARE = 0.9
 """Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
@@ -200,6 +202,7 @@ def validate(
     warnings = (
         *structure.warnings,
         *_learning_warnings(setup, results),
+        *_few_warnings(setup.profile, results),
         *_benchmark_warnings(chosen, cells),
         *_seen_warnings(chosen, cells, setup.backgrounds),
     )
@@ -279,6 +282,25 @@ def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | N
             text = f"painted with the {what} that evaluation shows: its scores are of distractors that were seen"
             found.append(Issue("learning", record.name, text))
     return found
+
+
+def _few_warnings(profile: Profile, results) -> list[Issue]:
+    """Tell of data so few that pictures are shifted, for which a short training is too short."""
+    found = {}
+    for cell, result in results:
+        agent, seen = cell.agent, result.get("transitions")
+        end_to_end = not (agent.sees_state or agent.own or agent.pretrain)
+        if not (seen and end_to_end and profile.scores and profile.shift_from and cell.benchmark == "b1"):
+            continue
+        if profile.shifts(profile.pixel_steps, seen):
+            passes = profile.pixel_steps * profile.batch_size / seen
+            needed = math.floor(result["episodes"] * passes / profile.shift_from) + 1
+            subset = cell.policy[0].subset
+            found[subset] = (
+                f"{profile.name} passes {passes:.0f} times over {pluralize(result['episodes'], 'episodes')}, so it "
+                f"shifts their pictures and learns more slowly; with {needed:,} episodes or more it does not"
+            )
+    return [Issue("learning", subset, text) for subset, text in found.items()]
 
 
 def _learning_warnings(setup: Setup, results) -> list[Issue]:

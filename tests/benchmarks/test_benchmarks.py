@@ -24,7 +24,7 @@ from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
 from dmcvb_gen.benchmarks.setup import Setup, fingerprint, keep_precision, open_data, pretraining_of
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
-from dmcvb_gen.benchmarks.validate import make_setup
+from dmcvb_gen.benchmarks.validate import _few_warnings, make_setup
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import training_pictures
@@ -601,6 +601,25 @@ def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
     assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
     whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10, 10**9)
     assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
+
+
+def test_a_release_so_small_that_quick_shifts_its_pictures_is_told(small_release):
+    cells = plan_benchmark("b1", open_release(small_release), ["bc", "state-bc", "id+bc"])[0]
+    [bc] = {cell for cell in cells if cell.agent.name == "bc" and cell.setting == "none"}
+    quick = PROFILES["quick"]
+
+    def told(transitions: int, cell=bc, profile=quick) -> list[str]:
+        return [
+            issue.message for issue in _few_warnings(profile, [(cell, {"transitions": transitions, "episodes": 100})])
+        ]
+
+    assert told(quick.pixel_steps * quick.batch_size // 10)
+    assert not told(quick.pixel_steps * quick.batch_size // 10 + 1)
+    [text] = told(50_000)
+    assert "passes 26 times over 100 episodes" in text and "with 257 episodes" in text
+    assert not quick.shifts(quick.pixel_steps, 257 * 500) and quick.shifts(quick.pixel_steps, 256 * 500)
+    assert not told(50_000, profile=PROFILES["paper"]) and not told(50_000, profile=PROFILES["smoke"])
+    assert not any(told(50_000, cell) for cell in cells if cell.agent.name != "bc")
 
 
 def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
