@@ -13,3 +13,12 @@ def pluralize(count: int, noun: str) -> str:
 def as_names(value: str | Iterable) -> tuple[str, ...]:
     """One name or several, as several."""
     return (value,) if isinstance(value, str) else tuple(map(str, value))
+
+
+def format_bytes(count: float) -> str:
+    """1536 -> "1.5 kB" (powers of 1000)."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if abs(count) < 1000 or unit == "TB":
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    raise AssertionError("unreachable")

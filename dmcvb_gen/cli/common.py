@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.text import format_bytes
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
 
@@ -127,15 +128,6 @@ class OutPath(click.Path):
         except DmcvbError as error:
             self.fail(f"{error}.", param, ctx)
         return super().convert(value, param, ctx)
-
-
-def format_bytes(count: float) -> str:
-    """1536 -> "1.5 kB" (powers of 1000)."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if abs(count) < 1000 or unit == "TB":
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    raise AssertionError("unreachable")
 
 
 def moved_files(moved: Any) -> str:

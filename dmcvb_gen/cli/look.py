@@ -10,7 +10,6 @@ import click
 from dmcvb_gen.cli.common import (
     OutPath,
     answer,
-    format_bytes,
     format_duration,
     json_option,
     print_json,
@@ -18,7 +17,7 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.storage.remote import is_url, public
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import format_bytes, pluralize
 
 
 @click.command()

@@ -11,7 +11,6 @@ import click
 from dmcvb_gen import commands
 from dmcvb_gen.cli.common import (
     answer,
-    format_bytes,
     format_duration,
     print_json,
     print_table,
@@ -21,7 +20,7 @@ from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.cli.unused_options import check_exclusive_options
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.storage.remote import is_url
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import format_bytes, pluralize
 
 OPTION_GROUPS = {
     "What": ("recipe", "only", "levels", "behaviour", "sample", "independent", "seed"),

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, format_bytes, json_option, print_json, remote_option
+from dmcvb_gen.cli.common import OutPath, json_option, print_json, remote_option
 from dmcvb_gen.progress import ProgressBar
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import format_bytes, pluralize
 
 HOST = "127.0.0.1"
 

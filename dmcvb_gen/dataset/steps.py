@@ -23,6 +23,7 @@ import numpy as np
 
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.text import format_bytes
 
 FIELDS = ("state", "action", "reward", "discount")
 READ_BYTES = 2**26
@@ -172,8 +173,8 @@ def _mapped(shape: tuple[int, ...], folder: Path) -> np.ndarray:
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise DmcvbError(
-            f"{needed / 1e9:.1f} GB of pictures fit neither into memory nor into {folder} ({free / 1e9:.1f} GB free); "
-            "give another --out, or more --memory"
+            f"{format_bytes(needed)} of pictures fit neither into memory nor into {folder} ({format_bytes(free)} "
+            "free); give another --out, or more --memory"
         )
     with tempfile.TemporaryFile(dir=folder) as file:
         file.truncate(needed)

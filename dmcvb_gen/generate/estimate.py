@@ -30,6 +30,7 @@ from dmcvb_gen.generate.render import distractor_state_of, renderers
 from dmcvb_gen.parallel import ProgressCallback, ignore, in_order
 from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import format_bytes
 
 SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
 """Whole episodes simulated of each locomotion task and level, and of each level of all mazes together: theirs vary in
@@ -293,5 +294,7 @@ def room_needed(plan: Plan, free: float, workers: int = 1, notify: Callable[[str
     """
     if (raw := raw_bytes(plan)) <= free:
         return raw
-    notify(f"{free / 1e9:.1f} GB are free and arrays take up to {raw / 1e9:.1f} GB; measuring how much they will take.")
+    notify(
+        f"{format_bytes(free)} are free and arrays take up to {format_bytes(raw)}; measuring how much they will take."
+    )
     return estimate(plan, workers).disk_bytes

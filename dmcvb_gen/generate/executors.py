@@ -18,6 +18,7 @@ from dmcvb_gen.generate.target import leave
 from dmcvb_gen.parallel import Needs, Pool, ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.parallel.memory import free_memory
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import format_bytes
 
 PROCESS_BYTES = 1 << 30
 """Memory that a worker takes before it holds any episode: libraries, models, a renderer's buffers."""
@@ -141,8 +142,8 @@ def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
         advice = f"fewer --episodes-per-shard in a new release, or {advice}"
     raise StoreError(
         f"a shard of {record.name} ({len(largest.episodes)} episodes of {record.max_steps} steps, {record.size} pixels "
-        f"a side) needs {needed / 1e9:.1f} GB of memory, {side_by_side} are made at once, and {free / 1e9:.1f} GB are "
-        f"free; use {advice}"
+        f"a side) needs {format_bytes(needed)} of memory, {side_by_side} are made at once, and {format_bytes(free)} "
+        f"are free; use {advice}"
     )
 
 

@@ -51,7 +51,7 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import format_bytes, pluralize
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_byt
     kept = there is not None and merged(there, plan.manifest, str(root)) is there
     if expected_bytes > (free := free_bytes(root)):
         raise StoreError(
-            f"about {expected_bytes / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free "
+            f"about {format_bytes(expected_bytes)} are needed and {format_bytes(free)} are free "
             f"at {root}; make room, choose another --out or fewer --episodes"
         )
     if there is not None and kept and (shared or _is_done(there, plan)):

@@ -53,6 +53,7 @@ from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.storage import Storage, open_storage
 from dmcvb_gen.storage.base import in_parallel, unfinished
 from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.text import format_bytes
 
 
 @dataclass(frozen=True)
@@ -322,7 +323,7 @@ class Download:
         free = shutil.disk_usage(self.out).free
         if needed > free:
             raise StoreError(
-                f"{needed / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free at {self.out}; make "
+                f"{format_bytes(needed)} are needed and {format_bytes(free)} are free at {self.out}; make "
                 "room, choose another --out, or fetch less with --only and --episodes"
             )
 

@@ -179,7 +179,7 @@ def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, 
 
 
 def test_more_than_the_disk_holds_is_refused_before_any_work(tmp_path):
-    with pytest.raises(StoreError, match="GB are needed"):
+    with pytest.raises(StoreError, match="TB are needed"):
         prepare(make_plan(small_recipe(), tmp_path / "r"), expected_bytes=1e18)
 
 
@@ -197,7 +197,7 @@ def test_a_disk_that_is_smaller_than_raw_arrays_is_measured_for(tmp_path, monkey
         monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=amount))
 
     free(needed * 0.5)
-    with pytest.raises(StoreError, match=r"^about .* GB are needed and .* GB are free"):
+    with pytest.raises(StoreError, match=r"^about .*B are needed and .*B are free"):
         prepare_rollout(plan, options, notify=told.append)
     assert not (tmp_path / "r").exists()
     free((needed + raw) / 2)
@@ -452,6 +452,6 @@ def test_going_on_from_a_manifest_paints_where_it_was_begun(tmp_path, recipe):
 def test_shards_that_do_not_fit_in_memory_are_refused_before_any_work(recipe, workers, tmp_path, monkeypatch):
     monkeypatch.setattr("dmcvb_gen.generate.executors.free_memory", lambda: 10_000)
     monkeypatch.setattr("dmcvb_gen.generate.engine.simulate", None)
-    with pytest.raises(StoreError, match="GB of memory.*--episodes-per-shard"):
+    with pytest.raises(StoreError, match="B of memory.*--episodes-per-shard"):
         roll_out(recipe(), tmp_path / "r", workers=workers)
     assert not list((tmp_path / "r").rglob("c"))
