@@ -104,6 +104,7 @@ def main() -> None:
         rate=profile.rate,
         shift=profile.shifts(steps, len(data)),
         decay=profile.decay,
+        muon=profile.muon,
     )
     curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
     evaluator.close()

@@ -17,6 +17,7 @@ import torch
 
 from dmcvb_gen.agents.data import TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
+from dmcvb_gen.agents.muon import Muon
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
@@ -48,6 +49,7 @@ class TrainSettings:
       rate: times the learner's own learning rate (1e-3, the paper's).
       shift: pictures are shifted at random, as the paper's; short trainings learn several times as fast without.
       decay: the learning rate falls linearly to zero over the steps; the paper keeps it, short trainings gain by it.
+      muon: hidden matrices move by `Muon`, not by the paper's Adam.
     """
 
     steps: int = 400_000
@@ -60,6 +62,7 @@ class TrainSettings:
     rate: float = 1.0
     shift: bool = True
     decay: bool = False
+    muon: bool = False
 
 
 def draw(
@@ -123,6 +126,9 @@ def train(
     """
     first, curve, spent, means = 0, [], 0.0, _Means()
     path = folder / RESUME_FILE if folder else None
+    if settings.muon:
+        precision = torch.bfloat16 if settings.half else torch.float32
+        learner.optimizers = {name: Muon.instead_of(one, precision) for name, one in learner.optimizers.items()}
     if path is not None and path.exists():
         first, curve, spent, means = _load_state(learner, path)
         tick(first)

@@ -98,6 +98,7 @@ def train_settings(
         rate=setup.profile.rate if pixels else 1.0,
         shift=setup.profile.frozen_shift if frozen else setup.profile.shifts(steps, transitions),
         decay=setup.profile.decay,
+        muon=pixels and setup.profile.muon,
         compile=setup.compile,
         workers=1 if setup.device != "cpu" else 0,
     )

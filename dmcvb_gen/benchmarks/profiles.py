@@ -31,6 +31,7 @@ class Profile:
       frozen_shift: pictures are shifted while a policy or decoder learns on a frozen encoder. Without shifts every
         observation is encoded once, and its latent kept.
       decay: the learning rate falls to zero over each training, instead of staying as the paper's.
+      muon: of agents that see pictures, hidden matrices move by `Muon` instead of the paper's Adam.
       scores: True if its scores mean anything.
       note: printed wherever a score stands.
     """
@@ -50,6 +51,7 @@ class Profile:
     shift_from: float = 0.0
     frozen_shift: bool = True
     decay: bool = False
+    muon: bool = False
     episode_steps: int | None = None
     scores: bool = True
     note: str = ""
@@ -123,9 +125,10 @@ PROFILES = {
             shift_from=10.0,
             frozen_shift=False,
             decay=True,
+            muon=True,
             note="quick: a small network of 4x4 patches and frame differences, 1 % of the paper's samples (10 % of "
-            "states), random shifts only from ten passes over the data on, a falling rate; scores are not comparable "
-            "with the paper's",
+            "states), Muon instead of Adam, a falling rate, random shifts only from ten passes over the data on; "
+            "scores are not comparable with the paper's",
         ),
         Profile(
             "paper",

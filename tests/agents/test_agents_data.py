@@ -267,9 +267,12 @@ def without_time(point):
     return {name: value for name, value in point.items() if name != "seconds"}
 
 
-@pytest.mark.parametrize("decay, make_learner", [(False, state_learner), (True, state_learner), (False, pixel_learner)])
-def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, decay, make_learner):
-    data, settings = make_data(), dataclasses.replace(SETTINGS, decay=decay)
+@pytest.mark.parametrize(
+    "changed, make_learner",
+    [({}, state_learner), ({"decay": True}, state_learner), ({}, pixel_learner), ({"muon": True}, pixel_learner)],
+)
+def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, changed, make_learner):
+    data, settings = make_data(), dataclasses.replace(SETTINGS, **changed)
     data = data if make_learner is pixel_learner else data.states_only()
     whole = make_learner(data)
     wanted = train(whole, data, settings)

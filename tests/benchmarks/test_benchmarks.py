@@ -599,6 +599,8 @@ def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
     assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, True, False)
     assert not train_settings(setup, 10, 65).shift  # fewer than ten passes over the data
     assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
+    quick = dataclasses.replace(setup, profile=PROFILES["quick"])
+    assert train_settings(quick, 10, 64).muon and not train_settings(quick, 10, 64, pixels=False).muon
     whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10, 10**9)
     assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
 
