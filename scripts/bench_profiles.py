@@ -37,6 +37,7 @@ class Variant:
     rate: float = 1.0
     shift: bool | None = None
     half: bool = False
+    muon: bool = True
     compiled: bool = False
 
 
@@ -46,6 +47,7 @@ VARIANTS = {
     "batch 128": Variant(batch=128),
     "half the rate": Variant(rate=0.5),
     "twice the rate": Variant(rate=2.0),
+    "Adam": Variant(muon=False),
     "shifted": Variant(shift=True),
     "unshifted": Variant(shift=False),
     "narrow": Variant(NARROW),
@@ -56,7 +58,7 @@ VARIANTS = {
     "GELU": Variant(replace(PATCHES, activation="gelu")),
     "bfloat16": Variant(half=True),
     "compiled": Variant(compiled=True),
-    "paper": Variant(PAPER),
+    "paper": Variant(PAPER, muon=False),
 }
 
 
@@ -77,6 +79,7 @@ def settings(variant: Variant, steps: int, transitions: int) -> TrainSettings:
         rate=variant.rate,
         shift=by_rule if variant.shift is None else variant.shift,
         decay=True,
+        muon=variant.muon,
     )
 
 
