@@ -2,6 +2,7 @@
 
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --scale 18 --folder runs/cheetah-curve
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --folder runs/paper-cell
+    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --set muon=false --folder runs/adam
 
 The agent trains as in `validate` with that profile, `--scale` times as long, on one thread. It is scored on 30 fresh
 episodes at even distances, and each score is printed. A stopped training goes on if the command is given again. At the
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+from dataclasses import fields, replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -22,7 +24,7 @@ from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
 from dmcvb_gen.agents.data import Source, load_data
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator
-from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
+from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, get_profile
 from dmcvb_gen.dataset import open_release
 
 COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
@@ -58,6 +60,23 @@ def keep_options(options: argparse.Namespace, parser: argparse.ArgumentParser) -
     path.write_text(json.dumps(asked, indent=1) + "\n")
 
 
+def change(profile: Profile, pairs: list[str], parser: argparse.ArgumentParser) -> Profile:
+    """The profile with other values of numbers and switches; refuse what it has no such field for."""
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = None
+        kinds = {field.name: type(getattr(profile, field.name)) for field in fields(profile)}
+        kinds = {field: kind for field, kind in kinds.items() if kind in (bool, int, float)}
+        right = (bool,) if kinds.get(name) is bool else (int, float)
+        if name not in kinds or type(value) not in right:
+            parser.error(f"--set {pair}: give FIELD=VALUE, e.g. muon=false; fields are {', '.join(kinds)}")
+        profile = replace(profile, **{name: kinds[name](value)})
+    return profile
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("release")
@@ -69,9 +88,11 @@ def main() -> None:
     parser.add_argument("--scores", type=int, default=12, help="Evaluations along the training.")
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="A field of the profile.")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    agent, profile = parse_agent(options.agent), get_profile(options.profile).scaled(options.scale)
+    agent, profile = parse_agent(options.agent), change(get_profile(options.profile), options.set, parser)
+    profile = profile.scaled(options.scale)
     if agent.own or agent.pretrain or agent.sees_state:
         parser.error("--agent: one that trains its own encoder on pictures")
     subset = open_release(options.release)[options.subset]

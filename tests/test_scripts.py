@@ -41,6 +41,9 @@ def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path)
         other += [*options, "--seed", "1"]
         refused = subprocess.run(other, capture_output=True, text=True)
         assert refused.returncode == 2 and "choose another --folder" in refused.stderr
+        for pair in ("muon=2", "rate=true", "rates=2", "rate"):
+            wrong = subprocess.run([*other, "--set", pair], capture_output=True, text=True)
+            assert wrong.returncode == 2 and f"--set {pair}: give FIELD=VALUE" in wrong.stderr
 
 
 @pytest.mark.slow
