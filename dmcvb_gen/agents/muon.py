@@ -65,9 +65,11 @@ class Muon(torch.optim.Adam):
         return super().step(closure)
 
     @classmethod
-    def instead_of(cls, optimizer: torch.optim.Optimizer, dtype: torch.dtype) -> Muon:
-        """One over the parameters of another optimizer, at its learning rate."""
-        [group] = optimizer.param_groups
+    def instead_of(cls, optimizer: torch.optim.Optimizer, dtype: torch.dtype) -> torch.optim.Optimizer:
+        """One over the parameters of a plain Adam, at its learning rate; any other optimizer is an agent's own choice."""
+        group, *others = optimizer.param_groups
+        if type(optimizer) is not torch.optim.Adam or others or group["weight_decay"]:
+            return optimizer
         return cls(group["params"], group["lr"], dtype)
 
     def _move(self, weight: torch.Tensor, lr: float) -> None:

@@ -86,6 +86,7 @@ PROFILES = {
             episodes=2,
             batch_size=16,
             state_batch_size=16,
+            muon=True,
             episode_steps=10,
             scores=False,
             note="smoke: a few steps to see that everything runs; its numbers are not scores",

@@ -62,6 +62,16 @@ def test_an_orthogonalized_matrix_has_singular_values_near_one():
     torch.testing.assert_close(orthogonalize(torch.zeros(40, 50)), torch.zeros(40, 50))  # of a layer that gets none
 
 
+@pytest.mark.parametrize("other", [torch.optim.SGD, torch.optim.AdamW])
+def test_an_optimizer_that_an_agent_chose_stays(other):
+    weight = nn.Parameter(torch.randn(64, 64))
+    chosen = other([weight], lr=0.01)
+    assert Muon.instead_of(chosen, torch.float32) is chosen
+    plain = torch.optim.Adam([weight], lr=0.02)
+    [group] = Muon.instead_of(plain, torch.float32).param_groups
+    assert group["lr"] == 0.02 and group["params"][0] is weight
+
+
 def test_a_saved_state_goes_on_where_it_was():
     start, steps = torch.randn(64, 64), gradients((64, 64), 8)
     whole = nn.Parameter(start.clone())

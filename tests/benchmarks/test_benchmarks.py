@@ -618,8 +618,8 @@ def test_a_release_so_small_that_quick_shifts_its_pictures_is_told(small_release
     assert told(quick.pixel_steps * quick.batch_size // 10)
     assert not told(quick.pixel_steps * quick.batch_size // 10 + 1)
     [text] = told(50_000)
-    assert "passes 26 times over 100 episodes" in text and "with 257 episodes" in text
-    assert not quick.shifts(quick.pixel_steps, 257 * 500) and quick.shifts(quick.pixel_steps, 256 * 500)
+    assert "passes 20 times over 100 episodes" in text and "with 205 episodes" in text
+    assert not quick.shifts(quick.pixel_steps, 205 * 500) and quick.shifts(quick.pixel_steps, 204 * 500)
     assert not told(50_000, profile=PROFILES["paper"]) and not told(50_000, profile=PROFILES["smoke"])
     assert not any(told(50_000, cell) for cell in cells if cell.agent.name != "bc")
 
