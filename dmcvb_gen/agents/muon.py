@@ -66,7 +66,10 @@ class Muon(torch.optim.Adam):
 
     @classmethod
     def instead_of(cls, optimizer: torch.optim.Optimizer, dtype: torch.dtype) -> torch.optim.Optimizer:
-        """One over the parameters of a plain Adam, at its learning rate; any other optimizer is an agent's own choice."""
+        """One over the parameters of a plain Adam, at its learning rate.
+
+        Any other optimizer is an agent's own choice and is returned as it is.
+        """
         group, *others = optimizer.param_groups
         if type(optimizer) is not torch.optim.Adam or others or group["weight_decay"]:
             return optimizer
