@@ -23,7 +23,9 @@ FAMILIES = {
 }
 TINY = dict(episodes=2, max_steps=8, size=32, episodes_per_shard=1, progress=False)
 COMMANDS_ALONE = {"as_json", "dry_run", "strict", "executor", "ray_address", "init", "finishing", "slurm_script", "own"}
-"""Options that say how something is printed, begin and end a release of many machines, or belong to another one."""
+COMMANDS_ALONE |= {"list_settings"}
+"""Options that say how something is printed, only print, begin and end a release of many machines, or belong to another
+one."""
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
