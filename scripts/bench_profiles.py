@@ -30,7 +30,7 @@ WARM, TIMED = 20, 100
 
 @dataclass(frozen=True)
 class Variant:
-    """What is otherwise than in the profile quick; `shift` None: by quick's rule."""
+    """The settings of a training; the defaults are those of quick, whose rule decides about shifts if `shift` is None."""
 
     network: Architecture = PATCHES
     batch: int = 64

@@ -12,7 +12,7 @@ import torch
 MOMENTUM = 0.95
 ITERATIONS = 5
 COEFFICIENTS = 3.4445, -4.7750, 2.0315
-"""Of the polynomial that moves singular values towards 1 (Jordan et al. 2024)."""
+"""Coefficients of the polynomial that moves singular values towards 1 (Jordan et al. 2024)."""
 SCALE = 0.2
 """Root mean square of Adam's usual step, in learning rates (Liu et al. 2025)."""
 FEWEST, LARGEST = 32, 2**18
@@ -68,7 +68,7 @@ class Muon(torch.optim.Adam):
     def instead_of(cls, optimizer: torch.optim.Optimizer, dtype: torch.dtype) -> torch.optim.Optimizer:
         """One over the parameters of a plain Adam, at its learning rate.
 
-        Any other optimizer is an agent's own choice and is returned as it is.
+        An agent may have chosen another optimizer; that one is returned unchanged.
         """
         group, *others = optimizer.param_groups
         if type(optimizer) is not torch.optim.Adam or others or group["weight_decay"]:
