@@ -30,7 +30,7 @@ WARM, TIMED = 20, 100
 
 @dataclass(frozen=True)
 class Variant:
-    """The settings of a training. The defaults are those of quick, and its rule decides about shifts if `shift` is None."""
+    """Settings of a training. The defaults are those of quick, whose rule decides about shifts if `shift` is None."""
 
     network: Architecture = PATCHES
     batch: int = 64
