@@ -5,8 +5,8 @@
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --set muon=false --folder runs/adam
 
 The agent trains as in `validate` with that profile, `--scale` times as long, on one thread. It is scored on 30 fresh
-episodes at even distances, and each score is printed. A stopped training goes on if the command is given again. At the
-end the folder has curve.csv and curve.png.
+episodes at even distances, and each score is printed. Images that the release does not store are painted. A stopped
+training goes on if the command is given again. At the end the folder has curve.csv and curve.png.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, get_profile
 from dmcvb_gen.dataset import open_release
+from dmcvb_gen.loaders.painted import Painting, painted_release
 
 COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
 
@@ -95,7 +96,8 @@ def main() -> None:
     profile = profile.scaled(options.scale)
     if agent.own or agent.pretrain or agent.sees_state:
         parser.error("--agent: one that trains its own encoder on pictures")
-    subset = open_release(options.release)[options.subset]
+    release = open_release(options.release)
+    subset = painted_release(release, Painting(), missing=True)[options.subset]
     keep_options(options, parser)  # after what may refuse them
     data = load_data([Source(subset)], seed=options.seed, stack=agent.stack)
     torch.manual_seed(options.seed)
