@@ -1,4 +1,4 @@
-"""Behavior cloning from pictures in a few minutes: the score of several networks, batch sizes and rates beside quick's.
+"""Behavior cloning from images in a few minutes: the score of several networks, batch sizes and rates beside quick's.
 
     python scripts/bench_profiles.py RELEASE --subset walker-walk/expert/none --minutes 2
     python scripts/bench_profiles.py RELEASE --subset ant-maze-empty7x7/expert/visible --only quick,paper

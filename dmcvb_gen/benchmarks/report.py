@@ -397,12 +397,12 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
     pictured = [result for result in results if "size" in result["evaluation"]]
     others = ", agents that see states in float32" if len(pictured) < len(results) else ""
     for precision in sorted({result["machine"]["precision"] for result in pictured}):
-        notes.append(f"Networks that see pictures computed in {precision}{others}.")
+        notes.append(f"Networks that see images computed in {precision}{others}.")
     for data, evaluation in sorted({(r["renderers"]["data"], r["renderers"]["evaluation"]) for r in pictured}):
         if data != evaluation:
             notes.append(
                 f"The data were painted elsewhere ({data}), the evaluations here by renderer {evaluation}: agents with "
-                "pictures are scored on other pictures than they learned from."
+                "images are scored on other images than they learned from."
             )
     if any(result["score"]["success"] is not None for result in results):
         notes.append(

@@ -298,7 +298,7 @@ def _few_warnings(profile: Profile, results) -> list[Issue]:
             subset = cell.policy[0].subset
             found[subset] = (
                 f"{profile.name} passes {passes:.0f} times over {pluralize(result['episodes'], 'episodes')}, so it "
-                f"shifts their pictures and learns more slowly; with {needed:,} episodes or more it does not"
+                f"shifts their images and learns more slowly; with {needed:,} episodes or more it does not"
             )
     return [Issue("learning", subset, text) for subset, text in found.items()]
 

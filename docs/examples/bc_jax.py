@@ -1,4 +1,4 @@
-"""Behavior cloning from pictures in JAX: python bc_jax.py releases/demo walker-walk/expert/dynamic"""
+"""Behavior cloning from images in JAX: python bc_jax.py releases/demo walker-walk/expert/dynamic"""
 
 import sys
 

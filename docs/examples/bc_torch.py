@@ -1,4 +1,4 @@
-"""Behavior cloning from pictures in torch: python bc_torch.py releases/demo walker-walk/expert/dynamic"""
+"""Behavior cloning from images in torch: python bc_torch.py releases/demo walker-walk/expert/dynamic"""
 
 import sys
 

@@ -46,7 +46,7 @@ def train(data):
     return lambda observation: act(observation["state"])  # (episode, state) -> (episode, action) in [-1, 1]
 
 
-train.pixels = False  # its policy asks for no pictures, which makes an evaluation quick
+train.pixels = False  # its policy asks for no images, which makes an evaluation quick
 
 if __name__ == "__main__":
     from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""A policy of your own from pictures in torch, scored as `validate` scores its agents.
+"""A policy of your own from images in torch, scored as `validate` scores its agents.
 
 python evaluate_torch.py releases/demo walker-walk/expert/dynamic
 dmcvb-gen validate releases/demo --agent evaluate_torch:train

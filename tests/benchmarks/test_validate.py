@@ -121,7 +121,7 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     page = (out / "report.html").read_text()
     assert page.index("Sound") < page.index("Structure") < page.index("Episode returns") < page.index("Scores")
     assert "paper 913" not in page and "claims no score" in page
-    assert f"Networks that see pictures computed in {machine(out)['precision']}, agents that see states" in page
+    assert f"Networks that see images computed in {machine(out)['precision']}, agents that see states" in page
     assert page.count("<span class=tag>smoke</span>") == 3
     assert page.count("data:image/png;base64") >= 6 and "src='http" not in page and "href=" not in page
     facts = json.loads((out / "report.json").read_text())

@@ -56,7 +56,7 @@ class PolicyLearning(Benchmark):
         return {
             "order": ("Do stronger distractors cost return (none > static > dynamic)?", _order),
             "state": ("Does BC(state) stay near its data (5 %)?", _state),
-            "gap": ("Is BC(state) above BC from pictures?", _gap),
+            "gap": ("Is BC(state) above BC from images?", _gap),
             "id": ("Does ID+BC beat the other agents under distractors and in mazes?", _encoder),
         }
 

@@ -1,4 +1,4 @@
-"""LeRobot's dataset layout, version 3 (github.com/huggingface/lerobot): Parquet tables with PNG pictures, or mp4.
+"""LeRobot's dataset layout, version 3 (github.com/huggingface/lerobot): Parquet tables with PNG images, or mp4.
 
 `datasets.load_dataset(folder)` reads the tables, too: their schema says that the pictures are pictures.
 """
@@ -34,7 +34,7 @@ CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
 
 @register_exporter(
     "lerobot",
-    reader="LeRobot v3 (Parquet with PNG pictures, or mp4), `datasets.load_dataset`",
+    reader="LeRobot v3 (Parquet with PNG images, or mp4), `datasets.load_dataset`",
     keeps="pixels, states, actions, rewards, ends; depth, segmentation, flow as images",
     drops="the last observation of each episode, physics, labels",
     mark="meta/info.json",

@@ -31,7 +31,7 @@ def folder_name(release: ReleaseReader, subset: str) -> str:
 
 @register_exporter(
     "minari",
-    reader="minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless pictures)",
+    reader="minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless images)",
     keeps="pixels, states, actions, rewards, ends, seeds, the Gymnasium environment",
     drops="physics, labels",
     mark="data/main_data.hdf5",
