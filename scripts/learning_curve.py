@@ -3,10 +3,11 @@
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --scale 18 --folder runs/cheetah-curve
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --folder runs/paper-cell
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --set muon=false --folder runs/adam
+    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --device cuda --folder F
 
-The agent trains as in `validate` with that profile, `--scale` times as long, on one thread. It is scored on 30 fresh
-episodes at even distances, and each score is printed. Images that the release does not store are painted. A stopped
-training goes on if the command is given again. At the end the folder has curve.csv and curve.png.
+The agent trains as in `validate` with that profile, `--scale` times as long, on one thread or a GPU. It is scored on 30
+fresh episodes at even distances, and each score is printed. Images that the release does not store are painted. A
+stopped training goes on if the command is given again. At the end the folder has curve.csv and curve.png.
 """
 
 from __future__ import annotations
@@ -89,22 +90,32 @@ def main() -> None:
     parser.add_argument("--scores", type=int, default=12, help="Evaluations along the training.")
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--threads", type=int, default=1, help="Threads of the training; the scores take as many.")
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="A field of the profile.")
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    torch.set_num_threads(options.threads)
     agent, profile = parse_agent(options.agent), change(get_profile(options.profile), options.set, parser)
     profile = profile.scaled(options.scale)
     if agent.own or agent.pretrain or agent.sees_state:
         parser.error("--agent: one that trains its own encoder on pictures")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device: this torch finds no CUDA device; install a CUDA build of torch")
     release = open_release(options.release)
     subset = painted_release(release, Painting(), missing=True)[options.subset]
     keep_options(options, parser)  # after what may refuse them
-    data = load_data([Source(subset)], seed=options.seed, stack=agent.stack)
+    data = load_data([Source(subset)], seed=options.seed, stack=agent.stack, device=options.device)
     torch.manual_seed(options.seed)
     encoder = make_encoder(agent, data.sizes, None, profile.network)
-    learner = make_policy(agent, encoder, data.sizes, profile.network)
+    learner = make_policy(agent, encoder, data.sizes, profile.network).to(options.device)
     evaluator = Evaluator(
-        subset, normalization=data.normalization, stack=agent.stack, episodes=30, max_steps=profile.episode_steps
+        subset,
+        normalization=data.normalization,
+        stack=agent.stack,
+        episodes=30,
+        max_steps=profile.episode_steps,
+        device=options.device,
+        threads=options.threads,
     )
 
     done = [0]
@@ -128,6 +139,7 @@ def main() -> None:
         shift=profile.shifts(steps, len(data)),
         decay=profile.decay,
         muon=profile.muon,
+        workers=0 if options.device == "cpu" else 1,
     )
     curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
     evaluator.close()
