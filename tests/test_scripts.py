@@ -33,7 +33,18 @@ def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path)
         made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
         pixels = task != "walker-walk"  # of that one they are painted on reading
         release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], pixels=pixels, **made)
-        options = ("--profile", "smoke", "--scale", "2", "--scores", "3", "--folder", str(tmp_path / "curve" / task))
+        options = (
+            "--profile",
+            "smoke",
+            "--scale",
+            "2",
+            "--scores",
+            "3",
+            "--threads",
+            "2",
+            "--folder",
+            str(tmp_path / "curve" / task),
+        )
         printed = run("learning_curve.py", str(tmp_path / task), "--subset", next(iter(release)), *options)
         assert [line.split()[0] for line in printed.splitlines()] == ["2", "4", "6"]
         rows = (tmp_path / "curve" / task / "curve.csv").read_text().splitlines()
