@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import dmcvb_gen
-from dmcvb_gen.benchmarks.profiles import PROFILES
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -28,49 +25,35 @@ def test_both_precisions_are_timed():
 
 
 @pytest.mark.slow
+def test_a_learning_curve_paints_the_images_that_a_release_lacks(tmp_path):
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        made = {"episodes": 2, "max_steps": 20, "size": 16, "pixels": False, "progress": False}
+        release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
+        command = ["learning_curve.py", str(tmp_path / task), "--subset", next(iter(release)), "--profile", "smoke"]
+        printed = run(*command, "--scores", "1", "--threads", "2", "--folder", str(tmp_path / "curve" / task))
+        assert len(printed.splitlines()) == 1
+
+
+@pytest.mark.slow
 def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path):
     for task in ("walker-walk", "ant-maze-empty7x7"):
         made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
-        pixels = task != "walker-walk"  # of that one they are painted on reading
-        release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], pixels=pixels, **made)
-        options = (
-            "--profile",
-            "smoke",
-            "--scale",
-            "2",
-            "--scores",
-            "3",
-            "--threads",
-            "2",
-            "--folder",
-            str(tmp_path / "curve" / task),
-        )
+        release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
+        options = ("--profile", "smoke", "--scale", "2", "--scores", "3", "--folder", str(tmp_path / "curve" / task))
         printed = run("learning_curve.py", str(tmp_path / task), "--subset", next(iter(release)), *options)
         assert [line.split()[0] for line in printed.splitlines()] == ["2", "4", "6"]
         rows = (tmp_path / "curve" / task / "curve.csv").read_text().splitlines()
         assert len(rows) == 4 and (tmp_path / "curve" / task / "curve.png").exists()
-
-
-@pytest.mark.slow
-def test_a_learning_curve_refuses_other_options_and_writes_no_folder_for_them(tmp_path):
-    made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
-    release = dmcvb_gen.rollout("walker-walk", out=tmp_path / "release", levels=["random"], **made)
-    command = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / "release", "--profile", "smoke"]
-    first = [*command, "--subset", next(iter(release)), "--folder", tmp_path / "curve"]
-    subprocess.run(first, check=True, capture_output=True)
-    refused = subprocess.run([*first, "--seed", "1"], capture_output=True, text=True)
-    assert refused.returncode == 2 and "choose another --folder" in refused.stderr
-    wrong = [*command, "--subset", "none", "--folder", tmp_path / "wrong"]
-    assert subprocess.run(wrong, capture_output=True).returncode != 0
-    assert not (tmp_path / "wrong").exists()
-
-
-@pytest.mark.parametrize("pair", ["muon=2", "rate=true", "rates=2", "rate"])
-def test_a_learning_curve_says_how_a_field_is_set(pair, capsys):
-    script = runpy.run_path(str(SCRIPTS / "learning_curve.py"))
-    with pytest.raises(SystemExit):
-        script["change"](PROFILES["smoke"], [pair], argparse.ArgumentParser())
-    assert f"--set {pair}: give FIELD=VALUE" in capsys.readouterr().err
+        wrong = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", "none", *options[:-1]]
+        assert subprocess.run([*wrong, str(tmp_path / "wrong")], capture_output=True).returncode != 0
+        assert not (tmp_path / "wrong").exists()
+        other = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", next(iter(release))]
+        other += [*options, "--seed", "1"]
+        refused = subprocess.run(other, capture_output=True, text=True)
+        assert refused.returncode == 2 and "choose another --folder" in refused.stderr
+        for pair in ("muon=2", "rate=true", "rates=2", "rate"):
+            wrong = subprocess.run([*other, "--set", pair], capture_output=True, text=True)
+            assert wrong.returncode == 2 and f"--set {pair}: give FIELD=VALUE" in wrong.stderr
 
 
 @pytest.mark.slow
