@@ -6,8 +6,9 @@
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --device cuda --folder F
 
 The agent trains as in `validate` with that profile, `--scale` times as long, on one thread or a GPU. It is scored on 30
-fresh episodes at even distances, and each score is printed. Images that the release does not store are painted. A
-stopped training goes on if the command is given again. At the end the folder has curve.csv and curve.png.
+fresh episodes at even distances, and each score is printed. On a GPU, processes score it on the CPU while it trains on.
+Images that the release does not store are painted. A stopped training goes on if the command is given again. At the
+end the folder has curve.csv and curve.png.
 """
 
 from __future__ import annotations
@@ -15,21 +16,101 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-from dataclasses import fields, replace
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from safetensors.torch import load_file, save_file
 
-from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
-from dmcvb_gen.agents.data import Source, load_data
+from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, parse_agent
+from dmcvb_gen.agents.data import Sizes, Source, load_data
+from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.agents.trainer import TrainSettings, train
-from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.evaluate import Evaluator, Score
 from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, get_profile
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Subset, open_release
 from dmcvb_gen.loaders.painted import Painting, painted_release
 
 COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What it takes to score weights in another process: those of an agent that learned from a subset."""
+
+    release: str
+    subset: str
+    agent: Agent
+    profile: Profile
+    precision: str
+
+    def open(self) -> Subset:
+        """The subset, with pictures that it does not store painted."""
+        return painted_release(open_release(self.release), Painting(), missing=True)[self.subset]
+
+    def policy(self, sizes: Sizes) -> Policy:
+        """An untrained policy."""
+        network = self.profile.network
+        return make_policy(self.agent, make_encoder(self.agent, sizes, None, network), sizes, network)
+
+    def evaluator(self, subset: Subset, threads: int = 1) -> Evaluator:
+        """30 fresh episodes."""
+        most = self.profile.episode_steps
+        return Evaluator(subset, stack=self.agent.stack, episodes=30, max_steps=most, threads=threads)
+
+    def score(self, sizes: Sizes, weights: Path) -> dict[str, float]:
+        """The return of stored weights, written beside them too."""
+        torch.set_num_threads(1)
+        policy = self.policy(sizes)
+        policy.load_state_dict(load_file(weights))
+        policy.half = self.precision == "bfloat16"
+        evaluator = self.evaluator(self.open())
+        found = points_of(evaluator(policy))
+        evaluator.close()
+        weights.with_suffix(".json").write_text(json.dumps(found) + "\n")
+        return found
+
+
+def points_of(score: Score) -> dict[str, float]:
+    """A score's columns of the curve."""
+    return {"return": score.mean, "error": score.stderr}
+
+
+class ScoresBeside:
+    """Scores a policy in other processes while it trains on; its weights wait in a folder.
+
+    Args:
+      say: called with a number of steps and their score, when it is there.
+    """
+
+    def __init__(self, scene: Scene, sizes: Sizes, folder: Path, processes: int, say: Callable):
+        self._scene, self._sizes, self._folder, self._say = scene, sizes, folder, say
+        self._pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+        self._scores: dict[int, Future] = {}
+        folder.mkdir(parents=True, exist_ok=True)
+        for weights in sorted(folder.glob("*.safetensors")):  # of an earlier start
+            if not weights.with_suffix(".json").exists():
+                self._submit(int(weights.stem), weights)
+
+    def __call__(self, policy: Policy, step: int) -> None:
+        weights = self._folder / f"{step}.safetensors"
+        save_file({name: value.cpu().contiguous() for name, value in policy.state_dict().items()}, weights)
+        self._submit(step, weights)
+
+    def _submit(self, step: int, weights: Path) -> None:
+        self._scores[step] = self._pool.submit(self._scene.score, self._sizes, weights)
+        self._scores[step].add_done_callback(lambda done: done.exception() or self._say(step, done.result()))
+
+    def finish(self) -> dict[int, dict[str, float]]:
+        """Step -> its score, of all that are stored."""
+        for score in self._scores.values():
+            score.result()
+        self._pool.shutdown()
+        return {int(path.stem): json.loads(path.read_text()) for path in self._folder.glob("*.json")}
 
 
 def write_curve(folder: Path, points: list[dict], of_data: float) -> None:
@@ -91,7 +172,10 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--threads", type=int, default=1, help="Threads of the training; the scores take as many.")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="Threads of the training, or processes of a GPU's scores."
+    )
+    parser.add_argument("--compile", action="store_true", help="Use torch.compile.")
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="A field of the profile.")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -101,32 +185,34 @@ def main() -> None:
         parser.error("--agent: one that trains its own encoder on pictures")
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device: this torch finds no CUDA device; install a CUDA build of torch")
-    release = open_release(options.release)
-    subset = painted_release(release, Painting(), missing=True)[options.subset]
+    scene = Scene(options.release, options.subset, agent, profile, options.precision)
+    subset = scene.open()
     keep_options(options, parser)  # after what may refuse them
     data = load_data([Source(subset)], seed=options.seed, stack=agent.stack, device=options.device)
     torch.manual_seed(options.seed)
-    encoder = make_encoder(agent, data.sizes, None, profile.network)
-    learner = make_policy(agent, encoder, data.sizes, profile.network).to(options.device)
-    evaluator = Evaluator(
-        subset,
-        normalization=data.normalization,
-        stack=agent.stack,
-        episodes=30,
-        max_steps=profile.episode_steps,
-        device=options.device,
-        threads=options.threads,
-    )
-
+    learner = scene.policy(data.sizes).to(options.device)
     done = [0]
 
     def count(steps: int) -> None:
         done[0] += steps
 
-    def evaluate(policy) -> dict[str, float]:
-        score = evaluator(policy)
-        print(f"{done[0]:>9,} of {settings.steps:,} steps: {score.mean:7.1f} +- {score.stderr:.1f}", flush=True)
-        return {"return": score.mean, "error": score.stderr}
+    def say(step: int, score: dict[str, float]) -> None:
+        of = f"{step:>9,} of {settings.steps:,} steps"
+        print(f"{of}: {score['return']:7.1f} +- {score['error']:.1f}", flush=True)
+
+    if options.device == "cuda":
+        beside = ScoresBeside(scene, data.sizes, options.folder / "scores", options.threads, say)
+        evaluator = None
+    else:
+        evaluator = scene.evaluator(subset, options.threads)
+
+    def evaluate(policy: Policy) -> dict[str, float]:
+        if evaluator is None:
+            beside(policy, done[0])
+            return {}
+        score = points_of(evaluator(policy))
+        say(done[0], score)
+        return score
 
     steps = -(-profile.pixel_steps // options.scores) * options.scores  # so that the last score is of a whole stretch
     settings = TrainSettings(
@@ -139,10 +225,15 @@ def main() -> None:
         shift=profile.shifts(steps, len(data)),
         decay=profile.decay,
         muon=profile.muon,
+        compile=options.compile,
         workers=0 if options.device == "cpu" else 1,
     )
     curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
-    evaluator.close()
+    if evaluator is None:
+        scores = beside.finish()
+        curve = [point | scores.get(point["step"], {}) for point in curve]
+    else:
+        evaluator.close()
     write_curve(options.folder, [point for point in curve if "return" in point], float(subset.returns.mean()))
 
 

@@ -13,6 +13,8 @@ from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, ObservationD
 class Autoencoder(Learner):
     """AE: || psi(phi(o)) - o ||^2."""
 
+    recordable = True
+
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__()
         self.encoder = encoder

@@ -17,6 +17,7 @@ class BehaviorCloning(Policy):
 
     needs_pictures = False
     pretrains = True
+    recordable = True
 
     def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER, frozen: bool = False):
         super().__init__()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -152,6 +152,21 @@ class Sizes:
     stack: int = 0
 
 
+class Picks(NamedTuple):
+    """What is drawn for a batch, all of it (batch,) int64.
+
+    Attributes:
+      index: which of `TrainingData.candidates`.
+      down, right: offsets of the pictures in 0..2 PAD; None: not shifted.
+      steps: how far off the next observation is; None if nobody asks for it.
+    """
+
+    index: np.ndarray
+    down: np.ndarray | None = None
+    right: np.ndarray | None = None
+    steps: np.ndarray | None = None
+
+
 class TrainingData:
     """Episodes of one or several subsets, ready to be drawn from.
 
@@ -253,21 +268,51 @@ class TrainingData:
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
           options: dtype, reuse and pictures of `transitions`.
         """
+        rows = self.candidates(k if next_observation else 1, hold_out)
+        picks = self.pick(
+            len(rows), size, generator, next_observation, k, sample_k, shift and not hold_out and self.can_shift
+        )
+        index, down, right, steps = (None if values is None else self._to_device(values) for values in picks)
+        return self.transitions(rows[index], steps, down, right, **options)
+
+    @property
+    def can_shift(self) -> bool:
+        """True if there are pictures that are not encoded yet."""
+        return self.frames is not None and self.latent is None
+
+    def candidates(self, k: int = 1, hold_out: bool = False) -> torch.Tensor:
+        """(row,) long: the rows that a batch is drawn from, those with an observation k steps later.
+
+        Raises:
+          DmcvbError: there are none.
+        """
         rows = self.hold_out_rows if hold_out else self.train_rows
-        if next_observation and k > 1:
+        if k > 1:
             rows = rows[rows + k <= self.end[rows]]
         if not len(rows):
             raise DmcvbError(
                 f"there are no {'held-out ' if hold_out else ''}transitions to draw from (k = {k}); roll out more "
                 "episodes"
             )
-        chosen = rows[self._to_device(generator.integers(len(rows), size=size))]
-        down = right = steps = None
-        if shift and not hold_out and self.frames is not None and self.latent is None:
-            down, right = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
+        return rows
+
+    @staticmethod
+    def pick(
+        candidates: int,
+        size: int,
+        generator: np.random.Generator,
+        next_observation: bool = False,
+        k: int = 1,
+        sample_k: bool = False,
+        shift: bool = False,
+    ) -> Picks:
+        """Draw a batch from so many candidates; see `batch`."""
+        index = generator.integers(candidates, size=size)
+        down, right = generator.integers(2 * PAD + 1, size=(2, size)) if shift else (None, None)
+        steps = None
         if next_observation:
-            steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-        return self.transitions(chosen, steps, down, right, **options)
+            steps = generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k)
+        return Picks(index, down, right, steps)
 
     def transitions(
         self,

@@ -15,6 +15,7 @@ class LatentForwardDynamics(Learner):
     """LFD: || phi_EMA(o_t+1) - g(phi(o_t), e(a_t)) ||^2, phi_EMA an average of phi over time (equation 5)."""
 
     needs_next = True
+    recordable = True
 
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__()

@@ -22,6 +22,7 @@ class InverseDynamics(Learner):
     """
 
     needs_next = True
+    recordable = True
     options = {"k": 1, "sample": False}
 
     def __init__(

@@ -75,10 +75,10 @@ class Muon(torch.optim.Adam):
             return optimizer
         return cls(group["params"], group["lr"], dtype)
 
-    def _move(self, weight: torch.Tensor, lr: float) -> None:
+    def _move(self, weight: torch.Tensor, lr: float | torch.Tensor) -> None:
         gradient, state = weight.grad, self.state[weight]
         if not state:
-            state |= {"step": torch.zeros(()), "momentum": torch.zeros_like(weight)}
+            state |= {"step": torch.zeros((), device=weight.device), "momentum": torch.zeros_like(weight)}
         state["step"] += 1  # Adam looks for it in every state that it loads
         momentum = state["momentum"]
         momentum.lerp_(gradient, 1 - MOMENTUM)
@@ -86,4 +86,8 @@ class Muon(torch.optim.Adam):
         # Convolutions lie with the channels last in memory, so that this order of columns takes no copy.
         matrix = ahead.movedim(1, -1).flatten(1)
         step = orthogonalize(matrix.to(self.dtype)).to(weight.dtype) * (SCALE * max(matrix.shape) ** 0.5)
-        weight.add_(step.view_as(ahead.movedim(1, -1)).movedim(-1, 1), alpha=-lr)
+        step = step.view_as(ahead.movedim(1, -1)).movedim(-1, 1)
+        if torch.is_tensor(lr):  # of a recorded update, which reads it anew every time
+            weight.sub_(step * lr)
+        else:
+            weight.add_(step, alpha=-lr)

@@ -14,6 +14,8 @@ from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, initialize
 class StatePrediction(Learner):
     """State: || s - h(phi(o)) ||^2, h linear."""
 
+    recordable = True
+
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__()
         self.encoder, self.h = encoder, initialize(nn.Linear(encoder.features, sizes.state))
