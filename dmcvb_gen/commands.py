@@ -4,7 +4,6 @@ The options of a command are made from its function: types and defaults from the
 docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resumes if it is made again.
 """
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -28,6 +27,7 @@ from dmcvb_gen.options import (
     Split,
 )
 from dmcvb_gen.parallel import Workers, ignore
+from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
@@ -401,7 +401,7 @@ def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore)
         progress_bar(options["progress"], "B", "fetched") as moved,
         progress_bar(options["progress"], " frames", "painted") as frames,
     ):
-        painter = _render_config(*look, None, os.cpu_count() or 1, "cpu", frames, notify)
+        painter = _render_config(*look, None, usable_cores(), "cpu", frames, notify)
         return fetch_and_paint(*what, painter=painter, tick=moved, **given)
 
 

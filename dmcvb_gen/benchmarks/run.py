@@ -6,7 +6,6 @@ A cell that cannot be run has a result of {"error": one line}; what it raised li
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 import traceback
 import uuid
@@ -24,6 +23,7 @@ from dmcvb_gen.benchmarks.suites import Cell
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_text
 from dmcvb_gen.parallel import Needs, Workers, ignore, open_pool
+from dmcvb_gen.parallel.cores import usable_cores
 
 TICK_SECONDS = 0.2
 """Progress is told no more often: an Adam step on states takes less than telling of it."""
@@ -150,9 +150,9 @@ def planned_steps(profile: Profile, cells: Sequence[Cell]) -> int:
 
 def default_workers(device: str) -> int:
     """Cells side by side: two of one thread each are faster than one of two. An accelerator is not shared."""
-    return min(2, os.cpu_count() or 1) if device == "cpu" else 1
+    return min(2, usable_cores()) if device == "cpu" else 1
 
 
 def default_threads(workers: int) -> int:
     """Threads of each of `workers` processes."""
-    return max(1, (os.cpu_count() or 1) // workers)
+    return max(1, usable_cores() // workers)

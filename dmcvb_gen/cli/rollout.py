@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import shlex
 
 import click
@@ -160,8 +159,9 @@ def _run(plan, workers, as_json, whole=True):
 
 def _show_plan(plan, workers, as_json):
     from dmcvb_gen.generate.estimate import estimate, measurements
+    from dmcvb_gen.parallel.cores import usable_cores
 
-    cores, workers = os.cpu_count() or 1, workers if isinstance(workers, int) else 1
+    cores, workers = usable_cores(), workers if isinstance(workers, int) else 1
     with ProgressBar(not as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
         cost = estimate(plan, workers, bar.update)
     disk = cost.disk_bytes if plan.target.folder else cost.bytes  # buckets have no links

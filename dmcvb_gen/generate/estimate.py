@@ -9,7 +9,6 @@ Tasks are measured side by side in as many processes as will work: cores that sh
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 import time
 from collections import Counter, defaultdict
@@ -28,6 +27,7 @@ from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.plan import Plan
 from dmcvb_gen.generate.render import distractor_state_of, renderers
 from dmcvb_gen.parallel import ProgressCallback, ignore, in_order
+from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import format_bytes
@@ -224,7 +224,7 @@ def estimate(plan: Plan, workers: int = 1, progress: ProgressCallback = ignore) 
       StoreError: a worker was killed.
     """
     plan = _with_inputs(plan)
-    cores = os.cpu_count() or 1
+    cores = usable_cores()
     workers = min(workers, cores)
     lengths: dict[tuple, list[int]] = {}
     seconds: dict[tuple, float] = {}

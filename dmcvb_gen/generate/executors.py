@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import queue
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +15,7 @@ from dmcvb_gen.generate.jobs import Job
 from dmcvb_gen.generate.render import frame_count
 from dmcvb_gen.generate.target import leave
 from dmcvb_gen.parallel import Needs, Pool, ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.parallel.memory import free_memory
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import format_bytes
@@ -44,7 +44,7 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallba
     alone = workers == 1 or len(jobs) <= 1 and isinstance(workers, int)
     with open_pool(workers, tick=progress, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
         for job in jobs:
-            pool.submit(job, run_job, job, os.cpu_count() or 1 if alone else 1)
+            pool.submit(job, run_job, job, usable_cores() if alone else 1)
         expected = _Expected(jobs)
         expect(progress, expected.frames)
         try:

@@ -6,7 +6,6 @@ A `StepSource` has `__len__` and `__getitem__`, which is what Grain (`grain.MapD
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -17,6 +16,7 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import shown, training_pictures
 from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.loaders.stream import Steps, check_count
+from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
 SHARE_OF_MEMORY = 0.25
@@ -61,7 +61,7 @@ class StepSource:
         if in_memory is None:
             size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3
             fresh = getattr(subset, "fresh", False)  # then each of a loader's workers paints and holds its own
-            holders = 1 + (os.cpu_count() or 1) if fresh else 1
+            holders = 1 + usable_cores() if fresh else 1
             in_memory = size <= SHARE_OF_MEMORY * (free_memory() or UNKNOWN_MEMORY) / holders
         self.in_memory = in_memory
         self._held: tuple[int, StepTable] | None = None

@@ -1,0 +1,30 @@
+"""Count the cores that this process may use: a batch system or container often grants few of a machine's."""
+
+from __future__ import annotations
+
+import math
+import os
+
+from dmcvb_gen.parallel.memory import CONTAINER
+
+
+def usable_cores() -> int:
+    """Return the number of cores that the system lets this process use, at least 1."""
+    return max(1, int(min(_allowed(), _container())))
+
+
+def _allowed() -> float:
+    """Cores that the process may run on: those of its CPU affinity, which Slurm and taskset set."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS and Windows do not tell
+        return os.cpu_count() or 1
+
+
+def _container() -> float:
+    """Cores whose time a container may take, rounded up (cgroup v2)."""
+    try:
+        quota, period = (CONTAINER / "cpu.max").read_text().split()
+        return math.ceil(int(quota) / int(period))
+    except (OSError, ValueError):  # no container, or one without a limit ("max")
+        return math.inf

@@ -1,0 +1,35 @@
+"""The cores that a batch system or a container grants are what commands use, not all of the machine's."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from dmcvb_gen.benchmarks import run
+from dmcvb_gen.parallel import cores
+
+
+@pytest.mark.parametrize("limit, wanted", [("max 100000", 6), ("150000 100000", 2), ("50000 100000", 1), ("", 6)])
+def test_the_fewer_of_affinity_and_container_count(tmp_path, monkeypatch, limit, wanted):
+    monkeypatch.setattr(cores.os, "sched_getaffinity", lambda process: set(range(6)), raising=False)
+    monkeypatch.setattr(cores, "CONTAINER", tmp_path)
+    if limit:
+        (tmp_path / "cpu.max").write_text(limit + "\n")
+    assert cores.usable_cores() == wanted
+    assert run.default_workers("cpu") * run.default_threads(run.default_workers("cpu")) <= wanted
+
+
+def test_a_system_without_affinities_gives_all_cores(tmp_path, monkeypatch):
+    monkeypatch.delattr(cores.os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(cores, "CONTAINER", tmp_path)
+    assert cores.usable_cores() == os.cpu_count()
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no processes")
+def test_a_process_that_is_pinned_to_one_core_counts_one():
+    code = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])\n"
+    code += "from dmcvb_gen.parallel.cores import usable_cores; print(usable_cores())"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "1\n"
