@@ -25,6 +25,7 @@ class PrivilegedBC(BehaviorCloning):
     """Minimizes huber(h(phi(o)) - s) + || pi(s + noise) - a ||^2; acts by pi(h(phi(o)))."""
 
     pretrains = False
+    recordable = True
 
     def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER, frozen: bool = False):
         super().__init__(encoder, sizes, architecture, frozen)
