@@ -92,8 +92,8 @@ class Learner(nn.Module, abc.ABC):
     pretrains = True
     """Whether it may pre-train the encoder of another policy."""
     recordable = False
-    """Whether `update` asks for the same kernels every time, so that a GPU may record them once (`agents.recorded`); each
-    class says so for itself."""
+    """Whether `update` asks for the same kernels every time, so that a GPU may record them once
+    (`agents.recorded`). Each class says so for itself."""
     options: Mapping[str, int | bool] = {}
     """Its options in an agent's name and their defaults: True or False for a word, a number for word=1..64."""
 
