@@ -3,12 +3,13 @@
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --scale 18 --folder runs/cheetah-curve
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --folder runs/paper-cell
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --set muon=false --folder runs/adam
-    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --device cuda --folder F
+    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --precision bfloat16 \
+        --device cuda --compile --scores 40 --beside 10 --folder F
 
 The agent trains as in `validate` with that profile, `--scale` times as long, on one thread or a GPU. It is scored on 30
-fresh episodes at even distances, and each score is printed. On a GPU, processes score it on the CPU while it trains on.
-Images that the release does not store are painted. A stopped training goes on if the command is given again. At the
-end the folder has curve.csv and curve.png.
+fresh episodes at even distances, and each score is printed. With --beside, other processes score it on the CPU while
+it trains on. Images that the release does not store are painted. A stopped training goes on if the command is given
+again. At the end the folder has curve.csv and curve.png.
 """
 
 from __future__ import annotations
@@ -57,10 +58,10 @@ class Scene:
         network = self.profile.network
         return make_policy(self.agent, make_encoder(self.agent, sizes, None, network), sizes, network)
 
-    def evaluator(self, subset: Subset, threads: int = 1) -> Evaluator:
+    def evaluator(self, subset: Subset, **options) -> Evaluator:
         """30 fresh episodes."""
         most = self.profile.episode_steps
-        return Evaluator(subset, stack=self.agent.stack, episodes=30, max_steps=most, threads=threads)
+        return Evaluator(subset, stack=self.agent.stack, episodes=30, max_steps=most, **options)
 
     def score(self, sizes: Sizes, weights: Path) -> dict[str, float]:
         """The return of stored weights, written beside them too."""
@@ -172,9 +173,8 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument(
-        "--threads", type=int, default=1, help="Threads of the training, or processes of a GPU's scores."
-    )
+    parser.add_argument("--threads", type=int, default=1, help="Threads of the training; scores in turn take as many.")
+    parser.add_argument("--beside", type=int, default=0, metavar="N", help="Score in N processes beside the training.")
     parser.add_argument("--compile", action="store_true", help="Use torch.compile.")
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="A field of the profile.")
     options = parser.parse_args()
@@ -200,14 +200,14 @@ def main() -> None:
         of = f"{step:>9,} of {settings.steps:,} steps"
         print(f"{of}: {score['return']:7.1f} +- {score['error']:.1f}", flush=True)
 
-    if options.device == "cuda":
-        beside = ScoresBeside(scene, data.sizes, options.folder / "scores", options.threads, say)
-        evaluator = None
+    evaluator = beside = None
+    if options.beside:
+        beside = ScoresBeside(scene, data.sizes, options.folder / "scores", options.beside, say)
     else:
-        evaluator = scene.evaluator(subset, options.threads)
+        evaluator = scene.evaluator(subset, device=options.device, threads=options.threads)
 
     def evaluate(policy: Policy) -> dict[str, float]:
-        if evaluator is None:
+        if beside:
             beside(policy, done[0])
             return {}
         score = points_of(evaluator(policy))
@@ -229,7 +229,7 @@ def main() -> None:
         workers=0 if options.device == "cpu" else 1,
     )
     curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
-    if evaluator is None:
+    if beside:
         scores = beside.finish()
         curve = [point | scores.get(point["step"], {}) for point in curve]
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import subprocess
 import sys
 from pathlib import Path
@@ -54,6 +55,26 @@ def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path)
         for pair in ("muon=2", "rate=true", "rates=2", "rate"):
             wrong = subprocess.run([*other, "--set", pair], capture_output=True, text=True)
             assert wrong.returncode == 2 and f"--set {pair}: give FIELD=VALUE" in wrong.stderr
+
+
+@pytest.mark.slow
+def test_scores_beside_a_training_are_those_in_turn(tmp_path):
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
+        release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
+        options = (str(tmp_path / task), "--subset", next(iter(release)), "--profile", "smoke", "--scores", "3")
+        curves = {}
+        for name, few in {"turn": (), "beside": ("--beside", "1")}.items():
+            folder = tmp_path / name / task
+            printed = run("learning_curve.py", *options, *few, "--folder", str(folder))
+            with open(folder / "curve.csv", newline="") as file:
+                rows = list(csv.DictReader(file))
+            assert sorted(line.split()[0] for line in printed.splitlines()) == ["1", "2", "3"]
+            curves[name] = [(row["step"], row["return"], row["error"]) for row in rows]
+        assert curves["turn"] == curves["beside"] and len(curves["turn"]) == 3
+    (folder / "scores" / "2.json").unlink()  # of a run that was killed before this score was there
+    again = run("learning_curve.py", *options, *few, "--folder", str(folder))
+    assert again.count("2 of 3 steps") == 2  # that one, and the training's own
 
 
 @pytest.mark.slow
