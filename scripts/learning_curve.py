@@ -41,7 +41,7 @@ COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
 
 @dataclass(frozen=True)
 class Scene:
-    """What it takes to score weights in another process: those of an agent that learned from a subset."""
+    """An agent and the subset that it learns from; another process can score its weights by these."""
 
     release: str
     subset: str

@@ -153,12 +153,12 @@ class Sizes:
 
 
 class Picks(NamedTuple):
-    """What is drawn for a batch, all of it (batch,) int64.
+    """The random choices of a batch; each array is (batch,) int64.
 
     Attributes:
       index: which of `TrainingData.candidates`.
       down, right: offsets of the pictures in 0..2 PAD; None: not shifted.
-      steps: how far off the next observation is; None if nobody asks for it.
+      steps: steps to the next observation; None if the batch has none.
     """
 
     index: np.ndarray

@@ -104,7 +104,7 @@ def test_nothing_is_recorded_without_a_gpu_or_from_a_mapped_file():
     on_gpu = SimpleNamespace(device=torch.device("cuda"), frames=SimpleNamespace(mapped=False))
     assert recorded.can_record(bc(data), on_gpu)
     derived = type("Derived", (BehaviorCloning,), {})(observation_encoder(9, SIZE, SMALL), data.sizes, SMALL)
-    assert not recorded.can_record(derived, on_gpu)  # nobody says that its updates are alike
+    assert not recorded.can_record(derived, on_gpu)  # its class does not say that its updates are alike
     on_gpu.frames.mapped = True
     assert not recorded.can_record(bc(data), on_gpu)
 
