@@ -3,8 +3,11 @@
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --scale 18 --folder runs/cheetah-curve
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --folder runs/paper-cell
     python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --set muon=false --folder runs/adam
-    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --precision bfloat16 \
-        --device cuda --compile --scores 40 --beside 10 --folder F
+
+On a GPU, the paper's cell takes minutes:
+
+    python scripts/learning_curve.py RELEASE --subset cheetah-run/expert/none --profile paper --folder F
+        --device cuda --precision bfloat16 --compile --scores 40 --beside 10
 
 The agent trains as in `validate` with that profile, `--scale` times as long, on one thread or a GPU. It is scored on 30
 fresh episodes at even distances, and each score is printed. With --beside, other processes score it on the CPU while
