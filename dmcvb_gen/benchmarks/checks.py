@@ -114,8 +114,8 @@ def check_labels(subset: Subset) -> Iterator[Issue]:
     looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]
     own = task.material_colors.astype(np.float32)
     names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
-    for episode in map(int, subset.episodes):
-        video, frame, color, style = subset.episode(episode, names).values()
+    for episode, labels in subset.each_episode(names):
+        video, frame, color, style = labels.values()
         problems = [(~np.isin(style, looks) | (style != style[0]), "the maze's style is not one of its split's")]
         problems += _label_problems(setting, own, video, frame, color)
         for bad, message in problems:

@@ -32,6 +32,8 @@ from dmcvb_gen.text import pluralize
 
 MAX_STEP_BYTES = 2**20
 """Bytes of a step that is no picture, at most."""
+TRANSITIONS = "action", "reward", "discount"
+"""Arrays whose last stored row, of an episode's last observation, means nothing."""
 MANY_EPISODES = 10**6
 """An array with more episodes than that, and ten times the manifest's, is damaged or hostile."""
 
@@ -227,6 +229,10 @@ class Subset:
     @property
     def episodes(self) -> np.ndarray:
         """(episode,) int: indices of the committed episodes."""
+        return self._episodes.copy()
+
+    @functools.cached_property
+    def _episodes(self) -> np.ndarray:
         ranges = [np.arange(*self.commits[shard].episodes) for shard in sorted(self.commits)]
         return np.concatenate(ranges) if ranges else np.zeros(0, int)
 
@@ -312,8 +318,25 @@ class Subset:
         """
         names = self.arrays if arrays is None else tuple(arrays)
         values = self.rows([name for name in names if self.array(name).ndim > 1], [index])
-        values |= {name: values[name][:-1] for name in ("action", "reward", "discount") if name in values}
+        values |= {name: values[name][:-1] for name in TRANSITIONS if name in values}
         return {name: values[name] if name in values else self.read(name, [index])[0] for name in names}
+
+    def each_episode(self, arrays: Iterable[str]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Every committed episode's index and what `episode` gives, in the order of `episodes`.
+
+        A shard is read at a time. `episode` decodes it anew for each of its episodes.
+        """
+        names = tuple(arrays)
+        with_steps = [name for name in names if self.array(name).ndim > 1]
+        for shard in sorted(self.commits):
+            episodes = range(*self.commits[shard].episodes)
+            values: dict[str, Any] = {name: self.read(name, episodes) for name in names if name not in with_steps}
+            ends = np.cumsum(self.read("length", episodes).clip(0, self.record.max_steps) + 1)[:-1]
+            for name, rows in self.rows(with_steps, episodes).items():
+                parts = np.split(rows, ends)
+                values[name] = [part[:-1] for part in parts] if name in TRANSITIONS else parts
+            for index, episode in enumerate(episodes):
+                yield episode, {name: values[name][index] for name in names}
 
 
 def _ranges(indices: np.ndarray) -> str:

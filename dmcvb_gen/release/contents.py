@@ -54,7 +54,6 @@ def _sample(count: int, wanted: int) -> np.ndarray:
 def check_values(subset: Subset) -> Iterator[Issue]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
-    episodes = subset.episodes
     specs = subset_specs(EpisodeShape.of(task), subset.record)
     for spec in imported_specs(subset.record) if subset.record.imported else specs:
         if spec.name not in subset.arrays:
@@ -67,12 +66,12 @@ def check_values(subset: Subset) -> Iterator[Issue]:
             yield Issue("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
             return
     seen: dict[bytes, int] = {}
-    for episode, length in zip(map(int, episodes), map(int, subset.lengths), strict=True):
+    names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
+    read = subset.each_episode([*names, "return", "terminated"])
+    for (episode, values), length in zip(read, map(int, subset.lengths), strict=True):
         if not 0 < length <= subset.record.max_steps:
             yield Issue("lengths", subset.name, f"length {length} is not in 1..{subset.record.max_steps}", episode)
             continue
-        names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
-        values = subset.episode(episode, [*names, "return", "terminated"])
         for name in names:
             bad = ~np.isfinite(values[name].reshape(len(values[name]), -1)).all(axis=1)
             if bad.any():

@@ -23,6 +23,7 @@ from dmcvb_gen.dataset.writer import finish_release, sha256_file, subset_digest
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.plan import finish, make_plan, prepare
+from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.tasks import get_task
@@ -75,6 +76,21 @@ def test_a_release_reads_back_with_its_shapes_and_alignment(small_release):
         result = batch.step(episode["action"][step : step + 1])
         assert result.reward[0].astype(np.float32) == episode["reward"][step]
         np.testing.assert_array_equal(batch.physics()[0], episode["physics"][step + 1])
+
+
+@pytest.mark.parametrize("family", ["small_release", "maze_release"])
+@pytest.mark.parametrize("painted", [False, True])
+def test_each_episode_of_a_subset_is_what_reading_it_alone_gives(request, family, painted):
+    """In shards of one and of two episodes, the last one not full; mazes' episodes end early."""
+    release = open_release(request.getfixturevalue(family))
+    for subset in painted_release(release, Painting()).subsets.values() if painted else release.subsets.values():
+        read = list(subset.each_episode(subset.arrays))
+        assert [episode for episode, _ in read] == list(subset.episodes) and len(read) > 1
+        for episode, values in read:
+            alone = subset.episode(episode)
+            assert list(values) == list(alone)
+            for name, value in alone.items():
+                np.testing.assert_array_equal(values[name], value)
 
 
 def test_repainting_a_stored_frame_gives_the_stored_pixels(small_release):

@@ -161,6 +161,7 @@ def test_what_cannot_be_read_at_a_url_is_not_said_to_be_moved(root, monkeypatch,
 READERS = {
     "read": lambda subset: subset.read("pixels"),
     "episode": lambda subset: subset.episode(0),
+    "each episode": lambda subset: list(subset.each_episode(["pixels"])),
     "xarray": lambda subset: subset.xarray()["pixels"].values,
     "xarray, a part": lambda subset: subset.xarray([1])["pixels"].isel(step=slice(1, 3), height=[0, 2]).values,
     "xarray, load": lambda subset: subset.xarray().load(),
