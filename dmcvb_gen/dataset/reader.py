@@ -321,12 +321,15 @@ class Subset:
         values |= {name: values[name][:-1] for name in TRANSITIONS if name in values}
         return {name: values[name] if name in values else self.read(name, [index])[0] for name in names}
 
-    def each_episode(self, arrays: Iterable[str]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        """Every committed episode's index and what `episode` gives, in the order of `episodes`.
+    def each_episode(self, arrays: Iterable[str] | None = None) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Index and arrays of every committed episode, as `episode` gives them, in the order of `episodes`.
 
-        A shard is read at a time. `episode` decodes it anew for each of its episodes.
+        Each array is read once a shard, which takes a fraction of reading each episode; a shard's arrays are in memory.
+
+        Args:
+          arrays: names of arrays, all by default.
         """
-        names = tuple(arrays)
+        names = self.arrays if arrays is None else tuple(arrays)
         with_steps = [name for name in names if self.array(name).ndim > 1]
         for shard in sorted(self.commits):
             episodes = range(*self.commits[shard].episodes)

@@ -84,7 +84,7 @@ def test_each_episode_of_a_subset_is_what_reading_it_alone_gives(request, family
     """In shards of one and of two episodes, the last one not full; mazes' episodes end early."""
     release = open_release(request.getfixturevalue(family))
     for subset in painted_release(release, Painting()).subsets.values() if painted else release.subsets.values():
-        read = list(subset.each_episode(subset.arrays))
+        read = list(subset.each_episode())
         assert [episode for episode, _ in read] == list(subset.episodes) and len(read) > 1
         for episode, values in read:
             alone = subset.episode(episode)
