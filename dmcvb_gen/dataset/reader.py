@@ -331,10 +331,11 @@ class Subset:
         """
         names = self.arrays if arrays is None else tuple(arrays)
         with_steps = [name for name in names if self.array(name).ndim > 1]
+        lengths = iter(self.lengths.clip(0, self.record.max_steps))
         for shard in sorted(self.commits):
             episodes = range(*self.commits[shard].episodes)
             values: dict[str, Any] = {name: self.read(name, episodes) for name in names if name not in with_steps}
-            ends = np.cumsum(self.read("length", episodes).clip(0, self.record.max_steps) + 1)[:-1]
+            ends = np.cumsum([int(next(lengths)) + 1 for _ in episodes])[:-1]
             for name, rows in self.rows(with_steps, episodes).items():
                 parts = np.split(rows, ends)
                 values[name] = [part[:-1] for part in parts] if name in TRANSITIONS else parts

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import islice
 
 import mujoco
 import numpy as np
@@ -69,8 +70,8 @@ def _trajectories(release: Release) -> dict[tuple[str, str], Subset]:
 
 def _episodes(subset: Subset, name: str) -> Iterable[np.ndarray]:
     """Observations of an array, episode by episode, the last one included: (length + 1, ...)."""
-    for place, episode in enumerate(subset.episodes[:EPISODES]):
-        yield subset.episode(int(episode), [name])[name][: int(subset.lengths[place]) + 1]
+    for _, values in islice(subset.each_episode([name]), EPISODES):
+        yield values[name]
 
 
 def read_states(subset: Subset) -> Iterable[np.ndarray]:
