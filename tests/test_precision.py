@@ -16,7 +16,18 @@ from dmcvb_gen.training import sac
 from dmcvb_gen.training.defaults import default_run
 from dmcvb_gen.training.runs import read_config
 
-SHORT = ["--steps", "12", "--set", "warmup_steps=8", "--set", "simulations=4", "--set", "batch_size=8"]
+SHORT = [
+    "--steps",
+    "12",
+    "--set",
+    "warmup_steps=8",
+    "--set",
+    "simulations=4",
+    "--set",
+    "batch_size=8",
+    "--set",
+    "compile=false",
+]
 
 
 @pytest.mark.parametrize(("half", "chosen"), [(0.5, "bfloat16"), (0.99, "float32"), (8.0, "float32")])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import dmcvb_gen
 
@@ -18,6 +20,21 @@ def run(name: str, *arguments: str) -> str:
     done = subprocess.run([sys.executable, SCRIPTS / name, *arguments], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
+
+
+@pytest.fixture
+def learning_curve(monkeypatch, capsys):
+    """The program in this process, which has imported torch: (arguments) -> what it printed."""
+    threads = torch.get_num_threads()
+    monkeypatch.syspath_prepend(SCRIPTS)  # processes that score beside a training find it there, too
+
+    def call(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["learning_curve.py", *arguments])
+        importlib.import_module("learning_curve").main()
+        return capsys.readouterr().out
+
+    yield call
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.slow
@@ -36,29 +53,32 @@ def test_a_learning_curve_paints_the_images_that_a_release_lacks(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path):
+def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path, learning_curve, capsys):
+    def refused(*arguments: str) -> str:
+        with pytest.raises(SystemExit) as end:
+            learning_curve(*arguments)
+        assert end.value.code == 2
+        return capsys.readouterr().err
+
     for task in ("walker-walk", "ant-maze-empty7x7"):
         made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
         release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
         options = ("--profile", "smoke", "--scale", "2", "--scores", "3", "--folder", str(tmp_path / "curve" / task))
-        printed = run("learning_curve.py", str(tmp_path / task), "--subset", next(iter(release)), *options)
+        command = (str(tmp_path / task), "--subset", next(iter(release)), *options)
+        printed = learning_curve(*command)
         assert [line.split()[0] for line in printed.splitlines()] == ["2", "4", "6"]
         rows = (tmp_path / "curve" / task / "curve.csv").read_text().splitlines()
         assert len(rows) == 4 and (tmp_path / "curve" / task / "curve.png").exists()
-        wrong = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", "none", *options[:-1]]
-        assert subprocess.run([*wrong, str(tmp_path / "wrong")], capture_output=True).returncode != 0
+        with pytest.raises(KeyError):
+            learning_curve(str(tmp_path / task), "--subset", "none", *options[:-1], str(tmp_path / "wrong"))
         assert not (tmp_path / "wrong").exists()
-        other = [sys.executable, SCRIPTS / "learning_curve.py", tmp_path / task, "--subset", next(iter(release))]
-        other += [*options, "--seed", "1"]
-        refused = subprocess.run(other, capture_output=True, text=True)
-        assert refused.returncode == 2 and "choose another --folder" in refused.stderr
+        assert "choose another --folder" in refused(*command, "--seed", "1")
         for pair in ("muon=2", "rate=true", "rates=2", "rate"):
-            wrong = subprocess.run([*other, "--set", pair], capture_output=True, text=True)
-            assert wrong.returncode == 2 and f"--set {pair}: give FIELD=VALUE" in wrong.stderr
+            assert f"--set {pair}: give FIELD=VALUE" in refused(*command, "--set", pair)
 
 
 @pytest.mark.slow
-def test_scores_beside_a_training_are_those_in_turn(tmp_path):
+def test_scores_beside_a_training_are_those_in_turn(tmp_path, learning_curve):
     for task in ("walker-walk", "ant-maze-empty7x7"):
         made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
         release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
@@ -66,14 +86,14 @@ def test_scores_beside_a_training_are_those_in_turn(tmp_path):
         curves = {}
         for name, few in {"turn": (), "beside": ("--beside", "1")}.items():
             folder = tmp_path / name / task
-            printed = run("learning_curve.py", *options, *few, "--folder", str(folder))
+            printed = learning_curve(*options, *few, "--folder", str(folder))
             with open(folder / "curve.csv", newline="") as file:
                 rows = list(csv.DictReader(file))
             assert sorted(line.split()[0] for line in printed.splitlines()) == ["1", "2", "3"]
             curves[name] = [(row["step"], row["return"], row["error"]) for row in rows]
         assert curves["turn"] == curves["beside"] and len(curves["turn"]) == 3
     (folder / "scores" / "2.json").unlink()  # of a run that was killed before this score was there
-    again = run("learning_curve.py", *options, *few, "--folder", str(folder))
+    again = learning_curve(*options, *few, "--folder", str(folder))
     assert again.count("2 of 3 steps") == 2  # that one, and the training's own
 
 

@@ -1,8 +1,8 @@
 """Pytest plugin of the two tiers of tests: it measures each test's processor time and names slow tests without a mark.
 
-`bash scripts/test.sh` runs the tests without `@pytest.mark.slow` and gives `--cpu-limit 3`: tests without the mark
-whose own time is over 3 seconds are listed at the end. None fails by it, because machines differ in speed. A test's own
-time is the processor time of its body, in this process and in children that it waited for. The clock on the wall is
+`bash scripts/test.sh` runs the tests without `@pytest.mark.slow` and gives `--cpu-limit 2.5`: tests without the mark
+whose own time is over 2.5 seconds are listed at the end. None fails by it, because machines differ in speed. A test's
+own time is the processor time of its body, in this process and in children that it waited for. The clock on the wall is
 not used, because machines are shared; fixtures do not count, because many tests share them.
 """
 
