@@ -106,13 +106,16 @@ class HeldFrames:
             for first, last in rows[:, [0, -1]].tolist():
                 _advise(self._file, "WILLNEED", first * frame, (last + 1) * frame)
         (batch, frames), wide = rows.shape, self.size + 2 * PAD
-        line = self._mirror[down[:, None] + torch.arange(self.size, device=rows.device)]  # (batch, size)
+        # The last line is picked twice. Otherwise planes of 64 x 64 would lie a page apart, and all channels of a pixel
+        # would compete for the same few lines of the processor's cache when they are brought together.
+        order = torch.arange(self.size + 1, device=rows.device).clamp(max=self.size - 1)
+        line = self._mirror[down[:, None] + order]  # (batch, size + 1)
         plane = rows[:, :, None] * self.channels + torch.arange(self.channels, device=rows.device)
         first = plane.flatten(1) * (self.size * wide) + right[:, None]  # (batch, frames x channels)
-        index = first[:, :, None] + (line * wide)[:, None]  # (batch, frames x channels, size)
+        index = first[:, :, None] + (line * wide)[:, None]  # (batch, frames x channels, size + 1)
         flat = self.table.view(-1)
         lines = flat.as_strided((len(flat) - self.size + 1, self.size), (1, 1)).index_select(0, index.reshape(-1))
-        return lines.view(batch, frames * self.channels, self.size, self.size)
+        return lines.view(batch, frames * self.channels, self.size + 1, self.size)[:, :, :-1]
 
 
 def _advise(file: mmap.mmap, use: str, start: int, stop: int) -> None:
@@ -131,8 +134,9 @@ def normalize_pixels(
     Convolutions want that layout; otherwise they would convert it forward and backward. In this order bfloat16
     rounds once, as autocast would: 127.5 less is exact in 8 bits.
     """
-    values = pictures.to(dtype).sub_(127.5).mul_(1 / 255)  # as they lie, and turned last: a quarter faster
-    return values.contiguous(memory_format=torch.channels_last) if out is None else out.copy_(values)
+    turned = pictures.contiguous(memory_format=torch.channels_last)  # while they are bytes
+    values = turned.to(dtype) if out is None else out.copy_(turned)
+    return values.sub_(127.5).mul_(1 / 255)
 
 
 @dataclass(frozen=True)
