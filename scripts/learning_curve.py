@@ -37,6 +37,7 @@ from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score
 from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, get_profile
 from dmcvb_gen.dataset import Subset, open_release
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.painted import Painting, painted_release
 
 COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
@@ -189,7 +190,10 @@ def main() -> None:
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device: this torch finds no CUDA device; install a CUDA build of torch")
     scene = Scene(options.release, options.subset, agent, profile, options.precision)
-    subset = scene.open()
+    try:
+        subset = scene.open()
+    except DmcvbError as error:
+        parser.error(str(error))
     keep_options(options, parser)  # after what may refuse them
     data = load_data([Source(subset)], seed=options.seed, stack=agent.stack, device=options.device)
     torch.manual_seed(options.seed)

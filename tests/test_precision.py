@@ -16,18 +16,8 @@ from dmcvb_gen.training import sac
 from dmcvb_gen.training.defaults import default_run
 from dmcvb_gen.training.runs import read_config
 
-SHORT = [
-    "--steps",
-    "12",
-    "--set",
-    "warmup_steps=8",
-    "--set",
-    "simulations=4",
-    "--set",
-    "batch_size=8",
-    "--set",
-    "compile=false",
-]
+SMALL = ("warmup_steps=8", "simulations=4", "batch_size=8", "compile=false")
+SHORT = ["--steps=12", *(f"--set={pair}" for pair in SMALL)]
 
 
 @pytest.mark.parametrize(("half", "chosen"), [(0.5, "bfloat16"), (0.99, "float32"), (8.0, "float32")])
