@@ -34,7 +34,8 @@ class UnknownNameError(DmcvbError, KeyError):
         hint = f" Did you mean {near[0]!r}?" if near else ""
         listed, rest = known, ""
         if len(known) > MOST_LISTED:
-            listed = difflib.get_close_matches(str(name), known, n=MOST_LISTED // 3, cutoff=0.3)
+            most = MOST_LISTED // 3
+            listed = difflib.get_close_matches(str(name), known, n=most, cutoff=0.3) or known[:most]
             rest = f" and {len(known) - len(listed)} more"
         super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(listed)}{rest}.")
 

@@ -41,7 +41,7 @@ from dmcvb_gen.benchmarks.trained import save_agent
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import replacing, write_json
+from dmcvb_gen.files import replacing, sha256_file, write_json
 from dmcvb_gen.loaders.source import StepSource
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.tasks import Task, get_task
@@ -204,7 +204,7 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     folder = setup.cells / f"{cell.id}.{mark[:12]}.run"
     subset = release[cell.policy[0].subset]
     curve, trained = _train_policy(setup, cell, subset, data, policy, folder, tick)
-    _save_trained(setup, cell, policy, data)
+    kept = _save_trained(setup, cell, policy, data)
     inspected = time.perf_counter()
     looked_into = pixels and setup.profile.readout_steps
     inspection = inspect(setup, policy.encoder, data, cell, folder, tick) if looked_into else None
@@ -222,7 +222,7 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     result = {"fingerprint": mark, "seed": setup.seed, "digests": digests}
     result |= _facts(setup, cell, subset, data, curve, seconds)
     result["pretraining"] = pretrained and {key: pretrained[key] for key in ("curve", "seconds")}
-    result["inspection"] = inspection
+    result |= {"inspection": inspection, "policy_file": kept}
     write_json(path, result)
     _clear(folder)
     return result
@@ -318,11 +318,16 @@ def _train_policy(
     return curve, time.perf_counter() - started
 
 
-def _save_trained(setup: Setup, cell: Cell, policy: Policy, data: TrainingData) -> None:
-    """Keep the policy beside its result, unless its score is noise or its encoder is a large file of the user's."""
-    if setup.profile.scores and not cell.agent.ready_encoder:
-        path = setup.cells / f"{cell.id}.safetensors"
-        save_agent(path, policy, cell.agent, data.sizes, setup.profile.network, data.normalization)
+def _save_trained(setup: Setup, cell: Cell, policy: Policy, data: TrainingData) -> str | None:
+    """Keep the policy beside its result, unless its score is noise or its encoder is a large file of the user's.
+
+    Gives the file's SHA-256: a later run with another seed or profile writes over it.
+    """
+    if not setup.profile.scores or cell.agent.ready_encoder:
+        return None
+    path = setup.cells / f"{cell.id}.safetensors"
+    save_agent(path, policy, cell.agent, data.sizes, setup.profile.network, data.normalization)
+    return sha256_file(path)
 
 
 def _facts(

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jinja2 import Environment, StrictUndefined
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from dmcvb_gen.benchmarks.suites import slug
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -90,8 +90,14 @@ class Row(BaseModel):
     processor: str
     precision: str
     evaluation: Evaluation
-    returns: tuple[float, ...]
+    returns: tuple[FiniteFloat, ...] = Field(min_length=1)
     policy: str | None
+
+    @model_validator(mode="after")
+    def _counted(self) -> Row:
+        if len(self.returns) != self.evaluation.episodes:
+            raise ValueError(f"{len(self.returns)} returns of {self.evaluation.episodes} episodes")
+        return self
 
     @property
     def name(self) -> str:
@@ -157,7 +163,7 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
 
     Raises:
       DmcvbError: there is no report, its scores are noise, the release is not complete, or it has no cell that can be
-        evaluated by its name alone.
+        evaluated by its name alone; a policy file is another run's.
     """
     folder = Path(report)
     try:
@@ -176,13 +182,30 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
     )
     made_of = Release(**{key: release[key] for key in ("name", "version", "digest")}, command=command)
     rows = [
-        (_row_of(result, facts, made_of), folder / "cells" / f"{result['id']}.safetensors")
+        (_row_of(result, facts, made_of), _policy_of(result, folder))
         for result in facts["results"]
         if result.get("evaluation") and result["evaluation"]["goals"] is None
     ]
     if not rows:
         raise DmcvbError(f"{folder} holds no cell that can be evaluated again; B3's goals are a release's own")
-    return {row.name: (row, path if path.exists() else None) for row, path in rows}
+    return {row.name: (row, path) for row, path in rows}
+
+
+def _policy_of(result: dict[str, Any], report: Path) -> Path | None:
+    """The policy file of a report's cell, None if it is not there.
+
+    Raises:
+      DmcvbError: it is that of another run into the same folder.
+    """
+    path = report / "cells" / f"{result['id']}.safetensors"
+    if not path.exists():
+        return None
+    if sha256_file(path) != result.get("policy_file"):
+        raise DmcvbError(
+            f"{path} is not the policy that {report / 'report.json'} scored; run its validate again, or remove the "
+            "file to make a row without policy"
+        )
+    return path
 
 
 def _row_of(result: dict[str, Any], facts: dict[str, Any], release: Release) -> Row:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,13 +99,28 @@ def load_agent(path: str | Path) -> TrainedAgent:
             raise ValueError("another format")
         normalization = Normalization(tensors.pop("normalization.mean"), tensors.pop("normalization.std"))
         agent, sizes, network = parse_agent(facts["agent"]), Sizes(**facts["sizes"]), Architecture(**facts["network"])
-        policy = make_policy(agent, make_encoder(agent, sizes, architecture=network), sizes, network)
+        if normalization.mean.shape != (sizes.state,) or normalization.std.shape != (sizes.state,):
+            raise ValueError("the normalization does not fit")
+        with torch.device("meta"):  # without memory: a file may name any size
+            _check_shapes(_untrained(agent, sizes, network), tensors)
+        policy = _untrained(agent, sizes, network)
         lacking = policy.load_state_dict(tensors, strict=False)
         wrong = [*lacking.unexpected_keys, *(name for name in lacking.missing_keys if policy.acts_by(name))]
         if wrong:
             raise ValueError(f"{wrong[0]} does not fit")
         policy.half = bool(facts["half"])
-    except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except (OSError, SafetensorError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
         raise DmcvbError(f"{path} is no agent that validate trained ({reason})") from None
     return TrainedAgent(agent, sizes, policy.eval(), normalization)
+
+
+def _untrained(agent: Agent, sizes: Sizes, network: Architecture) -> Policy:
+    return make_policy(agent, make_encoder(agent, sizes, architecture=network), sizes, network)
+
+
+def _check_shapes(policy: Policy, tensors: Mapping[str, torch.Tensor]) -> None:
+    """Raise ValueError if a weight that acts is missing or has another shape than in the file."""
+    for name, weight in policy.state_dict().items():
+        if policy.acts_by(name) and (name not in tensors or tensors[name].shape != weight.shape):
+            raise ValueError(f"{name} does not fit")

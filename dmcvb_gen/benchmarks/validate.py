@@ -114,6 +114,7 @@ def make_setup(
     precision: str = "auto",
     memory: float | None = None,
     dino_weights: str | Path | None = None,
+    backgrounds: str | Path | None = None,
     training: bool = True,
     **fields: Any,
 ) -> Setup:
@@ -148,6 +149,7 @@ def make_setup(
         threads=threads,
         memory=None if memory is None else int(memory * 1e9),
         dino_weights=None if dino_weights is None else str(dino_weights),
+        backgrounds=None if backgrounds is None else str(backgrounds),
         **fields,
     )
 

@@ -95,7 +95,8 @@ def train_behaviour(
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
     algorithm = algo or (found.algorithm if found else "guided" if layout else "sac")
-    given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from)
+    source = None if init_from is None else str(init_from)
+    given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=source)
     changed = parse_settings(as_names(settings), config, algorithm)
     torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
     chosen = _precision(precision, algorithm, changed, found)

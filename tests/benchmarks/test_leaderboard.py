@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 import dmcvb_gen
 from dmcvb_gen.agents.networks import PATCHES
+from dmcvb_gen.benchmarks import trained
 from dmcvb_gen.benchmarks.leaderboard import Row, add_rows, check_row, read_rows, render_page, rows_of_report
 from dmcvb_gen.benchmarks.profiles import get_profile
 from dmcvb_gen.benchmarks.trained import load_agent
@@ -186,6 +190,55 @@ def test_a_file_that_is_no_agent_is_refused(walkers, tmp_path):
     (tmp_path / "x.safetensors").write_bytes(b"not one")
     with pytest.raises(DmcvbError, match="no agent that validate trained"):
         load_agent(tmp_path / "x.safetensors")
+
+
+@pytest.mark.parametrize(
+    "change", [{"sizes": {"action": 10**7}}, {"sizes": {"state": 10**7}}, {"network": {"latent": 10**7}}, "no facts"]
+)
+def test_a_file_that_names_other_sizes_than_it_holds_makes_no_networks(change, walkers, tmp_path, monkeypatch):
+    kept = walkers / "cells" / "b1_walker-walk_none_bc_random.safetensors"
+    with safe_open(str(kept), "pt") as file:
+        facts = json.loads(file.metadata()["facts"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    changed = [] if change == "no facts" else facts | {key: facts[key] | new for key, new in change.items()}
+    save_file(tensors, str(tmp_path / "x.safetensors"), metadata={"facts": json.dumps(changed)})
+    made, untrained = [], trained._untrained
+
+    def watched(*arguments):
+        policy = untrained(*arguments)
+        made.append(next(policy.parameters()).device.type)
+        return policy
+
+    monkeypatch.setattr(trained, "_untrained", watched)
+    with pytest.raises(DmcvbError, match="no agent that validate trained"):
+        load_agent(tmp_path / "x.safetensors")
+    assert "cpu" not in made
+    assert load_agent(kept).agent.name == "bc" and made[-2:] == ["meta", "cpu"]
+
+
+def test_a_policy_of_another_run_into_the_same_folder_makes_no_row(walkers, tmp_path):
+    shutil.copytree(walkers, tmp_path / "report")
+    cells = tmp_path / "report" / "cells"
+    mine, other = cells / "b1_walker-walk_none_bc_random.safetensors", tmp_path / "report" / "report.json"
+    mine.write_bytes((cells / "b1_walker-walk_dynamic_bc_random.safetensors").read_bytes())
+    with pytest.raises(DmcvbError, match=f"{mine.name} is not the policy that {other} scored"):
+        rows_of_report(tmp_path / "report")
+    mine.unlink()
+    rows = rows_of_report(tmp_path / "report").values()
+    assert [row.agent for row, policy in rows if policy is None] == ["bc"] and len(rows) == 7
+
+
+@pytest.mark.parametrize(
+    "returns, reason", [([], "at least 1 item"), ([1.0, 2.0], "2 returns of 3 episodes"), ([1, 2, "nan"], "finite")]
+)
+def test_a_row_without_the_returns_of_its_episodes_is_no_row(returns, reason, walkers, tmp_path):
+    (row, *_) = add_rows(tmp_path, rows_of_report(walkers))
+    path = tmp_path / f"{row.name}.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"returns": returns}))
+    for options in ([], ["--check"]):
+        done = CliRunner().invoke(main, ["leaderboard", str(tmp_path), *options])
+        assert done.exit_code == 2 and f"{path.name} is no row of a leaderboard" in done.output.replace("\n", ""), done
+        assert reason in done.output
 
 
 # -- the rows of this repository ------------------------------------------------------------------
