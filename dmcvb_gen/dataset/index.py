@@ -36,6 +36,8 @@ from dmcvb_gen.storage.remote import is_url, storage_errors
 
 ZARR_JSON = "zarr.json"
 INDEX = "files.json"
+CLAIM = "publishing.json"
+"""At a URL while a publisher is at work: which release it puts there."""
 CARD_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
 COMMITS = "commits/"
 """Folder of the shards' records, which name the machine that made them."""

@@ -19,6 +19,7 @@ from dmcvb_gen import files
 from dmcvb_gen.dataset.append import is_grown_from
 from dmcvb_gen.dataset.index import (
     CARD_FILES,
+    CLAIM,
     INDEX,
     Index,
     card_files,
@@ -45,8 +46,6 @@ from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.storage import Storage, open_storage
 from dmcvb_gen.storage.remote import storage_errors
-
-CLAIM = "publishing.json"
 
 
 def index_of(root: Path, manifest: Manifest) -> Index:

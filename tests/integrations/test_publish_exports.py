@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from unittest import mock
 
 import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.dataset.index import CLAIM
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.export.publishing import export_format, publish_export
@@ -45,13 +47,60 @@ def test_the_hub_gets_one_commit_and_lerobots_tag(stored, tmp_path):
         api = mock.create_autospec(HfApi, instance=True)  # refuses calls that the real one would
         api.list_repo_refs.return_value.tags = [mock.Mock()]
         api.list_repo_refs.return_value.tags[0].name = "v3.0"
+        api.list_repo_files.return_value = [".gitattributes", "README.md", "meta/info.json"]
         publish_export(folder, "hf://datasets/me/demo", api=api)
         called = [call[0] for call in api.method_calls]
-        assert called == ["create_repo", "upload_folder", "list_repo_refs", "delete_tag", "create_tag"]
+        assert called == [
+            "create_repo",
+            "list_repo_files",
+            "upload_folder",
+            "list_repo_refs",
+            "delete_tag",
+            "create_tag",
+        ]
         assert api.upload_folder.call_args.kwargs["folder_path"] == folder
         assert api.create_tag.call_args.kwargs == {"repo_id": "me/demo", "repo_type": "dataset", "tag": "v3.0"}
     with pytest.raises(StoreError, match="--merge"):
         publish_export(tmp_path, "hf://datasets/me/demo", api=api)
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_an_export_is_never_mixed_with_a_release_or_another_export(to, stored, tmp_path):
+    for name, other in (SUBSETS, SUBSETS[::-1]):
+        release, place = stored[name].folder, tmp_path / f"{to}-{name.partition('/')[0]}"
+        [folder] = export(str(release), to, tmp_path / to, [name])
+        shutil.copytree(folder, place / "export")
+        data = next(path for path in content(folder) if path.suffix and not path.name.startswith("."))
+        left = f"left-by-{other.partition('/')[0]}{data.suffix}"
+        (place / "export" / left).write_bytes(b"of a larger export")
+        shutil.copytree(release, place / "release")
+        (place / "begun").mkdir()
+        (place / "begun" / CLAIM).write_text("{}")
+        for there, said in (("export", left), ("release", "holds a release"), ("begun", "holds a release")):
+            before = content(place / there)
+            done = CliRunner().invoke(main, ["publish", str(folder), f"file://{place / there}"])
+            assert done.exit_code == 2 and said in done.output and "give another URL" in done.output
+            assert content(place / there) == before
+
+
+def test_the_hub_keeps_an_export_from_a_release_and_from_other_exports(stored, tmp_path):
+    from huggingface_hub import HfApi
+
+    for name in SUBSETS:
+        [folder] = export(str(stored[name].folder), "hdf5", tmp_path, [name])
+        api = mock.create_autospec(HfApi, instance=True)
+        for there, said in (
+            ("in/manifest.json", "holds a release"),
+            ("in/old.hdf5", "old.hdf5"),
+            ("in/a/b.hdf5", "b.hdf5"),
+        ):
+            api.list_repo_files.return_value = [".gitattributes", "other/manifest.json", "other/old.hdf5", there]
+            with pytest.raises(StoreError, match=said):
+                publish_export(folder, "hf://datasets/me/demo/in", api=api)
+        api.upload_folder.assert_not_called()
+        api.list_repo_files.return_value = [".gitattributes", "other/manifest.json", "other/old.hdf5", "in/README.md"]
+        publish_export(folder, "hf://datasets/me/demo/in", api=api)
+        api.upload_folder.assert_called_once()
 
 
 def test_what_is_no_export_is_refused(tmp_path):

@@ -20,7 +20,7 @@ from click.testing import CliRunner
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.dataset.index import INDEX, card_files, take_in_card
+from dmcvb_gen.dataset.index import CLAIM, INDEX, card_files, take_in_card
 from dmcvb_gen.dataset.manifest import MANIFEST, commit_path
 from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
 from dmcvb_gen.dataset.writer import finish_release
@@ -29,7 +29,7 @@ from dmcvb_gen.generate.recipe import expand, load_recipe
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
-from dmcvb_gen.release.publish import CLAIM, publish
+from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.storage import base as storage
 from dmcvb_gen.storage.hub import HubStorage

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from collections.abc import Collection, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dmcvb_gen import files
-from dmcvb_gen.dataset.manifest import FileRecord
+from dmcvb_gen.dataset.index import CLAIM
+from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export.registry import all_formats
@@ -15,7 +17,7 @@ from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.storage import open_storage
 from dmcvb_gen.storage.hub import client_errors, new_api, newest_of, on_the_hub
 
-LEROBOT_INFO = "meta/info.json"
+LEROBOT_INFO, README = "meta/info.json", "README.md"
 
 
 def export_format(folder: str | Path) -> str | None:
@@ -44,7 +46,8 @@ def publish_export(
       tick: called with 1 for each file.
 
     Raises:
-      StoreError: there is no export, access is refused, or a file could not be moved.
+      StoreError: there is no export, a release or files of another export are there, access is refused, or a file
+        could not be moved.
     """
     folder = Path(folder)
     kind = export_format(folder)
@@ -57,10 +60,32 @@ def publish_export(
     total = sum(record.bytes for record in records)
     expect(tick, len(records))
     if on_the_hub(url):
-        _to_hub(folder, kind, url, api)
+        _to_hub(folder, kind, url, records, api)
         tick(len(records))
         return Moved(len(records), total, len(records))
-    return Moved(len(records), total, open_storage(url, options).upload_all(folder, records, workers, tick))
+    storage = open_storage(url, options)
+    _refuse_others(storage.place, storage.list(), records)
+    return Moved(len(records), total, storage.upload_all(folder, records, workers, tick))
+
+
+def _refuse_others(place: str, there: Collection[str], records: Sequence[FileRecord]) -> None:
+    """Raise StoreError if a place holds a release, or files that a reader would take for this export's."""
+    for name in (MANIFEST, CLAIM):
+        if name in there:
+            raise StoreError(f"{place} holds a release ({name}), which an export would damage; give another URL")
+    mine = {record.path for record in records}
+    kinds = {PurePosixPath(name).suffix for name in mine}
+    others = sorted(
+        name
+        for path in map(PurePosixPath, set(there) - mine)
+        if (name := str(path)) != README and not path.name.startswith(".") and path.suffix in kinds
+    )
+    if others:
+        more = f" and {len(others) - 1} more" if others[1:] else ""
+        raise StoreError(
+            f"{place} holds {others[0]}{more}, which this export lacks and its readers would read with it; remove "
+            "what is there, or give another URL"
+        )
 
 
 def _record(path: Path, folder: Path) -> FileRecord:
@@ -69,7 +94,7 @@ def _record(path: Path, folder: Path) -> FileRecord:
     return FileRecord.model_construct(path=name, bytes=size, sha256=files.sha256_file(path))
 
 
-def _to_hub(folder: Path, kind: str, url: str, api: Any) -> None:
+def _to_hub(folder: Path, kind: str, url: str, records: Sequence[FileRecord], api: Any) -> None:
     """One commit of all files into a data set repository; LeRobot's loader then looks for a tag of its version."""
     where, inside = newest_of(url)
     if kind == "lerobot" and (inside or not (folder / LEROBOT_INFO).is_file()):
@@ -80,6 +105,8 @@ def _to_hub(folder: Path, kind: str, url: str, api: Any) -> None:
     api = api or new_api()
     with client_errors(url):
         api.create_repo(**where, exist_ok=True)
+        there = [name.removeprefix(inside) for name in api.list_repo_files(**where) if name.startswith(inside)]
+        _refuse_others(url, there, records)
         message = f"{folder.name}: exported to {kind} by dmcvb-gen"
         api.upload_folder(**where, folder_path=folder, path_in_repo=inside, commit_message=message)
         if kind == "lerobot":
