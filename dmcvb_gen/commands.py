@@ -500,8 +500,9 @@ def validation_setup(options: Mapping[str, Any]) -> "Setup":
     from dmcvb_gen.dataset import open_release
 
     open_release(options["release"])  # a wrong name is told before the precision is timed
-    for agent in as_names(options["agents"]):
-        parse_agent(agent)
+    chosen = [parse_agent(agent) for agent in as_names(options["agents"])]
+    if options["dino_weights"] is not None and not any(agent.ready_encoder for agent in chosen):
+        raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
     given = {name: options[name] for name in ("out", "profile", "scale", "threads", "device", "precision", "compile")}
     given |= {name: options[name] for name in ("memory", "seed", "dino_weights", "backgrounds")}
     workers = options["workers"] or default_workers(options["device"])

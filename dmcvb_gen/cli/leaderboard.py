@@ -40,6 +40,8 @@ def leaderboard(context, folder, reports, patterns, data_command, check, names, 
     for value, option in ((patterns, "--cell"), (data_command, "--data-command")):
         if value and not reports:
             raise click.UsageError(f"{option} has no effect without --add: remove it.")
+    if reports and names and not check:
+        raise click.UsageError("--row has no effect beside --add: choose what is added by --cell.")
     if page and names:
         raise click.UsageError("--write writes all rows: remove --row.")
     for report in reports:

@@ -16,6 +16,7 @@ from dmcvb_gen.cli.common import (
     print_table,
     remote_option,
 )
+from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.storage.remote import is_url, public
 from dmcvb_gen.text import format_bytes, pluralize
 
@@ -113,6 +114,7 @@ def list_command(remote, options, as_json):
 
     if remote:
         return _list_remote(remote, options, as_json)
+    refuse(click.get_current_context(), ("options",), "it is for --remote")
     facts = describe_package()
     if as_json:
         return print_json(facts)

@@ -12,6 +12,7 @@ import click
 from dmcvb_gen import commands
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, print_table, remote_option
 from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.remote import is_url
@@ -150,8 +151,7 @@ def card(path, check, out, url, as_json):
     from dmcvb_gen.release.card import check_card, left_unchecked, write_card
 
     if check:
-        if out:
-            raise click.UsageError("Give --check or --out, not both.")
+        refuse(click.get_current_context(), ("out", "url"), "--check writes no card")
         findings, left = check_card(path), left_unchecked(path)
         fits = f"{path}: the card fits " + (f"the episodes that are here; {left:,} are not" if left else "the release")
         return answer(as_json, findings, *(findings or [fits]), code=1 if findings else 3 if left else 0)

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from dmcvb_gen.cli.common import OutPath, json_option, print_json, remote_option
+from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import format_bytes, pluralize
 
@@ -28,7 +29,8 @@ HOST = "127.0.0.1"
 @click.option("--out", metavar="FILE", type=OutPath(), help="The file.  [default: RELEASE/preview/viewer.html]")
 @remote_option
 @json_option
-def view(path, only, episodes, size, max_mb, open_it, serve, port, out, options, as_json):
+@click.pass_context
+def view(context, path, only, episodes, size, max_mb, open_it, serve, port, out, options, as_json):
     """Write one HTML file that plays episodes: images, reward, actions, states and distractor labels.
 
     The file works without a network. Images that the release does not store are painted for it.
@@ -39,6 +41,11 @@ def view(path, only, episodes, size, max_mb, open_it, serve, port, out, options,
     dmcvb-gen view releases/demo --serve
     """
     from dmcvb_gen.release.viewer import view as write
+
+    if serve and open_it:
+        refuse(context, ("open_it",), "--serve opens no file")
+    if not serve:
+        refuse(context, ("port",), "without --serve nothing is served")
 
     given = dict(only=only, episodes=episodes, size=size, max_bytes=int(max_mb * 1e6), storage_options=options)
     with ProgressBar(not as_json, unit=" episodes") as bar:

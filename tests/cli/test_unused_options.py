@@ -1,4 +1,4 @@
-"""No option of `rollout` goes unheard: what would change nothing is refused by its name."""
+"""No option goes unheard: what would change nothing is refused by its name."""
 
 from __future__ import annotations
 
@@ -80,6 +80,27 @@ def test_an_option_that_would_change_nothing_is_refused_with_the_cure(tmp_path, 
     options = [word for word in arguments if word.startswith("--")]
     assert_refused(rollout(*arguments), options, cure)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words, cure",
+    [
+        ("list --option a=b", "it is for --remote"),
+        ("view r --port 9001", "without --serve nothing is served"),
+        ("view r --serve --open", "--serve opens no file"),
+        ("card r --check --url file:/x", "--check writes no card"),
+        ("card r --check --out x", "--check writes no card"),
+        ("leaderboard b --add r --row x", "choose what is added by --cell"),
+        ("validate r --agents state-bc,bc --dino-weights x", "add --agents dino+bc"),
+        ("validate r --dino-weights x", "add --agents dino+bc"),
+    ],
+)
+def test_other_commands_refuse_what_has_no_effect(words, cure, small_release, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "r").symlink_to(small_release)
+    result = CliRunner().invoke(main, words.split())
+    assert_refused(result, [word for word in words.split() if word.startswith("--")], cure)
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 
 @pytest.mark.parametrize(
