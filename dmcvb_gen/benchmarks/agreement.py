@@ -1,8 +1,9 @@
 """Compare the order of a report's scores with the paper's: Spearman's rho with its interval.
 
 A score is taken as a share of its data's mean return, ours of our data and the paper's of the paper's, so that tasks
-and levels compare. The interval is a stratified bootstrap: episodes are drawn again within each cell and seed, as
-rliable does (Agarwal et al. 2021). It is scipy's, as rliable 1.2.0 gives arch 7 an argument that it refuses.
+and levels compare. The interval is a stratified bootstrap: starts are drawn again within each cell, as rliable does
+(Agarwal et al. 2021), each with the mean of the seeds, which all drive from the same starts. It is scipy's, as rliable
+1.2.0 gives arch 7 an argument that it refuses.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ class Pair:
 
     Attributes:
       task, where: the task; level, setting and agent.
-      returns: returns of our episodes as shares of our data's mean return, an array a seed.
+      returns: (start,) returns of our episodes as shares of our data's mean return, the mean of the seeds.
       paper: the paper's score as a share of the paper's data.
     """
 
     task: str
     where: str
-    returns: tuple[np.ndarray, ...]
+    returns: np.ndarray
     paper: float
 
     @property
     def ours(self) -> float:
-        return float(np.concatenate(self.returns).mean())
+        return float(self.returns.mean())
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def shared_cells(results: Iterable[Mapping[str, Any]]) -> list[Pair]:
         returns = np.array(result["score"]["returns"]) / result["data"]["mean"]
         paper = result["paper"]["mean"] / data[0]
         found.setdefault((task, f"{label} {setting} {cell['agent_name']}"), ([], paper))[0].append(returns)
-    return [Pair(task, where, tuple(returns), paper) for (task, where), (returns, paper) in found.items()]
+    return [Pair(task, where, np.mean(returns, axis=0), paper) for (task, where), (returns, paper) in found.items()]
 
 
 def rank_agreement(pairs: Sequence[Pair], seed: int = 0) -> list[Agreement]:
@@ -85,13 +86,12 @@ def rank_agreement(pairs: Sequence[Pair], seed: int = 0) -> list[Agreement]:
 
 
 def _agreement(task: str, pairs: Sequence[Pair], seed: int) -> Agreement:
-    strata, paper = [returns for pair in pairs for returns in pair.returns], [pair.paper for pair in pairs]
+    returns, paper = [pair.returns for pair in pairs], [pair.paper for pair in pairs]
 
     def rho(*returns: np.ndarray) -> float:
-        of_seeds = iter(returns)
-        ours = [np.concatenate([next(of_seeds) for _ in pair.returns]).mean() for pair in pairs]
+        ours = [of_cell.mean() for of_cell in returns]
         return float(np.nan_to_num(spearmanr(ours, paper).statistic))  # all alike: no order, so no agreement
 
-    drawn = bootstrap(strata, rho, vectorized=False, n_resamples=SAMPLES, method="percentile", random_state=seed)
+    drawn = bootstrap(returns, rho, vectorized=False, n_resamples=SAMPLES, method="percentile", random_state=seed)
     low, high = drawn.confidence_interval
-    return Agreement(task, len(pairs), rho(*strata), float(low), float(high))
+    return Agreement(task, len(pairs), rho(*returns), float(low), float(high))

@@ -201,12 +201,27 @@ def test_rho_is_of_shares_of_the_data_by_task_and_together_with_an_interval():
         for seed in (0, 1)
     ]
     pairs = shared_cells(results)
-    assert len(pairs) == 12 and all(len(pair.returns) == 2 for pair in pairs)
+    assert len(pairs) == 12 and all(len(pair.returns) == 3 for pair in pairs)
     assert {round(pair.paper, 6) for pair in pairs} == {0.85, 0.6, 0.3, 0.1}
     found = {one.task: one for one in rank_agreement(pairs)}
     assert set(found) == {*papers, "all tasks"} and found["all tasks"].cells == 12
     assert found["walker-walk"].rho == pytest.approx(0.8)  # one swap of neighbors of four: 1 - 6 * 2 / (4 * 15)
     assert found["walker-walk"].low <= 0.8 <= found["walker-walk"].high and found["walker-walk"].high == 1.0
+
+
+def test_seeds_that_fall_at_the_same_starts_make_no_interval_narrower():
+    rows = [("bc", 0.6, 900), ("id+bc", 0.55, 800), ("ae+bc", 0.5, 500), ("lfd+bc", 0.45, 60)]
+
+    def interval(*spreads):
+        """The returns of each seed lie so far from their mean at the first and the last start."""
+        seeds = enumerate(spreads)
+        results = [beside("walker-walk", *row, spread=spread, seed=seed) for seed, spread in seeds for row in rows]
+        [found] = rank_agreement(shared_cells(results))
+        return found.low, found.high
+
+    once = interval(0.3)
+    assert once == interval(0.3, 0.3, 0.3, 0.3, 0.3) and once[0] < once[1]
+    assert interval(0.3, -0.3) == (1.0, 1.0)  # what one seed loses at a start, the other one wins
 
 
 def test_noise_and_cells_that_the_paper_lacks_are_not_ranked():
