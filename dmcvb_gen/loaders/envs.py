@@ -119,6 +119,20 @@ class Scene:
                 )
         if self.goal and not maze:
             raise DmcvbError(f"{self.task} has no goal in its pictures; remove goal")
+        if self.max_steps is not None and self.max_steps < 1:
+            raise DmcvbError(f"max_steps is {self.max_steps}; give at least 1")
+        spec = self.spec()
+        if spec.goal is not GoalMode.FIXED:
+            for name in ("fixed_goals", "goal_pair", "goal_seed"):
+                if getattr(self, name) != getattr(Scene, name):
+                    raise DmcvbError(f"{name} has no effect without distractor 'fixed' (mazes); remove {name}")
+        if spec.distractor.kind == "none":
+            # An exported data set names the difficulty that every setting has by default.
+            unused = {"difficulty": (None, Distractor("none").difficulty), "backgrounds": (Scene.backgrounds,)}
+            for name, unchanged in unused.items():
+                if getattr(self, name) not in unchanged:
+                    shown = f"{self.task} {self.distractor}"
+                    raise DmcvbError(f"{name} has no effect: {shown} shows no distractors; remove {name}")
 
 
 class _Stage:

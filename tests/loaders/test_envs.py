@@ -228,6 +228,19 @@ def test_mistakes_are_answered():
     for task in ("walker-walk", "ant-maze-empty7x7"):
         with pytest.raises(DmcvbError, match="split 'test'.*train, val"):
             DistractedEnv(task, split="test")
+    for task, distractor, option in (
+        ("walker-walk", "none", dict(difficulty="hard")),
+        ("walker-walk", "none", dict(backgrounds="videos")),
+        ("ant-maze-empty7x7", "visible", dict(backgrounds="videos")),
+        ("ant-maze-empty7x7", "visible", dict(goal_pair=0)),
+        ("ant-maze-empty7x7", "hidden", dict(goal_seed=3)),
+        ("walker-walk", "static", dict(fixed_goals=2)),
+    ):
+        with pytest.raises(DmcvbError, match=f"no effect.*remove {next(iter(option))}"):
+            DistractedEnv(task, distractor, **option)
+    DistractedEnv("walker-walk", "none", difficulty="medium")  # as in data sets that `export` wrote
+    with pytest.raises(DmcvbError, match="max_steps is 0"):
+        DistractedEnv("walker-walk", max_steps=0)
     with pytest.raises(DmcvbError, match="remove difficulty"):
         DistractedEnv("ant-maze-empty7x7", "visible", difficulty="hard")
     with pytest.raises(DmcvbError, match="remove goal"):
