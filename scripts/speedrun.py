@@ -20,6 +20,7 @@ from pathlib import Path
 
 import torch
 
+from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import load_policy
@@ -36,12 +37,6 @@ CLOSE = 2000
 
 class Reached(Exception):
     """The goal was reached and confirmed; its argument is the mean return of fresh episodes."""
-
-
-def processor() -> str:
-    """The processor's name, as Linux gives it."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
 
 
 def main() -> None:
@@ -90,7 +85,7 @@ def main() -> None:
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     command = f"`speedrun.sh {shlex.join(sys.argv[1:])}`"
     amount = (f"{frames:,}", f"{minutes:.1f}") if reached else (f"not in {frames:,}", f"{minutes:.1f}")
-    facts = (command, *amount, reached, f"{processor()}, {precision}", commit, datetime.date.today())
+    facts = (command, *amount, reached, f"{environment()['cpu']}, {precision}", commit, datetime.date.today())
     print("| " + " | ".join(map(str, facts)) + " |")
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
+import json
 import re
 
 import click
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 import dmcvb_gen
+from dmcvb_gen.benchmarks.validate import make_setup
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -117,6 +120,23 @@ def test_shipped_recipes_and_manifests_by_name(tmp_path):
     assert list(made) == ["walker-walk/random/none"]
     with pytest.raises(UnknownNameError, match="quickstart"):
         dmcvb_gen.regenerate(manifest="quickstrat", out=tmp_path / "x", progress=False)
+
+
+def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
+    """What is written as JSON later takes paths, too: runs and reports."""
+    folder, _ = family
+    setup = make_setup(folder / "r", out=tmp_path, backgrounds=tmp_path / "videos", dino_weights=tmp_path / "weights")
+    json.dumps(dataclasses.asdict(setup))
+    begun = []
+
+    def stop(_, config, __):
+        begun.append(json.dumps(dataclasses.asdict(config)))
+        raise DmcvbError("enough")
+
+    monkeypatch.setattr("dmcvb_gen.training.training.open_run", stop)
+    with pytest.raises(DmcvbError, match="enough"):
+        dmcvb_gen.train_behaviour("walker-walk", out=tmp_path / "run", init_from=tmp_path / "other", progress=False)
+    assert str(tmp_path / "other") in begun[0]
 
 
 @pytest.mark.parametrize(
