@@ -266,6 +266,8 @@ def test_an_unknown_task_lists_the_known_ones_and_the_nearest():
     with pytest.raises(UnknownNameError, match="Did you mean 'walker-walk'.*walker-run.* and .* more") as caught:
         get_task("walker-wakl")
     assert len(str(caught.value)) < 300
+    with pytest.raises(UnknownNameError, match="unknown task 'zzzz'. Known: [a-z-]+, .* and .* more"):
+        get_task("zzzz")
     for domain, name in (("walker", "walker-walk"), ("humanoid", "humanoid-walk"), ("ant-maze", "ant-maze-empty7x7")):
         with pytest.raises(UnknownNameError, match=f"Did you mean '{name}'"):  # DMC-VB's own come first
             get_task(domain)
