@@ -33,6 +33,7 @@ def test_an_export_arrives_whole_and_a_second_try_moves_nothing(to, stored, tmp_
     done = CliRunner().invoke(main, ["publish", str(folder), f"file://{tmp_path / 'there'}"])
     assert done.exit_code == 0, done.output
     assert content(tmp_path / "there") == content(folder)
+    (tmp_path / "there" / "LICENSE").write_text("mine")  # no data, whatever the format's files are called
     again = publish_export(folder, f"file://{tmp_path / 'there'}")
     assert again.moved == 0 and again.files == len(content(folder))
     refused = CliRunner().invoke(main, ["publish", str(folder), f"file://{tmp_path / 'x'}", "--no-pixels"])

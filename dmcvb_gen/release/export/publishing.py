@@ -17,7 +17,9 @@ from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.storage import open_storage
 from dmcvb_gen.storage.hub import client_errors, new_api, newest_of, on_the_hub
 
-LEROBOT_INFO, README = "meta/info.json", "README.md"
+LEROBOT_INFO = "meta/info.json"
+NO_DATA = ("README.md", "LICENSE")
+"""Files that may be beside an export, whoever wrote them."""
 
 
 def export_format(folder: str | Path) -> str | None:
@@ -78,7 +80,7 @@ def _refuse_others(place: str, there: Collection[str], records: Sequence[FileRec
     others = sorted(
         name
         for path in map(PurePosixPath, set(there) - mine)
-        if (name := str(path)) != README and not path.name.startswith(".") and path.suffix in kinds
+        if (name := str(path)) not in NO_DATA and not path.name.startswith(".") and path.suffix in kinds
     )
     if others:
         more = f" and {len(others) - 1} more" if others[1:] else ""
