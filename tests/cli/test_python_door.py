@@ -123,7 +123,7 @@ def test_shipped_recipes_and_manifests_by_name(tmp_path):
 
 
 def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
-    """What is written as JSON later takes paths, too: runs and reports."""
+    """Runs and reports are written as JSON, which has no paths."""
     folder, _ = family
     setup = make_setup(folder / "r", out=tmp_path, backgrounds=tmp_path / "videos", dino_weights=tmp_path / "weights")
     json.dumps(dataclasses.asdict(setup))
