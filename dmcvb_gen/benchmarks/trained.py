@@ -104,10 +104,9 @@ def load_agent(path: str | Path) -> TrainedAgent:
         with torch.device("meta"):  # without memory: a file may name any size
             _check_shapes(_untrained(agent, sizes, network), tensors)
         policy = _untrained(agent, sizes, network)
-        lacking = policy.load_state_dict(tensors, strict=False)
-        wrong = [*lacking.unexpected_keys, *(name for name in lacking.missing_keys if policy.acts_by(name))]
-        if wrong:
-            raise ValueError(f"{wrong[0]} does not fit")
+        unexpected = policy.load_state_dict(tensors, strict=False).unexpected_keys
+        if unexpected:
+            raise ValueError(f"{unexpected[0]} does not fit")
         policy.half = bool(facts["half"])
     except (OSError, SafetensorError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
