@@ -496,13 +496,15 @@ def validation_setup(options: Mapping[str, Any]) -> "Setup":
     """Make the settings that all cells of a validation share from the arguments of `validate`."""
     from dmcvb_gen.agents.catalog import parse_agent
     from dmcvb_gen.benchmarks.run import default_workers
-    from dmcvb_gen.benchmarks.validate import make_setup
+    from dmcvb_gen.benchmarks.validate import make_setup, plan_validation
     from dmcvb_gen.dataset import open_release
 
-    open_release(options["release"])  # a wrong name is told before the precision is timed
-    chosen = [parse_agent(agent) for agent in as_names(options["agents"])]
+    release, agents = open_release(options["release"]), as_names(options["agents"])
+    chosen = [parse_agent(agent) for agent in agents]
     if options["dino_weights"] is not None and not any(agent.ready_encoder for agent in chosen):
         raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
+    benchmarks = () if options["checks_only"] else as_names(options["benchmarks"])
+    plan_validation(release, benchmarks, agents, as_names(options["only"]))  # tells mistakes before precision is timed
     given = {name: options[name] for name in ("out", "profile", "scale", "threads", "device", "precision", "compile")}
     given |= {name: options[name] for name in ("memory", "seed", "dino_weights", "backgrounds")}
     workers = options["workers"] or default_workers(options["device"])

@@ -24,9 +24,10 @@ class UnknownNameError(DmcvbError, KeyError):
     Args:
       kind: what is named.
       known: all names; of those that begin with `name`, the first one is the nearest.
+      cure: what lists all of them, if there is such a thing.
     """
 
-    def __init__(self, kind: str, name: object, known: Iterable[str]):
+    def __init__(self, kind: str, name: object, known: Iterable[str], cure: str = ""):
         known = list(map(str, known))
         longer = [other for other in known if name and other.startswith(str(name))]
         known = sorted(known)
@@ -35,8 +36,9 @@ class UnknownNameError(DmcvbError, KeyError):
         listed, rest = known, ""
         if len(known) > MOST_LISTED:
             most = MOST_LISTED // 3
-            listed = difflib.get_close_matches(str(name), known, n=most, cutoff=0.3) or known[:most]
-            rest = f" and {len(known) - len(listed)} more"
+            near_ones = difflib.get_close_matches(str(name), known, n=most, cutoff=0.3)
+            listed = [*near_ones, *(other for other in known if other not in near_ones)][:most]
+            rest = f" and {len(known) - len(listed)} more{cure and f'; {cure}'}"
         super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(listed)}{rest}.")
 
     def __str__(self) -> str:  # KeyError would print the repr

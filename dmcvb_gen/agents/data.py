@@ -477,9 +477,9 @@ def load_data(
     subsets = [source.subset for source in sources]
     names = [training_pictures(subset).arrays if subset.pixel_arrays else () for subset in subsets]
     if len({(subset.task, subset.record.size, len(n)) for subset, n in zip(subsets, names, strict=True)}) != 1:
-        raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or picture sizes differ")
+        raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or image sizes differ")
     if pixels and not names[0]:
-        raise DmcvbError(f"{subsets[0].name} has no pictures that agents are trained on")
+        raise DmcvbError(f"{subsets[0].name} has no images that agents are trained on")
     chosen, held_out = zip(*(choose_episodes(source, seed) for source in sources), strict=True)
     parts = [Selection(s, e, n if pixels else ()) for s, e, n in zip(subsets, chosen, names, strict=True)]
     size, lengths = subsets[0].record.size, [part.subset.read("length", part.episodes) for part in parts]

@@ -54,9 +54,7 @@ class DinoEncoder(ReadyEncoder):
         if weights is None:
             raise DmcvbError(cls.missing)
         if size > INPUT:
-            raise DmcvbError(
-                f"DINO sees {INPUT} pixels a side at most, these pictures have {size}; repaint them smaller"
-            )
+            raise DmcvbError(f"DINO sees {INPUT} pixels a side at most, these images have {size}; repaint them smaller")
         try:
             tensors = load_file(str(weights))
         except (OSError, SafetensorError) as error:

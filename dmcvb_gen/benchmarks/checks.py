@@ -228,7 +228,7 @@ def check_structure(
             findings += found
             warnings += odd
     for text in painter_drift(release, backgrounds):
-        warnings.append(Issue("painter", "pictures painted on reading", text))
+        warnings.append(Issue("painter", "images painted on reading", text))
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)
 
 

@@ -56,7 +56,7 @@ CHECKS = {
     "rewards": "physics gives the stored rewards",
     "physics": "stored actions lead to the stored physics states",
     "pixels": "sampled frames painted again are the stored ones",
-    "pictures": "no black, one-colored or frozen pictures",
+    "pictures": "no black, one-colored or frozen images",
     "labels": "distractor labels fit their setting",
 }
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""

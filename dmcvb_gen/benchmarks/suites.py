@@ -191,9 +191,9 @@ class SubsetFinder:
         if not is_maze(task):
             return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count}{shape} {out}"
         goals = [setting for setting in settings if setting != FIXED]
-        lines = [f"{rollout} {' '.join(f'--goal {s}' for s in goals)} --episodes {count}{shape}"] if goals else []
-        lines += [f"{rollout} --fixed-goals {FIXED_GOALS}{shape}"] if FIXED in settings else []
-        return "; ".join(f"{line} {out}-{number}" for number, line in enumerate(lines))
+        asked = [f"--goal {setting}" for setting in goals] + [f"--episodes {count}"] * bool(goals)
+        asked += [f"--fixed-goals {FIXED_GOALS}"] * (FIXED in settings)
+        return f"{rollout} {' '.join(asked)}{shape} {out}"
 
     def _shape(self, task: str) -> str:
         """Options that give new subsets the images' size and the time limit of what there is of a task."""

@@ -182,10 +182,7 @@ def validate(
     """
     started, progress = time.perf_counter(), progress or Progress()
     release = open_data(replace(setup, root=str(path)))
-    chosen = only(release, patterns)
-    if not chosen.subsets:
-        raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
-    cells, missing = _plan(chosen, benchmarks, agents, release.subsets.keys() - chosen.subsets.keys())
+    chosen, cells, missing = plan_validation(release, benchmarks, agents, patterns)
     if patterns:  # a subset that was not asked for is not missing
         asked = [replace(one, subsets=tuple(n for n in one.subsets if matches(n, patterns))) for one in missing]
         missing = [one for one in asked if one.subsets or one.left_out]
@@ -220,6 +217,20 @@ def validate(
     )
     there, asked = (sum(counts.values()) for counts in release_episodes(chosen))
     return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), report, facts)
+
+
+def plan_validation(
+    release: Release, benchmarks: Sequence[str], agents: Sequence[str], patterns: Sequence[str]
+) -> tuple[Release, list[Cell], list[Missing]]:
+    """The subsets that are asked for, the cells of the benchmarks on them, and what is missing for others.
+
+    Raises:
+      DmcvbError: a name is unknown, or there are no data for a benchmark.
+    """
+    chosen = only(release, patterns)
+    if not chosen.subsets:
+        raise DmcvbError(f"{release.root} has no committed episodes yet; run the rollout first")
+    return chosen, *_plan(chosen, benchmarks, agents, release.subsets.keys() - chosen.subsets.keys())
 
 
 def _plan(

@@ -17,7 +17,7 @@ def paint(release, as_json, **options):
     """Render the images of a release stored without pixels, and compare them with their known digests.
 
     Rerun the command to resume. With --size, --views or --goal it becomes another release,
-    and its manifest says so. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 if pictures differ
+    and its manifest says so. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 if images differ
     from the known ones.
 
     \b
@@ -77,7 +77,7 @@ def _painted_facts(done):
 def _painted(place, done):
     """Yield the result of painting in lines."""
     painted = f"{pluralize(done.shards, 'shards')} painted; {_compared(done)}."
-    yield f"{place}: {painted if done.shards else 'every shard that is here has its pictures already.'}"
+    yield f"{place}: {painted if done.shards else 'every shard that is here has its images already.'}"
     yield from (f"  differs: {name}" for name in done.differing[:10])
     if done.differing:
         yield (
@@ -87,7 +87,7 @@ def _painted(place, done):
 
 def _compared(done) -> str:
     if not done.known:
-        return "no digests of these pictures were known"
+        return "no digests of these images were known"
     if done.differing:
         return f"{len(done.differing)} of {done.known} differ from the known digests"
     return f"equal to the known digests ({done.known} of {done.shards})"

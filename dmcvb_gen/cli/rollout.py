@@ -176,9 +176,9 @@ def _show_plan(plan, workers, as_json):
             rate["steps_per_second"] = 1 / rate.pop("seconds_per_step")
         return print_json(facts | {"rates": rates})
     print_table(
-        ("subset", "episodes", "steps", "bytes", "core-hours"),
+        ("subset", "episodes", "steps", "bytes", "core time"),
         [
-            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), f"{seconds / 3600:.2f}")
+            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), format_duration(seconds))
             for name, (episodes, steps, size, seconds) in cost.of_subsets(plan).items()
         ],
         title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
@@ -190,6 +190,6 @@ def _show_plan(plan, workers, as_json):
         f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; {cost.steps:,} steps, {size}"
     )
     click.echo(
-        f"{cost.core_seconds / 3600:.2f} core-hours: {spans[workers]} with --workers {workers}, "
+        f"core time: {format_duration(cost.core_seconds)}; {spans[workers]} with --workers {workers}, "
         f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64"
     )

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.errors import UnknownNameError
@@ -102,21 +102,22 @@ def picture_of(array: str) -> tuple[str, bool] | None:
     return view or ONE_VIEW[0], folder == HIDDEN
 
 
-def shown(subset: HasRecord | SubsetRecord, views: Sequence[str] | None = None) -> Pictures:
+def shown(subset: HasRecord | SubsetRecord, views: Sequence[str] | Literal["agents"] | None = None) -> Pictures:
     """The pictures that a subset (or the subset of a record) shows: all its views, in the task's order, the goal
     hidden if its setting says so; whether they are stored or not.
 
     Args:
-      views: only these views, in this order.
+      views: only these views, in this order; "agents": those that agents are trained on, all but the overhead view.
 
     Raises:
       UnknownNameError: no such view.
     """
     record = subset if isinstance(subset, SubsetRecord) else subset.record
+    if views == "agents":
+        views = [view for view in record.views if view not in NOT_TRAINED_ON]
     return Pictures(record.views, record.hidden_goal).select(views)
 
 
 def training_pictures(subset: HasRecord) -> Pictures:
     """The pictures that agents are trained on: those shown, less the overhead view."""
-    pictures = shown(subset)
-    return pictures.select([view for view in pictures.views if view not in NOT_TRAINED_ON])
+    return shown(subset, "agents")

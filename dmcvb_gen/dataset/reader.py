@@ -27,7 +27,7 @@ from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.writer import read_commits
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.storage.remote import file_system, is_url, public, storage_errors
+from dmcvb_gen.storage.remote import check_no_options, file_system, is_url, public, storage_errors
 from dmcvb_gen.text import pluralize
 
 MAX_STEP_BYTES = 2**20
@@ -405,7 +405,7 @@ def open_release(path: str | Path, storage_options: dict | None = None, skip: Co
       skip: subsets that are known to be damaged, to be left out.
 
     Raises:
-      StoreError: there is no release, or its manifest or a commit record is damaged.
+      StoreError: there is no release, its manifest or a commit record is damaged, or options are given for a folder.
     """
     path, options = str(path), storage_options or {}
 
@@ -413,6 +413,7 @@ def open_release(path: str | Path, storage_options: dict | None = None, skip: Co
         return [record for record in manifest.subsets if record.name not in skip]
 
     if not is_url(path):
+        check_no_options(path, options)
         root = Path(path)
         manifest = local_manifest(root)
         commits = {subset.name: read_commits(root, subset) for subset in wanted(manifest)}

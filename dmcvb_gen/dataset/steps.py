@@ -173,7 +173,7 @@ def _mapped(shape: tuple[int, ...], folder: Path) -> np.ndarray:
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise DmcvbError(
-            f"{format_bytes(needed)} of pictures fit neither into memory nor into {folder} ({format_bytes(free)} "
+            f"{format_bytes(needed)} of images fit neither into memory nor into {folder} ({format_bytes(free)} "
             "free); give another --out, or more --memory"
         )
     with tempfile.TemporaryFile(dir=folder) as file:

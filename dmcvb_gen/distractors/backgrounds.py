@@ -117,7 +117,7 @@ def load_backgrounds(source: str | Path = "builtin", split: str = "train", video
     if not found:
         kinds = " ".join(sorted(VIDEOS | PICTURES))
         raise BackgroundError(
-            f"background folder {root} holds no videos; put in files of {kinds}, or a folder of pictures for each video"
+            f"background folder {root} holds no videos; put in files of {kinds}, or a folder of images for each video"
         )
     return _open(str(source), split, tuple(found), stamps)
 

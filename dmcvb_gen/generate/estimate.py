@@ -1,4 +1,4 @@
-"""Estimate the steps, bytes and core-hours of a plan from short measurements on this machine.
+"""Estimate the steps, bytes and core time of a plan from short measurements on this machine.
 
 What is measured once serves all that it is true of: episodes of a task and level for all settings that show them (a
 maze's fixed goals are drawn as its random ones are), pictures of a task, level and kind of distractor. The mazes, whose

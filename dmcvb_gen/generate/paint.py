@@ -287,7 +287,7 @@ def _has_others(record: SubsetRecord) -> StoreError:
     """The error if a subset has other pictures than are asked for, or another process is painting them."""
     views = "" if record.views == ("pixels",) else f", views {', '.join(record.views)}"
     return StoreError(
-        f"{record.name} has pictures already (or is being painted), and others than asked for: {record.size} pixels a "
+        f"{record.name} has images already (or is being painted), and others than asked for: {record.size} pixels a "
         f"side{views}; remove --size, --views and --goal to go on with those, or write a second release with "
         "`dmcvb-gen repaint`"
     )
@@ -374,7 +374,7 @@ def without_pictures(root: str | Path, out: str | Path) -> Manifest:
     release, out = open_release(root), local_path(out)
     if release.manifest.imported:
         raise StoreError(
-            f"{root} was imported and has no physics states, so pictures that it leaves behind could not be painted "
+            f"{root} was imported and has no physics states, so images that it leaves behind could not be painted "
             "again; publish it with them, without --no-pixels"
         )
     if out.exists() and any(out.iterdir()):

@@ -150,7 +150,7 @@ def _refuse_half_painted(
         lacking = [shard for shard, commit in done.get(record.name, {}).items() if record.pixels and not commit.painted]
         if lacking and record.episodes > old[record.name]:
             raise StoreError(
-                f"{record.name} of {place} has pictures, but {len(lacking)} of its shards have none yet; before it "
+                f"{record.name} of {place} has images, but {len(lacking)} of its shards have none yet; before it "
                 f"grows, paint them: dmcvb-gen paint {place} --only {record.name}"
             )
 

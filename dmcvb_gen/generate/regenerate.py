@@ -439,7 +439,7 @@ class _Digests:
                 array[first, :1]
             except Exception:  # codecs raise anything
                 if self.sound(f"{folder}/{path}/{ZARR_JSON}"):
-                    return f"{folder}/{path} has pictures that do not fit their array"
+                    return f"{folder}/{path} has images that do not fit their array"
         return None
 
     def sound(self, path: str) -> bool:

@@ -152,6 +152,7 @@ def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Reci
     if len({is_maze(task) for task in tasks}) > 1:
         raise RecipeError("mazes and locomotion tasks take different settings; roll them out by a --recipe")
     check_maze_options(tasks, given)
+    _check_video_count(given)
     tasks = tuple(rewarded(task, given.get("reward")) for task in tasks)
     goals, distractors = given.get("goals", ()), given.get("distractors", ())
     if is_maze(tasks[0]):
@@ -177,6 +178,18 @@ def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Reci
         **{name: given[name] for name in ("seed", "size", "split") if name in given},
         **_sources(given),
     )
+
+
+def _check_video_count(given: Mapping[str, Any]) -> None:
+    """Refuse a number of videos that the source does not have."""
+    if "video_count" not in given:
+        return
+    from dmcvb_gen.distractors import load_backgrounds
+
+    count, source = given["video_count"], given.get("backgrounds", "builtin")
+    there = len(load_backgrounds(source, given.get("split", "train")).lengths)
+    if count > there:
+        raise RecipeError(f"--video-count is {count}, but {source} has {there} videos: give {there} or less")
 
 
 def _difficulty(given: Mapping[str, Any]) -> str:
@@ -222,7 +235,9 @@ def check_maze_options(tasks: Sequence[str], given: Mapping[str, Any]) -> None:
     for name in _STRENGTHS:
         if name in given and all("_" in kind or kind == "none" for kind in given.get("distractors", ())):
             flag = f"--{name.replace('_', '-')}"
-            raise RecipeError(f"{flag} has no effect here: ask for --distractor static or dynamic")
+            named = [kind for kind in given.get("distractors", ()) if "_" in kind]
+            why = f"{named[0]} names its strength itself" if named else "nothing is varied"
+            raise RecipeError(f"{flag} has no effect here, {why}: ask for --distractor static or dynamic")
 
 
 def _check_given_to_mazes(given: Mapping[str, Any]) -> None:

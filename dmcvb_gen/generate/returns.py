@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Between, Local, Location, Names, Seed
-from dmcvb_gen.spec import is_maze
+from dmcvb_gen.spec import Level, is_maze
 from dmcvb_gen.text import as_names
 
 
@@ -37,7 +37,8 @@ def evaluate_behaviour(
       success, speed and running_speed (m/s) too.
 
     Raises:
-      DmcvbError: an unknown name, a policy that does not fit, or pictures of tasks that are no mazes.
+      DmcvbError: an unknown name, a policy that does not fit, an option without effect, or pictures of tasks that are
+        no mazes.
     """
     from dmcvb_gen.generate.info import return_statistics  # here, so that --help is quick
     from dmcvb_gen.generate.request import behaviour_source
@@ -50,6 +51,7 @@ def evaluate_behaviour(
     from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
 
     behaviour = behaviour_source(behaviour)
+    _check_levels(as_names(levels), behaviour, sample)
     chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
     chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
     if pictures and not any(map(is_maze, chosen)):
@@ -61,7 +63,7 @@ def evaluate_behaviour(
             policies = _policies(task_id, level, behaviour)
             out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
-            own = is_own(behaviour or "") and level != "random"
+            own = is_own(behaviour or "")
             mode = "own" if own else "sampled" if sample else "mean"
             row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
@@ -72,6 +74,15 @@ def evaluate_behaviour(
         if pictures and panels:
             save_paths_picture(task.layout, panels, Path(pictures) / f"{task_id}.png")  # type: ignore[attr-defined]
     return rows
+
+
+def _check_levels(levels: Sequence[str], behaviour: str | None, sample: bool) -> None:
+    for level in levels:
+        Level.parse(level)
+    if behaviour and Level.RANDOM in levels:
+        raise DmcvbError(f"level random has no policy: leave it out, or remove --behaviour {behaviour}")
+    if sample and set(levels) == {Level.RANDOM}:
+        raise DmcvbError("--sample has no effect here: level random is always drawn; ask for another, or remove it")
 
 
 def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
@@ -85,8 +96,7 @@ def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -
             raise DmcvbError(f"give the one TASK that {behaviour} is for")
         return tasks, levels or ["expert"]
     levels = levels or levels_of(behaviour)
-    named = [level for level in levels if level != "random"]
-    files = [path for level in named for path in resolve_policies("", level, behaviour)]
+    files = [path for level in levels for path in resolve_policies("", level, behaviour)]
     return tasks or sorted({read_header(path).task for path in files}), levels
 
 

@@ -118,7 +118,7 @@ class Scene:
                     f"an environment has no {modality}: the next frame is not known yet; remove {modality}"
                 )
         if self.goal and not maze:
-            raise DmcvbError(f"{self.task} has no goal in its pictures; remove goal")
+            raise DmcvbError(f"{self.task} has no goal in its images; remove goal")
         if self.max_steps is not None and self.max_steps < 1:
             raise DmcvbError(f"max_steps is {self.max_steps}; give at least 1")
         spec = self.spec()

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.pictures import shown, training_pictures
+from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.loaders.stream import Steps, check_count
 from dmcvb_gen.parallel.cores import usable_cores
@@ -54,7 +54,7 @@ class StepSource:
         in_memory: bool | None = None,
     ):
         self.subset, self.stack, self.next_step = subset, check_count("stack", stack), next_step
-        self.pictures = (training_pictures(subset) if pictures == "agents" else shown(subset, pictures)).arrays
+        self.pictures = shown(subset, pictures).arrays
         self.episodes = subset.choose(episodes)
         lengths = subset.read("length", self.episodes)
         self._ends = np.cumsum(lengths)

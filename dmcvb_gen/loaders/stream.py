@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def stream(
     *,
     batch_size: int | None = None,
     episodes: Sequence[int] | None = None,
-    pictures: Sequence[str] | None = None,
+    pictures: Sequence[str] | Literal["agents"] | None = None,
     stack: int = 3,
     next_step: bool = False,
     shuffle: bool = True,
@@ -67,7 +68,8 @@ def stream(
     Args:
       batch_size: steps a batch (see `StepTable.gather`); None gives single steps, without the leading axis.
       episodes: indices of committed episodes, all by default.
-      pictures: views (or their arrays), in this order; by default all that the subset shows; () reads states alone.
+      pictures: views (or their arrays), in this order; by default all that the subset shows; "agents": those that
+        agents see; () reads states alone.
       shuffle: mix episodes, and steps among the `buffer` episodes in memory; the same for the same seed, epoch and
         number of workers.
       rank, world, worker, workers: this process's share of the episodes. All ranks give as many batches as the one

@@ -6,7 +6,7 @@ They hold no open files, so they may be sent to the workers of a `DataLoader`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
@@ -94,7 +94,7 @@ class EpisodeDataset(_OfEpoch, Dataset):
         self,
         subset: Subset,
         episodes: Sequence[int] | None = None,
-        pictures: Sequence[str] | None = None,
+        pictures: Sequence[str] | Literal["agents"] | None = None,
     ):
         super().__init__(subset)
         self.pictures, self.episodes = shown(subset, pictures).arrays, subset.choose(episodes)

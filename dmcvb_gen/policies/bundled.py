@@ -9,7 +9,7 @@ from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file
-from dmcvb_gen.spec import TRAINED_LEVELS, is_maze
+from dmcvb_gen.spec import TRAINED_LEVELS, MazeName, task_folder
 
 CONVERTED = (".zip", ".pt", ".pth")
 """Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
@@ -43,9 +43,12 @@ def bundled_policies(task_id: str, level: str) -> list[Path]:
     names = bundled_names(task_id, level)
     if not names:
         have = ", ".join([*bundled_levels(task_id), "random"])
-        command = f"dmcvb-gen train-behaviour {task_id}" + (" --algo guided" if is_maze(task_id) else "")
+        maze = MazeName.parse(task_id)
+        own = maze is not None and maze.rows is not None
+        asked = "--layout FILE" if own else task_id + (" --algo guided" if maze else "")
         raise DmcvbError(
-            f"no {level} policy of {task_id} is bundled (there is: {have}); train one with `{command}` and "
+            f"no {level} policy of {task_folder(task_id)} is bundled (there is: {have}); "
+            f"train one with `dmcvb-gen train-behaviour {asked}` and "
             "`dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
         )
     return [bundled_file(name) for name in names]
@@ -55,9 +58,11 @@ def levels_of(behaviour: str | Path) -> list[str]:
     """Levels that a run folder or a folder of level files has policies for; a single policy file's own level.
 
     Raises:
-      PolicyFileError: there are none.
+      PolicyFileError: there are none, or no such file or folder.
     """
     path = Path(behaviour)
+    if not path.exists():
+        raise _neither(behaviour)
     if path.is_file():
         from dmcvb_gen.policies.policy_file import read_header  # loads numba, which listing needs not
 
@@ -73,6 +78,10 @@ def levels_of(behaviour: str | Path) -> list[str]:
         f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {behaviour}` first, "
         "or give a policy file"
     )
+
+
+def _neither(behaviour: str | Path) -> PolicyFileError:
+    return PolicyFileError(f"{behaviour} is neither a policy file, a run folder nor <module>:<function>")
 
 
 def _reasons(run: Path) -> dict[str, str]:
@@ -103,7 +112,7 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
     if path.is_file() or is_own(str(behaviour)):
         return [path]
     if not path.is_dir():
-        raise PolicyFileError(f"{behaviour} is neither a policy file, a run folder nor <module>:<function>")
+        raise _neither(behaviour)
     for folder in (path / "selected", path):
         files = level_files(folder, level)
         if files:

@@ -207,7 +207,7 @@ def _record(
     views = tuple(view for view, picture in pictures.items() if picture)
     if not views:
         wanted = picture_feature(task, get_task(task).views[0], hidden)
-        raise StoreError(f"{folders[0]}/features.json has no picture observation/{wanted}; it is no {name} of DMC-VB")
+        raise StoreError(f"{folders[0]}/features.json has no image observation/{wanted}; it is no {name} of DMC-VB")
     for number, path in enumerate(folders):
         if not any(place.folder == number for place in places):
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
@@ -221,7 +221,7 @@ def _record(
             raise ValueError(f"{size} pixels")
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise StoreError(
-            f"the features.json of {name} does not say a size of pictures ({error}); fetch the folder again"
+            f"the features.json of {name} does not say a size of images ({error}); fetch the folder again"
         ) from None
     return SubsetRecord(
         name=name,
@@ -385,7 +385,7 @@ def _picture(data: bytes, size: int) -> np.ndarray:
     """(size, size, 3) uint8; what says that it is larger is not decoded. Raises ValueError."""
     with Image.open(io.BytesIO(data)) as picture:
         if picture.size != (size, size):
-            raise ValueError(f"a picture of {picture.size} pixels instead of {size}")
+            raise ValueError(f"an image of {picture.size} pixels instead of {size}")
         return np.asarray(picture)
 
 

@@ -143,7 +143,9 @@ def publish(
     """
     root, manifest = load_manifest(root)
     if not manifest.complete:
-        raise StoreError(f"{root} is not complete; finish it with the same rollout, without --only or --part")
+        raise StoreError(
+            f"{root} is not complete; fetch the rest, or finish it with the same rollout, without --only or --part"
+        )
     index = index_of(root, manifest)
     total = sum(file.bytes for file in index.files)
     _check_card(root, manifest, index)

@@ -258,7 +258,7 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
         from dmcvb_gen.release import contents
     except ModuleNotFoundError as error:
         # Whoever only reads has no simulator; bytes are checked all the same, and this says what was not.
-        log.warning("values, physics and pictures of %s were not checked: %s is not installed", subset.name, error.name)
+        log.warning("values, physics and images of %s were not checked: %s is not installed", subset.name, error.name)
         return []
     try:
         return list(contents.check_contents(subset, backgrounds))

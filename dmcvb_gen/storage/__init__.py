@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.storage.base import Storage
-from dmcvb_gen.storage.remote import check_place, file_system, is_url
+from dmcvb_gen.storage.remote import check_no_options, check_place, file_system, is_url
 
 
 def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) -> Storage:
@@ -17,7 +17,7 @@ def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) ->
       options: options of fsspec, for a URL, e.g. {"endpoint_url": ...}.
 
     Raises:
-      StoreError: the URL's protocol is unknown or not installed, or it names no bucket.
+      StoreError: the URL's protocol is unknown or not installed, or it names no bucket; options for a folder.
     """
     from dmcvb_gen.storage.local import LocalStorage
     from dmcvb_gen.storage.object_store import ObjectStorage
@@ -25,6 +25,7 @@ def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) ->
     url = str(place)
     if not is_url(url):
         check_place(url)
+        check_no_options(url, options)
         return LocalStorage(Path(place))
     protocol, pairs = url.split(":", 1)[0], tuple(sorted((options or {}).items()))
     if protocol == "hf":

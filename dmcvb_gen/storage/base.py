@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes, sha256_file
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.storage.remote import NO_ROOM, is_refusal, reason, refused, storage_errors
+from dmcvb_gen.storage.remote import NO_ROOM, is_refusal, is_url, reason, refused, storage_errors
 
 ATTEMPTS = 4
 """Tries of a file before giving up."""
@@ -153,7 +153,7 @@ class Storage(abc.ABC):
         """Write a small file unless one is there; False if one is. Atomic on local disks, S3 and the Hub.
 
         Raises:
-          StoreError: there is no such bucket, or see the class.
+          StoreError: there is no such bucket or folder, or see the class.
         """
 
         def attempt() -> bool:
@@ -162,7 +162,8 @@ class Storage(abc.ABC):
             except FileExistsError:
                 return False
             except FileNotFoundError as error:
-                raise StoreError(f"{self.place}: {reason(error)}; create the bucket first") from None
+                kind = "bucket" if is_url(self.place) else "folder"
+                raise StoreError(f"{self.place}: {reason(error)}; create the {kind} first") from None
             return True
 
         return self._attempt(path, attempt, "write")

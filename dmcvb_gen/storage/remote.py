@@ -18,7 +18,7 @@ import logging
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,12 @@ BUCKET_PROTOCOLS = ("s3", "gs", "gcs", "az", "abfs", "hf")
 def is_url(path: str) -> bool:
     """Return True if a path is a URL rather than a folder ("file:..." counts as a URL)."""
     return "://" in path or path.startswith("file:")
+
+
+def check_no_options(folder: str | Path, options: Mapping[str, Any] | None) -> None:
+    """Raises StoreError for options of a file system, which have no effect on a folder."""
+    if options:
+        raise StoreError(f"--option has no effect: {folder} is a folder, not a URL; remove it")
 
 
 _ONE_SLASH = re.compile(r"([A-Za-z][\w+.-]+):/")
@@ -151,9 +157,10 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
     if isinstance(error, OSError) and number in NO_ROOM:
         return f"no room to {doing} {place} ({error.strerror}); make room and rerun the same command"
     if writing and not remote and isinstance(error, OSError):
-        return f"cannot {doing} {place}: {error.strerror or reason(error)}; choose a writable --out"
+        return f"cannot {doing} {place}: {error.strerror or reason(error)}; choose a place that you may write to"
     if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError) or "NotFound" in _kind(error):
-        cure = "create the bucket first" if writing else "check the path, or fetch or regenerate it"
+        there = "create the bucket first" if remote else "create the folder first, or choose another place"
+        cure = there if writing else "check the path, or fetch or regenerate it"
         return f"cannot {doing} {place}: it is not there ({reason(error)}); {cure}"
     if not remote and isinstance(error, PermissionError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}; change its rights"

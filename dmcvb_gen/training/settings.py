@@ -232,7 +232,7 @@ def check_settings(algorithm: str, values: Mapping[str, Any]) -> Any:
     known = [field.name for field in dataclasses.fields(kind)]
     for name in values:
         if name not in known:
-            raise UnknownNameError(f"setting of {algorithm}", name, known)
+            raise UnknownNameError(f"setting of {algorithm}", name, known, "--list-settings lists them all")
     try:
         return pydantic.TypeAdapter(kind).validate_python(dict(values))
     except pydantic.ValidationError as error:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import shlex
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from PIL import Image
 
 from dmcvb_gen.agents.catalog import parse_agent
@@ -25,12 +28,14 @@ from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
 from dmcvb_gen.benchmarks.setup import Setup, fingerprint, keep_precision, open_data, pretraining_of
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
 from dmcvb_gen.benchmarks.validate import _few_warnings, make_setup
+from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.reader import Release, Subset
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.recipe import expand
 from dmcvb_gen.parallel import Needs, Ray, SerialPool
 from dmcvb_gen.parallel.ray_pool import share_of_node
 from dmcvb_gen.tasks import get_task
@@ -144,6 +149,24 @@ def test_b3_has_a_policy_for_each_fixed_goal_and_names_what_is_missing(per_goal)
     }  # fmt: skip
     none, [missing] = plan_benchmark("b3", release_of("walker-walk/expert/none"))
     assert not none and "--fixed-goals 5" in missing.command and "--goal hidden" in missing.command
+
+
+def test_the_one_command_that_b3_names_makes_one_release_that_has_its_data(tmp_path, monkeypatch):
+    _, [missing] = plan_benchmark("b3", release_of("walker-walk/expert/none"))
+    program, command, *words = shlex.split(missing.command)
+    assert (program, command) == ("dmcvb-gen", "rollout")
+    planned = []
+
+    def stop(recipe, *_):
+        planned.extend(expand(recipe))
+        raise click.Abort()
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dmcvb_gen.generate.rollout.make_plan", stop)
+    result = CliRunner().invoke(main, [command, *words])
+    assert result.exit_code == 1 and {request.name for request in planned} == set(missing.subsets), result.output
+    cells, none = plan_benchmark("b3", release_of(*missing.subsets, fixed_goals=5, episodes_per_goal=10))
+    assert cells and not none
 
 
 def test_b3_of_a_part_of_a_release_has_the_goals_that_are_whole_and_says_which_are_not():

@@ -261,4 +261,21 @@ def test_subsets_that_only_leaves_out_are_not_missed(small_release, tmp_path):
 def test_a_partial_release_that_is_published_names_the_cure(tmp_path):
     roll_out(small_recipe(), tmp_path / "part", only=[NAME])
     said = run("publish", tmp_path / "part", f"file:{tmp_path / 'public'}", code=2)
-    assert "without --only or --part" in said
+    assert "fetch the rest, or finish it with the same rollout, without --only or --part" in said
+
+
+def test_a_maze_of_ones_own_without_a_policy_is_told_how_to_train_one(tmp_path):
+    (tmp_path / "ring.txt").write_text("*****\n*   *\n* * *\n*   *\n*****\n")
+    said = run("rollout", "--layout", tmp_path / "ring.txt", "--level", "expert", "--out", tmp_path / "out", code=2)
+    assert "`dmcvb-gen train-behaviour --layout FILE`" in said and "**" not in said
+
+
+def test_mistakes_in_what_is_validated_are_told_before_the_precision_is_timed(small_release, tmp_path, monkeypatch):
+    monkeypatch.setattr("dmcvb_gen.benchmarks.validate.choose_precision", lambda *_: pytest.fail("timed"))
+    for words, told in (
+        (["--benchmark", "b9"], "unknown benchmark 'b9'"),
+        (["--benchmark", "b3"], "has no data"),
+        (["--agent", "nowhere:x"], "cannot load agent nowhere:x"),
+        (["--only", "foo*"], "unknown subset pattern 'foo*'"),
+    ):
+        assert told in run("validate", small_release, *words, "--out", tmp_path / "out", code=2)

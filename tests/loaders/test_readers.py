@@ -143,6 +143,17 @@ def test_batches_pass_over_every_step_once_in_an_order_that_the_seed_decides(sub
     assert [len(batch["step"]) for batch in subset.batches(64, drop_last=True)] == [64] * 23
 
 
+def test_every_way_to_read_gives_the_views_that_agents_see(maze_release):
+    maze = next(iter(dmcvb_gen.open(maze_release).subsets.values()))
+    first = maze.source(pictures="agents")[0]["pixels"]
+    assert first.shape == (27, 16, 16)  # three frames of three views, without the overhead view
+    [batch] = maze.batches(10_000, pictures="agents", shuffle=False)
+    np.testing.assert_array_equal(batch["pixels"][0], first)
+    assert maze.torch("steps", pictures="agents")[0]["pixels"].shape == (27, 16, 16)
+    assert maze.torch("episodes", pictures="agents")[0]["pixels"].shape[1:] == (9, 16, 16)
+    assert next(iter(maze.batches(4)))["pixels"].shape[1:] == (36, 16, 16)
+
+
 def test_states_alone_are_read_without_pixels(subset):
     [batch] = subset.batches(10_000, pictures=())
     assert "pixels" not in batch and batch["state"].shape == (1500, 24)

@@ -68,6 +68,8 @@ def test_paths_of_a_maze_are_painted(tmp_path):
 def test_what_goes_unheard_or_is_not_there_is_refused_before_any_work(tmp_path):
     for arguments, words in (
         (["evaluate-behaviour", "walker-walk", "--pictures", tmp_path / "p"], "and walker-walk is not a maze"),
+        (["evaluate-behaviour", "walker-walk", "--level", "exprt"], "unknown level 'exprt'. Did you mean 'expert'?"),
+        (["evaluate-behaviour", "--behaviour", tmp_path / "nothere"], "neither a policy file, a run folder nor"),
         (["train-behaviour", "walker-walk", "--resume", "--out", tmp_path / "none"], "holds no run to resume"),
     ):
         result = CliRunner().invoke(main, [*map(str, arguments)])

@@ -313,6 +313,7 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
         (["walker-walk", "--algo", "dreamer"], "Known: guided, mpo, ppo, sac, sb3-sac, td3, tqc."),
         (["walker-walk", "--set", "speed=3"], "learning_rate"),
         (["walker-walk", "--algo", "ppo", "--set", "buffer_size=3"], "clip_range"),
+        (["walker-walk", "--set", "foo=1"], "clipped, compile and 25 more; --list-settings lists them all."),
         (["walker-walk", "--set", "speed"], "key=value"),
         (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),
         (["walker-walk", "--set", "actor_hidden=wide"], "the default is (256, 256)"),

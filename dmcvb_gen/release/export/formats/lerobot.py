@@ -141,7 +141,7 @@ class _Layout:
                 )
         self.sources, self.video, self.size = sources, video, first.subset.record.size
         if video and self.size % 2:
-            raise StoreError(f"videos need an even size, these pictures have {self.size} pixels; remove --video")
+            raise StoreError(f"videos need an even size, these images have {self.size} pixels; remove --video")
         self.tasks = list(dict.fromkeys(_task_text(source) for source in sources))
         tasks = {source.subset.task for source in sources}
         self.robot = tasks.pop() if len(tasks) == 1 else first.subset.record.family
