@@ -21,11 +21,12 @@ from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backg
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.recipe import RendererChoice
+from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import LEVELS, SPLITS, GoalMode, SubsetSpec, parse_setting
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 if TYPE_CHECKING:
@@ -159,17 +160,6 @@ class EvaluationScene:
         views = [view for view in get_task(task).views if view not in NOT_TRAINED_ON]
         check_size(options.get("size", cls.size))
         return cls(task, spec.setting, Pictures(tuple(views), spec.hides_goal), **options)
-
-
-def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
-    """Mean speed towards the goal of the episodes that reached it, m/s; None if none did.
-
-    Args:
-      distance: (episode,) to the goal at the start in a straight line, meters.
-      length: (episode,) agent steps. reached: (episode,) bool.
-    """
-    seconds = length * ACTION_REPEAT * task.control_timestep
-    return float((distance / seconds)[reached].mean()) if reached.any() else None
 
 
 class Evaluator:

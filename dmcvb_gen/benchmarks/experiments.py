@@ -23,7 +23,7 @@ from dmcvb_gen.agents.data import Normalization, Source, TrainingData, choose_ep
 from dmcvb_gen.agents.learners import Batch, Learner, Policy
 from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
-from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, goal_speed, protocol, renderer_choice
+from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, protocol, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.own import AgentData, OwnAgent
 from dmcvb_gen.benchmarks.profiles import Profile
@@ -44,6 +44,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, sha256_file, write_json
 from dmcvb_gen.loaders.source import StepSource
 from dmcvb_gen.parallel import ignore
+from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.tasks import Task, get_task
 from dmcvb_gen.version import __version__
 

@@ -46,19 +46,25 @@ def evaluate(
     )
 
 
-def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float | None]:
-    """Share of episodes that reached the goal, and their mean speed towards it.
+def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
+    """Mean speed towards the goal of the episodes that reached it, m/s; None if none did.
 
-    Speed is the straight distance to the goal at the start over the time it took, in m/s, as in the benchmarks;
-    None if no episode got there, both None for a task without a goal.
+    Args:
+      distance: (episode,) to the goal at the start in a straight line, meters.
+      length: (episode,) agent steps. reached: (episode,) bool.
     """
+    seconds = length * ACTION_REPEAT * task.control_timestep
+    return float((distance / seconds)[reached].mean()) if reached.any() else None
+
+
+def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float | None]:
+    """Share of episodes that reached the goal, and their speed (`goal_speed`); None of a task without a goal."""
     part = task.state_slices.get("target_vector")
     if part is None:
         return None, None
     reached = simulation.terminated
-    seconds = simulation.length * ACTION_REPEAT * task.control_timestep
-    speed = arithmetic.norm(simulation.state[:, 0, part]) / seconds
-    return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None
+    distance = arithmetic.norm(simulation.state[:, 0, part])
+    return float(reached.mean()), goal_speed(distance, simulation.length, reached, task)
 
 
 def running_speed(task: Task, simulation: Simulation) -> float | None:

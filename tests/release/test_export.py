@@ -518,7 +518,7 @@ def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path
     with pytest.raises(StoreError, match="antmaze_fixed_hidden_goal/empty7x7/<seed>"):
         import_tfds(tmp_path / "x", tmp_path / "r")
     what = dict(task="ant-maze-empty7x7", level="expert")
-    with pytest.raises(StoreError, match="no picture observation/lowres_top_camera;"):
+    with pytest.raises(StoreError, match="no image observation/lowres_top_camera;"):
         import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="visible")
     import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="hidden")
 
