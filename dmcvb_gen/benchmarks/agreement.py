@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import bootstrap, spearmanr
 
 from dmcvb_gen.benchmarks.paper import paper_score
 
@@ -86,6 +85,8 @@ def rank_agreement(pairs: Sequence[Pair], seed: int = 0) -> list[Agreement]:
 
 
 def _agreement(task: str, pairs: Sequence[Pair], seed: int) -> Agreement:
+    from scipy.stats import bootstrap, spearmanr  # takes a second, which other reports need not wait for
+
     returns, paper = [pair.returns for pair in pairs], [pair.paper for pair in pairs]
 
     def rho(*returns: np.ndarray) -> float:

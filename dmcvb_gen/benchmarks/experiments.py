@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
 from dmcvb_gen.agents.data import Normalization, Source, TrainingData, choose_episodes, load_data
-from dmcvb_gen.agents.learners import Batch, Learner, Policy
+from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, protocol, renderer_choice
@@ -45,7 +45,7 @@ from dmcvb_gen.files import replacing, sha256_file, write_json
 from dmcvb_gen.loaders.source import StepSource
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.policies.evaluation import goal_speed
-from dmcvb_gen.tasks import Task, get_task
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
 ProgressCallback = Callable[[str, int], None]
@@ -434,7 +434,6 @@ def inspect(
       folder: folder of the decoders' states while they train, a folder each.
     """
     curves: dict[str, Curve] = {}
-    errors: dict[str, Any] = {}
     torch.manual_seed(setup.seed)  # of the readouts' weights, also where training has just been resumed
     readouts = {
         "observation": ObservationProbe(encoder, data.sizes, setup.profile.network),
@@ -442,7 +441,7 @@ def inspect(
     }
     settings = train_settings(setup, setup.profile.readout_steps, len(data), frozen=True)
     inspected = min(len(data.hold_out_rows), INSPECTED)
-    draws = len(readouts) * (settings.steps * settings.batch_size + inspected) + inspected  # states' errors count twice
+    draws = len(readouts) * settings.steps * settings.batch_size + inspected
     data = encoded(setup, encoder, data, draws, tick)
     for name, learner in readouts.items():
         learner.to(setup.device)
@@ -454,10 +453,7 @@ def inspect(
             folder=folder / name,
             tick=lambda made, n=name: tick(f"{n} decoder", made),
         )
-        tested = functools.partial(tick, f"test error of the {name} decoder", 0)
-        errors[f"{name}_mse"] = _hold_out_error(learner, data, setup.profile.batch_size, tested)
-    units = state_units(setup, cell.task)
-    errors["state_l1"] = _field_errors(readouts["state"], data, get_task(cell.task), units, setup.profile.batch_size)
+    errors = _test_errors(readouts, data, setup, cell.task, tick)
     held_out = len(data.hold_out_rows) > 0
     batch = draw(readouts["observation"], data, 8, setup.seed, 0, hold_out=held_out)
     with torch.no_grad(), readouts["observation"].precision():
@@ -468,39 +464,34 @@ def inspect(
     return {**errors, "curves": curves, "held_out": held_out}
 
 
-def _hold_out_batches(learner: Learner, data: TrainingData, size: int) -> Iterator[Batch]:
-    """Every held-out transition once, at most 150,000 of them, evenly spread."""
+@torch.no_grad()
+def _test_errors(
+    readouts: dict[str, Any], data: TrainingData, setup: Setup, task: str, tick: ProgressCallback
+) -> dict[str, Any]:
+    """Errors of decoders on the held-out transitions, at most 150,000 of them, evenly spread, each encoded once.
+
+    Returns:
+      "observation_mse" and "state_mse": mean squared errors. "state_l1": state field -> mean absolute error, in the
+      standard deviations of `state_units`. All None if nothing is held out.
+    """
     rows = data.hold_out_rows
     rows = rows[:: max(1, -(-len(rows) // INSPECTED))]
-    for few in rows.split(size):
-        yield data.transitions(few, pictures=learner.needs_pictures)
-
-
-@torch.no_grad()
-def _hold_out_error(learner: Learner, data: TrainingData, size: int, tick: Callable[[], None] = ignore) -> float | None:
-    """Mean loss over the held-out transitions; None if none are held out. `tick` is called after each batch."""
-    total = count = 0.0
-    for batch in _hold_out_batches(learner, data, size):
-        tick()
-        total, count = total + float(learner.metrics(batch)["loss"]) * len(batch.action), count + len(batch.action)
-    return total / count if count else None
-
-
-@torch.no_grad()
-def _field_errors(
-    learner: StateProbe, data: TrainingData, task: Task, units: torch.Tensor, size: int
-) -> dict[str, float] | None:
-    """State field -> mean absolute error of its prediction on held-out transitions.
-
-    Args:
-      units: (state,) what an error is measured in: the same for all cells of a task.
-    """
-    errors = [(learner.predict(batch) - batch.state).abs() for batch in _hold_out_batches(learner, data, size)]
-    if not errors:
-        return None
-    scale = (data.normalization.std.cpu() / units).to(data.device)
-    each = (torch.cat(errors) * scale).mean(dim=0)
-    return {name: float(each[part].mean()) for name, part in task.state_slices.items()}
+    if not len(rows):
+        return {"observation_mse": None, "state_mse": None, "state_l1": None}
+    squared, absolute = dict.fromkeys(readouts, 0.0), torch.zeros(data.state.shape[1], device=data.device)
+    for few in rows.split(setup.profile.batch_size):
+        tick("test errors of the decoders", 0)
+        batch = data.transitions(few)
+        with readouts["state"].precision():
+            if batch.latent is None:
+                batch = dataclasses.replace(batch, latent=readouts["state"].encoder(batch.observation))
+            for name, learner in readouts.items():
+                squared[name] += float(learner.losses(batch)["loss"]) * len(few)
+            absolute += (readouts["state"].predict(batch) - batch.state).abs().sum(dim=0)
+    scale = data.normalization.std.cpu() / state_units(setup, task)
+    each = absolute.cpu() * scale / len(rows)
+    fields = {name: float(each[part].mean()) for name, part in get_task(task).state_slices.items()}
+    return {f"{name}_mse": total / len(rows) for name, total in squared.items()} | {"state_l1": fields}
 
 
 @functools.lru_cache(maxsize=8)
