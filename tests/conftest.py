@@ -23,7 +23,7 @@ from dmcvb_gen.rendering.native import textures  # noqa: E402
 pytest_plugins = ["tests.compiled_code", "tests.tiers"]
 
 # Tests make hundreds of renderers of mazes in one process, with more textures than a command needs to keep.
-textures._packed_levels = functools.lru_cache(maxsize=256)(textures._packed_levels.__wrapped__)
+textures._packed_levels = functools.lru_cache(maxsize=64)(textures._packed_levels.__wrapped__)
 
 
 def small_recipe(**changes):
@@ -83,8 +83,8 @@ def small_release(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def small_mazes(tmp_path_factory):
-    """Folder of a finished release of a maze: the goal visible, hidden, and fixed with the start; 2 episodes each."""
-    pattern = {"tasks": TINY_MAZE, "levels": "random", "episodes_per_shard": 1}
+    """Folder of a finished release of a maze: the goal visible, hidden, and fixed with the start; 2 short episodes each."""
+    pattern = {"tasks": TINY_MAZE, "levels": "random", "episodes_per_shard": 1, "max_steps": 100}
     subsets = [
         pattern | {"settings": ["visible", "hidden"], "episodes": 2},
         pattern | {"settings": ["fixed"], "fixed_goals": 2, "episodes_per_goal": 1},

@@ -17,6 +17,7 @@ from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
@@ -120,6 +121,7 @@ class Sb3Run(Run):
 
         while self.step < config.steps:
             steps = min(next_evaluation, config.steps, self.step + ROUND_STEPS) - self.step
+            model.set_logger(Logger(None, []))  # its own makes a folder in the system's temporary folder each time
             model.learn(steps, callback=_Ticker(tick), log_interval=None, reset_num_timesteps=False)
             self.step = model.num_timesteps
             if self.step >= min(next_evaluation, self.config.steps):

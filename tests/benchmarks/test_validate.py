@@ -100,8 +100,7 @@ def report(release, tmp_path_factory):
         "smoke",
         "--agents",
         "bc,state-bc,id+bc",
-        "--threads",
-        1,
+        *("--workers", 1, "--threads", 1),
         "--out",
         out,
     )

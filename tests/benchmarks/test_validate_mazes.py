@@ -73,7 +73,7 @@ def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(release):
 def report(release, tmp_path_factory):
     out = tmp_path_factory.mktemp("maze-report")
     command = ["validate", str(release), "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
-    return out, CliRunner().invoke(main, [*command, "--threads", "1", "--out", str(out)])
+    return out, CliRunner().invoke(main, [*command, "--workers", "1", "--threads", "1", "--out", str(out)])
 
 
 def test_a_maze_release_goes_through_b1_and_b3(report):

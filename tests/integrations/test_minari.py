@@ -113,7 +113,7 @@ def test_the_environment_shows_the_goal_as_the_data_were_painted(goal, tmp_path,
         env.close()
 
 
-def test_references_are_of_episodes_as_long_as_the_datas(small_mazes, tmp_path):
+def test_references_are_of_episodes_as_long_as_the_datas(maze_release, tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 10}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "short")
     release = dmcvb_gen.open(str(tmp_path / "short"))
@@ -124,7 +124,7 @@ def test_references_are_of_episodes_as_long_as_the_datas(small_mazes, tmp_path):
     release.subsets["x"].__dict__["returns"] = np.array([15.0])
     found = reference_returns(release, record)
     assert found["ref_max_score"] == 15 and 0 < found["ref_min_score"] < 10
-    mazes = dmcvb_gen.open(str(small_mazes))
+    mazes = dmcvb_gen.open(str(maze_release))
     whole = mazes["ant-maze-tiny/random/visible"].record
     assert whole.max_steps == get_task(whole.task).max_steps and reference_returns(mazes, whole) == {}  # no expert
 

@@ -31,6 +31,14 @@ def models(monkeypatch):
     return kept
 
 
+@pytest.mark.parametrize("algorithm", TINY)
+def test_a_run_leaves_no_logs_in_the_temporary_folder(algorithm, tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    train(tmp_path / "run", algorithm)
+    assert not list((tmp_path / "temporary").glob("SB3*"))
+
+
 def train(folder, algorithm, **changes):
     fields = dict(task="cheetah-run", algorithm=algorithm, steps=80, seed=0, settings=TINY[algorithm])
     run = open_run(folder, RunConfig(**fields | dict(evaluate_every=80, evaluate_sparse=80) | changes), False)
