@@ -21,8 +21,8 @@ from tests.conftest import maze_recipe, rewrite, small_recipe
 
 WALKER = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "dynamic"], "episodes": 3}
 RECIPES = {
-    "walker": small_recipe(subsets=[WALKER | {"episodes_per_shard": 1}]),
-    "maze": maze_recipe(("visible", "hidden")),
+    "walker": small_recipe(subsets=[WALKER | {"episodes_per_shard": 1, "max_steps": 60}]),
+    "maze": maze_recipe(("visible", "hidden"), max_steps=60),
 }
 
 
