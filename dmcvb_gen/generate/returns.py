@@ -63,7 +63,7 @@ def evaluate_behaviour(
             policies = _policies(task_id, level, behaviour)
             out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
-            own = is_own(behaviour or "")
+            own = is_own(behaviour or "") and level != "random"
             mode = "own" if own else "sampled" if sample else "mean"
             row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
@@ -79,9 +79,11 @@ def evaluate_behaviour(
 def _check_levels(levels: Sequence[str], behaviour: str | None, sample: bool) -> None:
     for level in levels:
         Level.parse(level)
-    if behaviour and Level.RANDOM in levels:
-        raise DmcvbError(f"level random has no policy: leave it out, or remove --behaviour {behaviour}")
-    if sample and set(levels) == {Level.RANDOM}:
+    if set(levels) != {Level.RANDOM}:
+        return
+    if behaviour:
+        raise DmcvbError("--behaviour has no effect here: level random has no policy; ask for another, or remove it")
+    if sample:
         raise DmcvbError("--sample has no effect here: level random is always drawn; ask for another, or remove it")
 
 
@@ -96,7 +98,8 @@ def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -
             raise DmcvbError(f"give the one TASK that {behaviour} is for")
         return tasks, levels or ["expert"]
     levels = levels or levels_of(behaviour)
-    files = [path for level in levels for path in resolve_policies("", level, behaviour)]
+    named = [level for level in levels if level != "random"]
+    files = [path for level in named for path in resolve_policies("", level, behaviour)]
     return tasks or sorted({read_header(path).task for path in files}), levels
 
 

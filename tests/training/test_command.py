@@ -104,6 +104,11 @@ def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
         evaluated("walker-walk", "--behaviour", file.parent, "--level", "medium", "--episodes", 2, "--json")
     )
     assert folder[0]["returns"] == row["returns"]
+    both = json.loads(
+        evaluated("--behaviour", file, "--level", "random", "--level", "medium", "--episodes", 2, "--json")
+    )
+    assert [one["level"] for one in both] == ["random", "medium"] and both[1]["returns"] == row["returns"]
+    assert both[0]["returns"]["mean"] < row["returns"]["mean"] / 2
     table = evaluated("--behaviour", file, "--episodes", 2)
     assert "DMC-VB paper" in table and "mean actions" in table
     (drawn,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--sample", "--json"))
