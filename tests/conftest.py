@@ -83,7 +83,7 @@ def small_release(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def small_mazes(tmp_path_factory):
-    """Folder of a finished release of a maze: the goal visible, hidden, and fixed with the start; 2 short episodes each."""
+    """Folder of a finished release of a maze: goal visible, hidden, and fixed with the start; 2 short episodes each."""
     pattern = {"tasks": TINY_MAZE, "levels": "random", "episodes_per_shard": 1, "max_steps": 100}
     subsets = [
         pattern | {"settings": ["visible", "hidden"], "episodes": 2},
