@@ -109,7 +109,7 @@ def train_behaviour(
         notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
     done, name = saved["step"] if saved else 0, task_folder(task)
     total = configuration.steps
-    if total < done:
+    if found and total < min(done, found.steps):  # a finished run is a few steps past its own number
         raise DmcvbError(f"{folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
     if found and total < found.steps:
         notify(f"The run ends at step {total:,} now, not at {found.steps:,}.")

@@ -323,6 +323,17 @@ def test_a_run_looks_again_when_it_is_alone(tmp_path):
         late.train()
 
 
+@pytest.mark.parametrize("algorithm", ["sac", "sb3-sac", "mpo"])
+@pytest.mark.parametrize("steps", [None, 90])
+def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(algorithm, steps, tmp_path):
+    end = train(tmp_path / "run", algorithm=algorithm, steps=90).step
+    assert end > 90, "steps that the simulations share evenly"
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run" / "checkpoints").iterdir()}
+    again = train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=steps, progress=False)
+    assert again.steps == end
+    assert before == {path.name: path.read_bytes() for path in (tmp_path / "run" / "checkpoints").iterdir()}
+
+
 def test_a_run_that_is_made_shorter_says_so(tmp_path):
     train(tmp_path / "run", steps=80)
     said = []
