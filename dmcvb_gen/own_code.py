@@ -29,10 +29,27 @@ def is_own(name: str) -> bool:
     return _OWN_ID.fullmatch(name) is not None
 
 
+_digests: dict[str, tuple[Any, str]] = {}
+"""Module -> its spec, which is another one after a reload, and the digest that its file had then."""
+
+
 def source_digest(module: str) -> str:
-    """SHA-256 of an imported module's file; "" for code without a file."""
-    file = getattr(sys.modules[module], "__file__", None)
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
+    """SHA-256 of an imported module's file; "" for code without a file.
+
+    Raises:
+      DmcvbError: the file has changed since it was first asked for, so that the code that runs is another one.
+    """
+    found = sys.modules[module]
+    file = getattr(found, "__file__", None)
+    if not file:
+        return ""
+    digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    spec, before = _digests.setdefault(module, (found.__spec__, digest))
+    if spec is not found.__spec__:
+        _digests[module] = found.__spec__, digest
+    elif before != digest:
+        raise DmcvbError(f"{file} has changed, but its old code still runs; restart Python, or importlib.reload it")
+    return digest
 
 
 def allow(names: Iterable[str], variable: str = TASKS) -> None:
@@ -68,3 +85,6 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
         raise DmcvbError(
             f"cannot find {kind} {name} ({error}); give <module>:<function>, run from its folder"
         ) from None
+    except Exception as error:  # the code of somebody else
+        reason = (str(error).splitlines() or [""])[0]
+        raise DmcvbError(f"{kind} {name} cannot be imported ({type(error).__name__}: {reason})") from error

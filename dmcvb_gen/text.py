@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
+from pathlib import Path
 
 
 def pluralize(count: int, noun: str) -> str:
     """A number with its noun, which is given in the plural: 1, "shards" -> "1 shard"; 1200 -> "1,200 shards"."""
     return f"{count:,} {noun.removesuffix('s') if count == 1 else noun}"
+
+
+def quoted(place: str | Path) -> str:
+    """A path or URL as a shell takes it: in quotes if it needs them."""
+    return shlex.quote(str(place))
 
 
 def as_names(value: str | Iterable) -> tuple[str, ...]:

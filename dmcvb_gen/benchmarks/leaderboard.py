@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from dmcvb_gen.benchmarks.suites import slug
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.files import copy_file, sha256_file, write_json, write_text
+from dmcvb_gen.text import quoted
 
 ERRORS = 3.0
 """Standard errors, the row's or the difference's, that a score may move by when it is computed again."""
@@ -131,7 +132,9 @@ def read_rows(folder: str | Path, names: Sequence[str] = ()) -> list[Row]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise DmcvbError(f"there is no folder {folder}; `dmcvb-gen leaderboard {folder} --add REPORT` begins one")
+        raise DmcvbError(
+            f"there is no folder {folder}; `dmcvb-gen leaderboard {quoted(folder)} --add REPORT` begins one"
+        )
     rows = {path.stem: _read_row(path) for path in sorted(folder.glob("*.json"))}
     for name in names:
         if name not in rows:

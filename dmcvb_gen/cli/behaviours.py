@@ -16,6 +16,7 @@ from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
 from dmcvb_gen.progress import ProgressBar
+from dmcvb_gen.text import quoted
 from dmcvb_gen.training.behaviour import train_behaviour as train
 
 
@@ -54,10 +55,11 @@ def train_behaviour(as_json, list_settings, **options):
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
     click.echo(f"{run.folder}: trained to {run.steps:,} agent steps; its curve is {run.curve}.")
     if not picked:
-        return click.echo(f"Next: dmcvb-gen select-checkpoints {run.folder}")
+        return click.echo(f"Next: dmcvb-gen select-checkpoints {quoted(run.folder)}")
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
-        click.echo(f"Next: dmcvb-gen rollout --layout {layout} --level expert --behaviour {run.folder} --goal visible")
+        options = f"--layout {quoted(layout)} --level expert --behaviour {quoted(run.folder)} --goal visible"
+        click.echo(f"Next: dmcvb-gen rollout {options}")
 
 
 def _list_settings(as_json, *, task, layout, algo, settings, config, **others):

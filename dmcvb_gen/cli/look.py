@@ -18,7 +18,7 @@ from dmcvb_gen.cli.common import (
 )
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.storage.remote import is_url, public
-from dmcvb_gen.text import format_bytes, pluralize
+from dmcvb_gen.text import format_bytes, pluralize, quoted
 
 
 @click.command()
@@ -68,10 +68,10 @@ def info(path, options, as_json):
     if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
         click.echo("* Episodes end sooner than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
-        paint = f"fetch {public(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {path}"
+        paint = f"fetch {public(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(path)}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
     if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
-        click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {public(path)}")
+        click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {quoted(public(path))}")
     if facts["digest"]:
         click.echo(f"digest {facts['digest']}")
 

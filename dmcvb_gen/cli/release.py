@@ -16,7 +16,7 @@ from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.remote import is_url
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import pluralize, quoted
 
 if TYPE_CHECKING:
     from dmcvb_gen.release.compare import Comparison, Spread
@@ -60,7 +60,7 @@ def _verified(path, result):
         yield f"digest {result.digest}"
     damaged = [found for found in result.findings if found.check == "files" and NOT_PART not in found.message]
     if any(found.subset != MANIFEST for found in damaged) and not is_url(str(path)):
-        yield f"`dmcvb-gen regenerate {path}` makes damaged and missing shards again."
+        yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
 
 
 @command_of(commands.regenerate)
@@ -112,7 +112,7 @@ def repaint(release, out, as_json, **options):
     manifest = commands.repaint(release, out=out, **options).manifest
     facts = {"out": out, "complete": manifest.complete, "subsets": [subset.name for subset in manifest.subsets]}
     made = (f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}" for subset in manifest.subsets)
-    answer(as_json, facts, *made, f"{out}: repainted; look at it: dmcvb-gen preview {out}")
+    answer(as_json, facts, *made, f"{out}: repainted; look at it: dmcvb-gen preview {quoted(out)}")
 
 
 @command_of(commands.publish, "release", "url")

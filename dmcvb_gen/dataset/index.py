@@ -33,6 +33,7 @@ from dmcvb_gen.dataset.manifest import (
 from dmcvb_gen.dataset.sharing import link_equal_files
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.remote import is_url, storage_errors
+from dmcvb_gen.text import quoted
 
 ZARR_JSON = "zarr.json"
 INDEX = "files.json"
@@ -177,7 +178,7 @@ def card_files(root: Path) -> list[FileRecord]:
 def _record(root: Path, name: str) -> FileRecord:
     path = root / name
     if not path.is_file():
-        raise StoreError(f"{path} is missing; run `dmcvb-gen regenerate {root}` first")
+        raise StoreError(f"{path} is missing; run `dmcvb-gen regenerate {quoted(root)}` first")
     with storage_errors(path):
         return FileRecord(path=name, bytes=path.stat().st_size, sha256=files.sha256_file(path))
 
@@ -243,7 +244,7 @@ def refuse_altered(listed: Iterable[FileRecord], digest: Callable[[str], str | N
         found = digest(file.path)
         if found != file.sha256:
             what = "is damaged" if found else "is missing"
-            cure = "put it there from a copy" if is_url(place) else f"dmcvb-gen regenerate {place}"
+            cure = "put it there from a copy" if is_url(place) else f"dmcvb-gen regenerate {quoted(place)}"
             raise StoreError(f"{file.path} of {place} {what}; mend it first: {cure}")
 
 
@@ -259,7 +260,7 @@ def refuse_altered_folder(root: Path, manifest: Manifest) -> None:
     if index is None and not manifest.complete:
         return  # writing it may have been interrupted, and it is written again
     if index is None:
-        raise StoreError(f"{root / INDEX} is damaged; mend it first: dmcvb-gen regenerate {root}")
+        raise StoreError(f"{root / INDEX} is damaged; mend it first: dmcvb-gen regenerate {quoted(root)}")
 
     def digest(path: str) -> str | None:
         with storage_errors(root / path):

@@ -28,7 +28,7 @@ from dmcvb_gen.dataset.writer import read_commits
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.storage.remote import check_no_options, file_system, is_url, public, storage_errors
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import pluralize, quoted
 
 MAX_STEP_BYTES = 2**20
 """Bytes of a step that is no picture, at most."""
@@ -198,8 +198,8 @@ class Subset:
     @property
     def _without_pictures(self) -> str:
         return (
-            f"{self.name} has episodes without images; add them: `dmcvb-gen paint {public(self.root)}` (in Python, "
-            "dmcvb_gen.open(..., paint=True) renders them as they are read)"
+            f"{self.name} has episodes without images; add them: `dmcvb-gen paint {quoted(public(self.root))}` "
+            "(in Python, dmcvb_gen.open(..., paint=True) renders them as they are read)"
         )
 
     def _check_shape(self, array: zarr.Array, name: str) -> None:
@@ -277,10 +277,23 @@ class Subset:
     def choose(self, episodes: Iterable[int] | None = None) -> np.ndarray:
         """(episode,) int: indices of committed episodes, all by default.
 
+        Args:
+          episodes: indices, or a mask of all committed ones (`subset.returns > 900`).
+
         Raises:
-          StoreError: one of them is not there.
+          StoreError: one of them is not there, or these are neither integers nor such a mask.
         """
-        chosen = self.episodes if episodes is None else np.asarray(list(episodes), int)
+        if episodes is None:
+            return self.episodes
+        chosen = np.asarray(list(episodes))
+        if chosen.dtype == bool and chosen.shape == self.episodes.shape:
+            return self.episodes[chosen]
+        if chosen.size and chosen.dtype.kind not in "iu":
+            raise StoreError(
+                f"episodes are {chosen.dtype} of shape {chosen.shape}; give indices, or a mask of all "
+                f"{len(self.episodes)} episodes of {self.name}"
+            )
+        chosen = chosen.astype(int)
         missing = np.setdiff1d(chosen, self.episodes)
         if len(missing):
             raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
@@ -374,7 +387,7 @@ class Release:
         if name in self.shortfalls and name not in self.subsets:
             raise StoreError(
                 f"{name} belongs to {self.manifest.name}, but none of its episodes are here: not made or fetched yet, "
-                f"or damaged; `dmcvb-gen verify {public(self.root)}` says which"
+                f"or damaged; `dmcvb-gen verify {quoted(public(self.root))}` says which"
             )
         if name not in self.subsets:
             raise UnknownNameError("subset", name, self.subsets)

@@ -37,6 +37,7 @@ from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
+from dmcvb_gen.text import quoted
 
 COPIED = ("state", "action", "reward", "discount", "length", "terminated", "return", "seed", "behaviour", "goal_pair")
 """Arrays that a repaint copies besides the physics states."""
@@ -167,7 +168,7 @@ def stored_episodes(job: Job) -> Episodes:
     assert job.stored
     subset = job.stored.subset
     if broken := damage(Path(subset.root), subset.record, job.shard):
-        raise StoreError(f"{subset.name} shard {job.shard}: {broken}; run `dmcvb-gen regenerate {subset.root}`")
+        raise StoreError(f"{subset.name} shard {job.shard}: {broken}; run `dmcvb-gen regenerate {quoted(subset.root)}`")
     index = np.asarray(job.episodes)
     physics, length = subset.read("physics", index), subset.read("length", index)
     labels = None if job.stored.new_labels else subset.labels(index)[:, : int(length.max()) + 1]
@@ -208,7 +209,7 @@ def shard_arrays(
     yield from label_arrays(labels, length, rows)
     yield from episodes.arrays.items()
     for label in job.labels:
-        yield from paint_labels(task, renderer, physics, labels, length, rows, label, record.hidden_goal)
+        yield from paint_labels(task, renderer, physics, labels, length, rows, label, record.hidden_goal, record.views)
 
 
 def _write_and_commit(

@@ -45,6 +45,7 @@ from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import GOAL_PICTURES, HIDDEN
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import quoted
 
 ABOUT_THE_PLACE = ("device",)
 """What a painter says of itself that decides no pixel on a CPU."""
@@ -252,7 +253,9 @@ class RenderSession:
         record = next(record for record in self.manifest.subsets if record.name == name)
         commit = read_commit(self.root, record, shard)
         if commit is None:
-            raise StoreError(f"{name} shard {shard} has no commit record; run `dmcvb-gen regenerate {self.root}`")
+            raise StoreError(
+                f"{name} shard {shard} has no commit record; run `dmcvb-gen regenerate {quoted(self.root)}`"
+            )
         if commit.painted:
             return None
         source = Stored(Subset(str(self.root), record, {shard: commit}, {}), in_place=True)

@@ -51,7 +51,7 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
-from dmcvb_gen.text import format_bytes, pluralize
+from dmcvb_gen.text import format_bytes, pluralize, quoted
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _refuse_half_painted(
         if lacking and record.episodes > old[record.name]:
             raise StoreError(
                 f"{record.name} of {place} has images, but {len(lacking)} of its shards have none yet; before it "
-                f"grows, paint them: dmcvb-gen paint {place} --only {record.name}"
+                f"grows, paint them: dmcvb-gen paint {quoted(place)} --only {record.name}"
             )
 
 

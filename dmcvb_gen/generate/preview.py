@@ -15,6 +15,7 @@ from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.extras import installed
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.text import quoted
 
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
@@ -205,9 +206,9 @@ def write_preview(
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:
-        cure = f"see what is here: dmcvb-gen verify {path}"
+        cure = f"see what is here: dmcvb-gen verify {quoted(path)}"
         if names:
-            cure = f"add them: dmcvb-gen paint {path}, or see it without: dmcvb-gen view {path}"
+            cure = f"add them: dmcvb-gen paint {quoted(path)}, or see it without: dmcvb-gen view {quoted(path)}"
         raise StoreError(f"{path} has no finished episodes with images; {cure}")
     folder = target or release.path / "preview"
     with storage_errors(folder, "write to"):

@@ -282,11 +282,12 @@ def paint_labels(
     rows: int,
     label: str,
     hide_goal: bool,
+    views: Sequence[str],
 ) -> Iterator[tuple[str, np.ndarray]]:
     """A modality of what the subset's pictures show, one array a view.
 
     Args:
-      label: name of the modality.
+      label: name of the modality. views: those of the task that the subset has.
 
     Yields:
       (name, (episode, rows, size, size, ...)); rows past an episode's end stay zero.
@@ -294,7 +295,7 @@ def paint_labels(
     modality = get_modality(label)
     last = length[:, None] - modality.needs_next  # whose next frame is there
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= last)
-    for view, name in zip(task.views, view_arrays(label, task.views), strict=True):
+    for view, name in zip(views, view_arrays(label, views), strict=True):
         size = (renderer.size, renderer.size, *modality.shape)
         out = np.zeros((len(physics), rows, *size), modality.dtype)
         for first in range(0, len(episode), LABEL_FRAMES):

@@ -36,7 +36,6 @@ from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import Distractor, is_maze, select
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.base import Task
 
 
 @dataclass(frozen=True)
@@ -88,14 +87,13 @@ class Repainted:
         return old.setting == new.setting and videos[0] == videos[1] and styles[0] == styles[1]
 
 
-def label_specs(task: Task, size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
-    """Specs of modalities: "depth", or "depth/<view>" if a task has several views."""
+def label_specs(views: Sequence[str], size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
+    """Specs of modalities of a subset's views: "depth", or "depth/<view>" if its task has several."""
     specs = []
     for modality in map(get_modality, labels):
         shape, dims = (size, size, *modality.shape), ("height", "width", "direction")
         specs += [
-            ArraySpec(name, modality.dtype, shape, dims[: len(shape)])
-            for name in view_arrays(modality.name, task.views)
+            ArraySpec(name, modality.dtype, shape, dims[: len(shape)]) for name in view_arrays(modality.name, views)
         ]
     return tuple(specs)
 
@@ -134,7 +132,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
     todo: dict[tuple[str, int], SubsetRecord] = {}
     for pair in pairs.values():
         record, shape = pair.record, EpisodeShape.of(get_task(pair.record.task))
-        specs = subset_specs(shape, record) + label_specs(get_task(record.task), record.size, request.labels)
+        specs = subset_specs(shape, record) + label_specs(record.views, record.size, request.labels)
         create_subset(out, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
         missing = sorted(set(pair.source.commits) - set(read_commits(out, record)))
         todo |= {(record.name, shard): record for shard in missing}

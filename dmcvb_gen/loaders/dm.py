@@ -41,13 +41,16 @@ class DmEnv(dm_env.Environment):
 
     def observation_spec(self) -> dict[str, specs.Array]:
         spaces, _ = self._env.spaces()
-        return {
-            "pixels": specs.BoundedArray(spaces["pixels"].shape, np.uint8, 0, 255, name="pixels"),
-            "state": specs.Array(spaces["state"].shape, np.float32, name="state"),
-        }
+        return {name: _spec(name, space) for name, space in spaces.items()}
 
     def action_spec(self) -> specs.BoundedArray:
         return specs.BoundedArray(self._env.spaces()[1].shape, np.float32, -1.0, 1.0, name="action")
 
     def close(self) -> None:
         self._env.close()
+
+
+def _spec(name: str, space: Any) -> specs.Array:
+    if np.isfinite(space.low).all() and np.isfinite(space.high).all():
+        return specs.BoundedArray(space.shape, space.dtype, space.low.min(), space.high.max(), name=name)
+    return specs.Array(space.shape, space.dtype, name=name)

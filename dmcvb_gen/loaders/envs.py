@@ -7,8 +7,8 @@ and one call of the renderer.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -119,8 +119,9 @@ class Scene:
                 )
         if self.goal and not maze:
             raise DmcvbError(f"{self.task} has no goal in its images; remove goal")
-        if self.max_steps is not None and self.max_steps < 1:
-            raise DmcvbError(f"max_steps is {self.max_steps}; give at least 1")
+        for name, number in (("max_steps", self.max_steps), ("threads", self.threads)):
+            if number is not None and (not isinstance(number, int | np.integer) or number < 1):
+                raise DmcvbError(f"{name} is {number}; give a whole number, at least 1")
         spec = self.spec()
         if spec.goal is not GoalMode.FIXED:
             for name in ("fixed_goals", "goal_pair", "goal_seed"):
@@ -133,6 +134,14 @@ class Scene:
                 if getattr(self, name) not in unchanged:
                     shown = f"{self.task} {self.distractor}"
                     raise DmcvbError(f"{name} has no effect: {shown} shows no distractors; remove {name}")
+
+
+def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
+    known = [field.name for field in fields(Scene) if field.name not in ("task", "distractor")]
+    for name in options:
+        if name not in known:
+            raise UnknownNameError("option of environments", name, known)
+    return Scene(task, distractor, **options)
 
 
 class _Stage:
@@ -290,7 +299,7 @@ class DistractedEnv(gymnasium.Env):
     def __init__(self, task: str, distractor: str = "none", *, render_mode: str | None = None, **options: Any):
         if render_mode not in (None, "rgb_array"):
             raise DmcvbError(f"render_mode {render_mode!r} is not offered; give 'rgb_array' or None")
-        self._stage = _Stage(1, Scene(task, distractor, **options))
+        self._stage = _Stage(1, _scene(task, distractor, options))
         self.task, self.render_mode = self._stage.task, render_mode
         self.observation_space, self.action_space = self._stage.spaces()
         self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
@@ -351,7 +360,7 @@ class DistractedVectorEnv(VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 20}
 
     def __init__(self, num_envs: int, task: str, distractor: str = "none", **options: Any):
-        self._stage = _Stage(num_envs, Scene(task, distractor, **options))
+        self._stage = _Stage(num_envs, _scene(task, distractor, options))
         self.num_envs, self.task, self.render_mode = num_envs, self._stage.task, None
         self.single_observation_space, self.single_action_space = self._stage.spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -366,6 +375,8 @@ class DistractedVectorEnv(VectorEnv):
         if seed is not None or self._seeds is None:
             given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
             given = [None] * self.num_envs if given is None else list(given)
+            if len(given) != self.num_envs:
+                raise DmcvbError(f"{len(given)} seeds are given for {self.num_envs} environments; give one for each")
             draws = [gymnasium.utils.seeding.np_random(value)[0] for value in given]
             self._seeds = [int(rng.integers(2**63)) for rng in draws]
             self._stage.started[:] = 0

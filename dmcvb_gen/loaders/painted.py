@@ -29,6 +29,7 @@ from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import quoted
 
 STORED, RESAMPLED = "stored", "resample"
 DISTRACTORS = (STORED, RESAMPLED)
@@ -130,7 +131,7 @@ class PaintedSubset(SubsetReader):
         """
         raise StoreError(
             f"xarray shows what is stored of {self.name}, and paints nothing; open the release without paint=True, or "
-            f"paint it first: dmcvb-gen paint {self.root}"
+            f"paint it first: dmcvb-gen paint {quoted(self.root)}"
         )
 
     def set_epoch(self, epoch: int) -> None:

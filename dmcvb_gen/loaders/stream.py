@@ -40,6 +40,8 @@ def share(episodes: np.ndarray, rank: int, world: int, worker: int = 0, workers:
     """
     if not 0 <= rank < world:
         raise DmcvbError(f"rank {rank} is not in 0..{world - 1}; give rank < world")
+    if not len(episodes):
+        raise DmcvbError("no episodes are chosen; give at least one")
     if len(episodes) < world:
         raise DmcvbError(f"{len(episodes)} episodes cannot be shared by {world} ranks; use fewer ranks")
     return episodes[: len(episodes) - len(episodes) % world][rank::world][worker::workers]

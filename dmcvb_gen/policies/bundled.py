@@ -10,6 +10,7 @@ from dmcvb_gen.files import parse_json
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file
 from dmcvb_gen.spec import TRAINED_LEVELS, MazeName, task_folder
+from dmcvb_gen.text import quoted
 
 CONVERTED = (".zip", ".pt", ".pth")
 """Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
@@ -75,7 +76,7 @@ def levels_of(behaviour: str | Path) -> list[str]:
     if reasons:
         raise PolicyFileError(f"{behaviour} has no selected policies: {next(iter(reasons.values()))}")
     raise PolicyFileError(
-        f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {behaviour}` first, "
+        f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {quoted(behaviour)}` first, "
         "or give a policy file"
     )
 
@@ -120,5 +121,5 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
     if why := _reasons(path).get(level):
         raise PolicyFileError(f"{behaviour} has no {level} policy selected: {why}")
     raise PolicyFileError(
-        f"{behaviour} has no {level} policy selected; run `dmcvb-gen select-checkpoints {behaviour}` first"
+        f"{behaviour} has no {level} policy selected; run `dmcvb-gen select-checkpoints {quoted(behaviour)}` first"
     )

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.errors import PolicyFileError
-from dmcvb_gen.files import parse_json
+from dmcvb_gen.files import parse_json, sha256_file
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.tasks import get_task
@@ -78,11 +78,16 @@ LAYOUTS = (
 )
 
 
-@functools.lru_cache(maxsize=8)
 def converted(path: Path, task_id: str, level: str) -> Path:
-    """A policy file with another program's policy, in a folder that goes when the process ends."""
+    """A policy file with another program's policy as it is now, in a folder that goes when the process ends."""
+    return _converted(path, task_id, level, sha256_file(path))
+
+
+@functools.lru_cache(maxsize=8)
+def _converted(path: Path, task_id: str, level: str, digest: str) -> Path:
     header, weights = convert(path, task_id, level)
-    target = Path(_folder().name) / hashlib.sha256(str(path).encode()).hexdigest()[:16] / f"{level}.safetensors"
+    place = hashlib.sha256(f"{path} {task_id} {digest}".encode()).hexdigest()[:16]
+    target = Path(_folder().name) / place / f"{level}.safetensors"
     save_policy(target, header, weights)
     return target
 

@@ -11,15 +11,13 @@ The code runs only if a person named it, see `own_code`.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from dmcvb_gen.errors import PolicyFileError
-from dmcvb_gen.files import sha256_file
-from dmcvb_gen.own_code import BEHAVIOURS, find_function
+from dmcvb_gen.own_code import BEHAVIOURS, find_function, source_digest
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
 from dmcvb_gen.tasks.base import Task
@@ -88,11 +86,11 @@ def own_policy(name: str, task: Task) -> OwnPolicy:
       DmcvbError: its code may not run, cannot be found, fails, or gives no actions of the task.
     """
     function = find_function(name, BEHAVIOURS, "behaviour")
-    source = getattr(importlib.import_module(name.partition(":")[0]), "__file__", None)
-    if source is None or not callable(function):
+    digest = source_digest(name.partition(":")[0])
+    if not digest or not callable(function):
         raise PolicyFileError(
             f"behaviour {name} is no function of a module with a source file; give <module>:<function>"
         )
-    policy = OwnPolicy(name, function, task, sha256_file(source))
+    policy = OwnPolicy(name, function, task, digest)
     policy.act(np.zeros((2, task.behaviour_size), np.float32), [np.random.default_rng(row) for row in range(2)])
     return policy

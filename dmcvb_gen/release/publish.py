@@ -46,6 +46,7 @@ from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.storage import Storage, open_storage
 from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.text import quoted
 
 
 def index_of(root: Path, manifest: Manifest) -> Index:
@@ -57,7 +58,9 @@ def index_of(root: Path, manifest: Manifest) -> Index:
     commits = {record.name: read_commits(root, record) for record in manifest.subsets}
     for record in manifest.subsets:
         if len(commits[record.name]) != shard_count(record):
-            raise StoreError(f"{record.name} has damaged or missing shards; run `dmcvb-gen regenerate {root}` first")
+            raise StoreError(
+                f"{record.name} has damaged or missing shards; run `dmcvb-gen regenerate {quoted(root)}` first"
+            )
     with storage_errors(root / MANIFEST):
         digest = files.sha256_file(root / MANIFEST)
     index = read_index(root)
@@ -179,11 +182,13 @@ def _check_card(root: Path, manifest: Manifest, index: Index) -> None:
     with storage_errors(root):
         for file in index.files:
             if is_card(file.path) and wrong_bytes(root, file):
-                raise StoreError(f"{root / file.path} does not have its digest; run `dmcvb-gen card {root}` first")
+                raise StoreError(
+                    f"{root / file.path} does not have its digest; run `dmcvb-gen card {quoted(root)}` first"
+                )
         known = page.is_file() and manifest.digest  # of version 1 there is none
         old = known and str(manifest.digest) not in page.read_text(errors="replace")
     if old:
-        raise StoreError(f"the card of {root} is of another version; run `dmcvb-gen card {root}` first")
+        raise StoreError(f"the card of {root} is of another version; run `dmcvb-gen card {quoted(root)}` first")
 
 
 def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:

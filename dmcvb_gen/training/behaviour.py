@@ -1,6 +1,7 @@
 """Train a behaviour policy: from what a person gives to a finished run, its curve and, for an own maze, its picks."""
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.spec import MazeName, task_folder
-from dmcvb_gen.text import as_names
+from dmcvb_gen.text import as_names, quoted
 
 if TYPE_CHECKING:
     from dmcvb_gen.training.selection import Selection
@@ -36,6 +37,20 @@ class TrainedRun:
     selection: "Selection | None" = None
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """More threads gain nothing at these sizes, and one gives the same bits on every machine."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@_one_thread()
 def train_behaviour(
     task: str | None = None,
     *,
@@ -77,7 +92,6 @@ def train_behaviour(
       Stopped: by Ctrl-C; the run is saved, and the message has the command that goes on.
       DmcvbError: an unknown name, a setting that is wrong, or a folder that holds another run or none to resume.
     """
-    import torch  # here, so that --help works without it
 
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.progress import ProgressBar
@@ -98,7 +112,6 @@ def train_behaviour(
     source = None if init_from is None else str(init_from)
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=source)
     changed = parse_settings(as_names(settings), config, algorithm)
-    torch.set_num_threads(1)  # more gain nothing at these sizes, and one gives the same bits on every machine
     chosen = _precision(precision, algorithm, changed, found)
     configuration = run_config(task, algorithm, changed | chosen, found, **given)  # type: ignore[arg-type]
     run = open_run(folder, configuration, resume)
@@ -150,7 +163,7 @@ def _select(folder: Path, name: str, bar: Any, steps: int) -> "Selection":
     try:
         return select_checkpoints(folder, SELECTION_EPISODES, progress=Rest())
     except KeyboardInterrupt:
-        command = f"dmcvb-gen select-checkpoints {folder}"
+        command = f"dmcvb-gen select-checkpoints {quoted(folder)}"
         raise Stopped(f"interrupted; the run is trained, select its checkpoints: {command}") from None
 
 

@@ -117,7 +117,7 @@ class Stopped(DmcvbError):
 
 def command_of(config: RunConfig) -> str:
     """The command line that trains this run again."""
-    parts = [f"dmcvb-gen train-behaviour {config.task} --algo {config.algorithm} --steps {config.steps}"]
+    parts = [f"dmcvb-gen train-behaviour {shlex.quote(config.task)} --algo {config.algorithm} --steps {config.steps}"]
     parts.append(f"--seed {config.seed}")
     parts.append(f"--evaluate-every {config.evaluate_every}")
     if config.init_from:

@@ -405,13 +405,11 @@ def plot_curve(folder: str | Path, expert: float | None = None) -> Path:
 @contextlib.contextmanager
 def _curve_figure(curve: Sequence[Point], task: str, path: Path) -> Iterator[Axes]:
     """Axes with a learning curve to draw more on; the picture is written at the end."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib.figure import Figure  # not pyplot, whose backend is the caller's
 
     steps, returns = [step for step, _, _ in curve], [value for _, value, _ in curve]
-    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
     axes.plot(steps, returns, color="0.75", linewidth=1, label="evaluations along the way")
     axes.plot(steps, smooth(returns), color="tab:blue", label="smoothed")
     yield axes
@@ -420,4 +418,3 @@ def _curve_figure(curve: Sequence[Point], task: str, path: Path) -> Iterator[Axe
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -241,6 +241,12 @@ def test_mistakes_are_answered():
     DistractedEnv("walker-walk", "none", difficulty="medium")  # as in data sets that `export` wrote
     with pytest.raises(DmcvbError, match="max_steps is 0"):
         DistractedEnv("walker-walk", max_steps=0)
+    for option in (dict(max_steps=2.5), dict(threads=0)):
+        with pytest.raises(DmcvbError, match="give a whole number, at least 1"):
+            DistractedEnv("walker-walk", **option)
+    for made in (lambda **options: DistractedVectorEnv(1, "walker-walk", **options), DistractedEnv):
+        with pytest.raises(DmcvbError, match="unknown option of environments 'siz'. Did you mean 'size'?"):
+            made(**({"task": "walker-walk"} if made is DistractedEnv else {}), siz=16)
     with pytest.raises(DmcvbError, match="remove difficulty"):
         DistractedEnv("ant-maze-empty7x7", "visible", difficulty="hard")
     with pytest.raises(DmcvbError, match="remove goal"):
@@ -258,6 +264,24 @@ class TestDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):
     def make_action_sequence(self):
         for _ in range(5):
             yield self.make_action()
+
+
+@pytest.mark.parametrize("task", ["walker-walk", TINY_MAZE])
+def test_a_vector_environment_takes_one_seed_for_each_place(task):
+    vector = DistractedVectorEnv(2, task, **SMALL)
+    for seeds in ([1], [1, 2, 3]):
+        with pytest.raises(DmcvbError, match=f"{len(seeds)} seeds are given for 2 environments"):
+            vector.reset(seed=seeds)
+    vector.reset(seed=[1, 2])
+
+
+@pytest.mark.parametrize("task", ["walker-walk", TINY_MAZE])
+def test_the_specs_of_the_dm_environment_are_of_all_that_it_observes(task):
+    env = DmEnv(task, modalities=["depth", "segmentation"], **SMALL)
+    observation, specs = env.reset().observation, env.observation_spec()
+    assert specs.keys() == observation.keys() == {"pixels", "state", "depth", "segmentation"}
+    for name, spec in specs.items():
+        spec.validate(observation[name])
 
 
 def test_the_dm_environment_has_the_gymnasium_episodes():

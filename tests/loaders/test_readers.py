@@ -154,6 +154,17 @@ def test_every_way_to_read_gives_the_views_that_agents_see(maze_release):
     assert next(iter(maze.batches(4)))["pixels"].shape[1:] == (36, 16, 16)
 
 
+def test_a_mask_chooses_episodes_and_other_values_are_refused(subset):
+    best = subset.returns == subset.returns.max()
+    assert list(subset.choose(best)) == list(np.flatnonzero(best)) and best.sum() == 1
+    assert set(subset.source(episodes=best, pictures=()).episodes) == set(np.flatnonzero(best))
+    for wrong in (best[:2], [0.5, 1.5], ["a"]):
+        with pytest.raises(DmcvbError, match="give indices, or a mask of all 3 episodes"):
+            subset.choose(wrong)
+    with pytest.raises(DmcvbError, match="no episodes are chosen"):
+        list(subset.batches(4, episodes=[]))
+
+
 def test_states_alone_are_read_without_pixels(subset):
     [batch] = subset.batches(10_000, pictures=())
     assert "pixels" not in batch and batch["state"].shape == (1500, 24)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import pickle
+import sys
 import zipfile
 
 import gymnasium
@@ -21,6 +22,7 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate import engine
 from dmcvb_gen.own_code import BEHAVIOURS
+from dmcvb_gen.own_code import TASKS as TASKS_VARIABLE
 from dmcvb_gen.policies.convert import convert
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.release.card import write_card
@@ -128,8 +130,28 @@ def test_a_functions_noise_comes_from_each_episodes_own_stream(task, code, tmp_p
 def test_other_code_of_the_same_name_is_refused(code, task, tmp_path, monkeypatch):
     done("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--out", tmp_path / "r")
     (tmp_path / f"{code}.py").write_text(CODE.format(actions=task.action_size) + "\n# changed\n")
-    engine._policies.cache_clear()  # as in a new process
+    engine._policies.cache_clear()
+    assert "old code still runs; restart Python" in refused("regenerate", tmp_path / "r", "--check")
+    again = ["--behaviour", f"{code}:noisy", "--out", tmp_path / "again"]
+    assert "old code still runs; restart Python" in refused("rollout", task.id, *TINY, *again)
+    assert not (tmp_path / "again").exists()
+    sys.modules.pop(code)  # as in a new process
     assert "is not the policy that the release names" in refused("regenerate", tmp_path / "r", "--check")
+    done("rollout", task.id, *TINY, *again)
+
+
+@pytest.mark.parametrize(
+    "text, told", [("def f(o, g)\n", "SyntaxError"), ("raise RuntimeError('boo')", "RuntimeError: boo")]
+)
+@pytest.mark.parametrize("place", ["task", "behaviour"])
+def test_code_that_cannot_be_imported_is_told_in_one_line(place, text, told, tmp_path, monkeypatch):
+    name = f"bad_{place}_{told[:5].lower()}"
+    (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(BEHAVIOURS, "")
+    monkeypatch.setenv(TASKS_VARIABLE, "")
+    asked = [f"{name}:f"] if place == "task" else [WALKER, "--level", "expert", "--behaviour", f"{name}:f"]
+    assert f"{place} {name}:f cannot be imported ({told}" in refused("rollout", *asked, "--out", tmp_path / "r")
 
 
 @pytest.mark.parametrize(
@@ -245,6 +267,18 @@ def test_a_cleanrl_state_dict_acts_as_cleanrl_does_and_regenerates(task, kind, t
     ours = load_policy(tmp_path / "p.safetensors").act(seen, None, True)
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
     goes_the_whole_way(task, tmp_path / "p.safetensors", tmp_path / "r")
+
+
+def test_a_file_that_was_written_anew_is_read_anew(task, tmp_path):
+    path, releases = tmp_path / "actor.pt", []
+    for seed in range(2):
+        torch.manual_seed(seed)
+        torch.save(CleanRlSac(task.behaviour_size, task.action_size).state_dict(), path)
+        done("rollout", task.id, *TINY, "--behaviour", path, "--out", tmp_path / str(seed))
+        releases.append(next(iter(open_release(tmp_path / str(seed)).subsets.values())))
+        [policy] = releases[-1].record.policies
+        assert policy.header["training"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert np.abs(releases[0].read("action") - releases[1].read("action")).max() > 0.01
 
 
 def test_policies_that_do_not_fit_are_refused_in_one_line(tmp_path):

@@ -334,6 +334,21 @@ def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(algo
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run" / "checkpoints").iterdir()}
 
 
+def test_training_leaves_the_callers_threads_and_figures_alone(tmp_path):
+    import matplotlib
+
+    before, backend = torch.get_num_threads(), matplotlib.get_backend()
+    torch.set_num_threads(2)
+    matplotlib.use("svg")
+    try:
+        train(tmp_path / "run", steps=80)
+        train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, progress=False)
+        assert torch.get_num_threads() == 2 and matplotlib.get_backend() == "svg"
+    finally:
+        torch.set_num_threads(before)
+        matplotlib.use(backend)
+
+
 def test_a_run_that_is_made_shorter_says_so(tmp_path):
     train(tmp_path / "run", steps=80)
     said = []

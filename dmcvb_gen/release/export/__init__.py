@@ -16,7 +16,7 @@ from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_p
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import all_formats, get_format
 from dmcvb_gen.spec import select
-from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.remote import is_url, local_path, storage_errors
 
 STAMP = ".dmcvb-gen.json"
 """File in each export that says what it was made from, so that the same command can resume."""
@@ -87,6 +87,8 @@ def export(
         if name not in kind.options:
             raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
     kind.check_installed()  # here, and not first in a worker
+    if not is_url(path) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
+        raise StoreError(f"--out {out} lies in the release itself; give another folder")
     release = open_for_reading(path, storage_options)
     names = select([record.name for record in release.manifest.subsets], list(only))
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)

@@ -55,8 +55,8 @@ def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     (folder / "meta").mkdir()
     files, statistics, index = _Files(folder, layout), _Statistics(), 0
     rows: list[dict[str, Any]] = []
-    for source in sources:
-        task = layout.tasks.index(_task_text(source))
+    for source, text in zip(sources, _task_texts(sources), strict=True):
+        task = layout.tasks.index(text)
         for episode in source:
             columns = layout.frames(episode, len(rows), index, task)
             row = {"episode_index": len(rows), "tasks": [layout.tasks[task]], "length": episode.length}
@@ -117,8 +117,17 @@ def _card(layout: _Layout) -> str:
     )
 
 
-def _task_text(source: Source) -> str:
-    return f"{source.subset.task} ({source.subset.level})"
+def _task_texts(sources: Sequence[Source]) -> list[str]:
+    """A text of each source: task and level, and the setting if they have several."""
+    subsets = [source.subset for source in sources]
+    settings: dict[tuple[str, str], set[str]] = {}
+    for subset in subsets:
+        settings.setdefault((subset.task, subset.level), set()).add(subset.record.setting)
+    told = [len(settings[subset.task, subset.level]) > 1 for subset in subsets]
+    return [
+        f"{subset.task} ({subset.level}{f', {subset.record.setting}' if more else ''})"
+        for subset, more in zip(subsets, told, strict=True)
+    ]
 
 
 class _Layout:
@@ -142,7 +151,7 @@ class _Layout:
         self.sources, self.video, self.size = sources, video, first.subset.record.size
         if video and self.size % 2:
             raise StoreError(f"videos need an even size, these images have {self.size} pixels; remove --video")
-        self.tasks = list(dict.fromkeys(_task_text(source) for source in sources))
+        self.tasks = list(dict.fromkeys(_task_texts(sources)))
         tasks = {source.subset.task for source in sources}
         self.robot = tasks.pop() if len(tasks) == 1 else first.subset.record.family
         self.rate, self.fps = first.steps_per_second, round(first.steps_per_second)
