@@ -131,6 +131,34 @@ def test_labels_of_hidden_goals_do_not_show_them(small_mazes, tmp_path):
     assert seen == {"visible": True, "hidden": False, "fixed": False}
 
 
+def test_labels_have_the_views_that_the_subset_has(tmp_path):
+    asked = [
+        "--level",
+        "random",
+        "--goal",
+        "visible",
+        "--episodes",
+        "2",
+        "--max-steps",
+        "3",
+        "--size",
+        "16",
+        "--no-pixels",
+    ]
+    for command in (
+        ["rollout", "ant-maze-empty7x7", *asked, "--out", str(tmp_path / "few views")],
+        ["paint", str(tmp_path / "few views"), "--views", "egocentric,top"],
+        ["repaint", str(tmp_path / "few views"), "--label", "depth", "--out", str(tmp_path / "new labels")],
+    ):
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 0, result.output
+    assert f"dmcvb-gen preview '{tmp_path / 'new labels'}'" in result.output
+    [subset] = open_release(tmp_path / "new labels").subsets.values()
+    depth = {name for name in subset.arrays if name.startswith("depth")}
+    assert depth == {"depth/egocentric", "depth/top"} and verify(tmp_path / "new labels").sound
+    assert all(subset.read(name).any() for name in depth)
+
+
 def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "native")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import io
 import json
+import shutil
 import subprocess
 import sys
 import types
@@ -19,7 +20,7 @@ from PIL import Image
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.pictures import shown
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.release.export import STAMP, export, registry
 from dmcvb_gen.release.export.publishing import export_format
 from dmcvb_gen.release.export.registry import all_formats, get_format, register_exporter
@@ -144,6 +145,16 @@ class ExporterTests:
 
 class TestExporters(ExporterTests):
     """The formats of this package."""
+
+
+@pytest.mark.parametrize("whole", ["small_release", "maze_release"])
+def test_an_export_into_the_release_itself_is_refused(whole, request, tmp_path):
+    folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "r")
+    before = sorted(folder.rglob("*"))
+    for out in (folder, folder / "exports"):
+        with pytest.raises(StoreError, match="lies in the release itself; give another folder"):
+            export(str(folder), "npz", out)
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_every_format_of_this_package_has_a_reader_and_its_line_in_the_docs():
