@@ -87,9 +87,9 @@ def export(
         if name not in kind.options:
             raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
     kind.check_installed()  # here, and not first in a worker
+    release = open_for_reading(path, storage_options)
     if not is_url(path) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
         raise StoreError(f"--out {out} lies in the release itself; give another folder")
-    release = open_for_reading(path, storage_options)
     names = select([record.name for record in release.manifest.subsets], list(only))
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
     folders = [out] if merge else [out / kind.folder_name(release, name) for name in names]
