@@ -14,6 +14,7 @@ import torch
 from click.testing import CliRunner
 from PIL import Image
 
+from dmcvb_gen import own_code
 from dmcvb_gen.agents.catalog import make_encoder, parse_agent
 from dmcvb_gen.agents.data import Normalization, Source, default_memory, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import PARTS
@@ -445,6 +446,9 @@ def test_an_agent_of_another_package_that_changed_is_another_one(small_release, 
     setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
     before = {name: fingerprint(setup, release, cell) for name, cell in cells.items()}
     file.write_text(file.read_text() + "\n# changed\n")
+    with pytest.raises(DmcvbError, match="old code still runs; restart Python"):
+        fingerprint(setup, release, cells["their-bc"])
+    own_code._digests.clear()  # as in a new process
     after = {name: fingerprint(setup, release, cell) for name, cell in cells.items()}
     assert before["their-bc"] != after["their-bc"] and before["bc"] == after["bc"]
 

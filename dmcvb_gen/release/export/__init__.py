@@ -88,7 +88,7 @@ def export(
             raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
     kind.check_installed()  # here, and not first in a worker
     release = open_for_reading(path, storage_options)
-    if not is_url(path) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
+    if not is_url(str(path)) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
         raise StoreError(f"--out {out} lies in the release itself; give another folder")
     names = select([record.name for record in release.manifest.subsets], list(only))
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
