@@ -76,7 +76,7 @@ def test_painting_a_light_release_gives_the_files_of_a_painted_one(made, tmp_pat
     assert told["shards"] == 4 and told["known"] == 0
     assert told["digest"] == open_release(made / "painted").manifest.digest
     again = run("paint", tmp_path / "copy")
-    assert again.exit_code == 0 and "every shard that is here has its pictures already" in again.output
+    assert again.exit_code == 0 and "every shard that is here has its images already" in again.output
     mine, theirs = files(tmp_path / "copy"), files(made / "painted")
     assert {n: v for n, v in mine.items() if n != ".lock"} == {n: v for n, v in theirs.items() if n != ".lock"}
 
