@@ -132,19 +132,7 @@ def test_labels_of_hidden_goals_do_not_show_them(small_mazes, tmp_path):
 
 
 def test_labels_have_the_views_that_the_subset_has(tmp_path):
-    asked = [
-        "--level",
-        "random",
-        "--goal",
-        "visible",
-        "--episodes",
-        "2",
-        "--max-steps",
-        "3",
-        "--size",
-        "16",
-        "--no-pixels",
-    ]
+    asked = ["--level=random", "--goal=visible", "--episodes=2", "--max-steps=3", "--size=16", "--no-pixels"]
     for command in (
         ["rollout", "ant-maze-empty7x7", *asked, "--out", str(tmp_path / "few views")],
         ["paint", str(tmp_path / "few views"), "--views", "egocentric,top"],
