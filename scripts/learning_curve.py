@@ -31,7 +31,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, parse_agent
-from dmcvb_gen.agents.data import Sizes, Source, load_data
+from dmcvb_gen.agents.data import Normalization, Sizes, Source, TrainingData, load_data
 from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score
@@ -53,27 +53,41 @@ class Scene:
     profile: Profile
     precision: str
 
+    @property
+    def half(self) -> bool:
+        return self.precision == "bfloat16" and not self.agent.sees_state  # as in `validate`
+
     def open(self) -> Subset:
-        """The subset, with pictures that it does not store painted."""
-        return painted_release(open_release(self.release), Painting(), missing=True)[self.subset]
+        """The subset; if the agent sees pictures, those that it does not store are painted."""
+        release = open_release(self.release)
+        if not self.agent.sees_state:
+            release = painted_release(release, Painting(), missing=True)
+        return release[self.subset]
 
     def policy(self, sizes: Sizes) -> Policy:
         """An untrained policy."""
         network = self.profile.network
         return make_policy(self.agent, make_encoder(self.agent, sizes, None, network), sizes, network)
 
-    def evaluator(self, subset: Subset, **options) -> Evaluator:
+    def evaluator(self, subset: Subset, normalization: Normalization, **options) -> Evaluator:
         """30 fresh episodes."""
-        most = self.profile.episode_steps
-        return Evaluator(subset, stack=self.agent.stack, episodes=30, max_steps=most, **options)
+        return Evaluator(
+            subset,
+            pixels=not self.agent.sees_state,
+            normalization=normalization,
+            stack=self.agent.stack,
+            episodes=30,
+            max_steps=self.profile.episode_steps,
+            **options,
+        )
 
-    def score(self, sizes: Sizes, weights: Path) -> dict[str, float]:
+    def score(self, sizes: Sizes, normalization: Normalization, weights: Path) -> dict[str, float]:
         """The return of stored weights, written beside them too."""
         torch.set_num_threads(1)
         policy = self.policy(sizes)
         policy.load_state_dict(load_file(weights))
-        policy.half = self.precision == "bfloat16"
-        evaluator = self.evaluator(self.open())
+        policy.half = self.half
+        evaluator = self.evaluator(self.open(), normalization)
         found = points_of(evaluator(policy))
         evaluator.close()
         weights.with_suffix(".json").write_text(json.dumps(found) + "\n")
@@ -92,8 +106,8 @@ class ScoresBeside:
       say: called with a number of steps and their score, when it is there.
     """
 
-    def __init__(self, scene: Scene, sizes: Sizes, folder: Path, processes: int, say: Callable):
-        self._scene, self._sizes, self._folder, self._say = scene, sizes, folder, say
+    def __init__(self, scene: Scene, data: TrainingData, folder: Path, processes: int, say: Callable):
+        self._scene, self._of_data, self._folder, self._say = scene, (data.sizes, data.normalization), folder, say
         self._pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
         self._scores: dict[int, Future] = {}
         folder.mkdir(parents=True, exist_ok=True)
@@ -107,7 +121,7 @@ class ScoresBeside:
         self._submit(step, weights)
 
     def _submit(self, step: int, weights: Path) -> None:
-        self._scores[step] = self._pool.submit(self._scene.score, self._sizes, weights)
+        self._scores[step] = self._pool.submit(self._scene.score, *self._of_data, weights)
         self._scores[step].add_done_callback(lambda done: done.exception() or self._say(step, done.result()))
 
     def finish(self) -> dict[int, dict[str, float]]:
@@ -170,7 +184,7 @@ def main() -> None:
     parser.add_argument("release")
     parser.add_argument("--subset", required=True)
     parser.add_argument("--folder", type=Path, required=True, help="Where the training and its curve are kept.")
-    parser.add_argument("--agent", default="bc")
+    parser.add_argument("--agent", default="bc", help="bc, td3-bc, state-bc, state-td3-bc, …")
     parser.add_argument("--profile", default="quick", choices=list(PROFILES))
     parser.add_argument("--scale", type=float, default=1.0, help="Times the profile's steps.")
     parser.add_argument("--scores", type=int, default=12, help="Evaluations along the training.")
@@ -185,8 +199,8 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     agent, profile = parse_agent(options.agent), change(get_profile(options.profile), options.set, parser)
     profile = profile.scaled(options.scale)
-    if agent.own or agent.pretrain or agent.sees_state:
-        parser.error("--agent: one that trains its own encoder on pictures")
+    if agent.own or agent.pretrain:
+        parser.error("--agent: one that trains its own encoder, or state-bc or state-td3-bc")
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device: this torch finds no CUDA device; install a CUDA build of torch")
     scene = Scene(options.release, options.subset, agent, profile, options.precision)
@@ -195,7 +209,8 @@ def main() -> None:
     except DmcvbError as error:
         parser.error(str(error))
     keep_options(options, parser)  # after what may refuse them
-    data = load_data([Source(subset)], seed=options.seed, stack=agent.stack, device=options.device)
+    pixels = not agent.sees_state
+    data = load_data([Source(subset)], pixels=pixels, seed=options.seed, stack=agent.stack, device=options.device)
     torch.manual_seed(options.seed)
     learner = scene.policy(data.sizes).to(options.device)
     done = [0]
@@ -209,9 +224,9 @@ def main() -> None:
 
     evaluator = beside = None
     if options.beside:
-        beside = ScoresBeside(scene, data.sizes, options.folder / "scores", options.beside, say)
+        beside = ScoresBeside(scene, data, options.folder / "scores", options.beside, say)
     else:
-        evaluator = scene.evaluator(subset, device=options.device, threads=options.threads)
+        evaluator = scene.evaluator(subset, data.normalization, device=options.device, threads=options.threads)
 
     def evaluate(policy: Policy) -> dict[str, float]:
         if beside:
@@ -221,17 +236,18 @@ def main() -> None:
         say(done[0], score)
         return score
 
-    steps = -(-profile.pixel_steps // options.scores) * options.scores  # so that the last score is of a whole stretch
+    steps = profile.pixel_steps if pixels else profile.state_steps
+    steps = -(-steps // options.scores) * options.scores  # so that the last score is of a whole stretch
     settings = TrainSettings(
         steps=steps,
-        batch_size=profile.batch_size,
+        batch_size=profile.batch_size if pixels else profile.state_batch_size,
         evaluate_every=steps // options.scores,
         points=options.scores,
-        half=options.precision == "bfloat16",
-        rate=profile.rate,
+        half=scene.half,
+        rate=profile.rate if pixels else 1.0,
         shift=profile.shifts(steps, len(data)),
         decay=profile.decay,
-        muon=profile.muon,
+        muon=pixels and profile.muon,
         compile=options.compile,
         workers=0 if options.device == "cpu" else 1,
     )

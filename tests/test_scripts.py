@@ -6,12 +6,14 @@ import csv
 import importlib
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 import dmcvb_gen
+from dmcvb_gen.benchmarks.profiles import PROFILES
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -75,6 +77,23 @@ def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path,
         assert "choose another --folder" in refused(*command, "--seed", "1")
         for pair in ("muon=2", "rate=true", "rates=2", "rate"):
             assert f"--set {pair}: give FIELD=VALUE" in refused(*command, "--set", pair)
+
+
+@pytest.mark.slow
+def test_a_learning_curve_of_states_ends_where_validate_ends(tmp_path, learning_curve, monkeypatch):
+    monkeypatch.setitem(PROFILES, "smoke", replace(PROFILES["smoke"], episodes=30))
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        made = {"episodes": 3, "max_steps": 20, "pixels": False, "progress": False}
+        name = next(iter(dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)))
+        curve, alone = tmp_path / "curve" / task, {"workers": 1, "threads": 1, "progress": False}
+        options = ("--subset", name, "--agent", "state-bc", "--profile", "smoke", "--scores", "1")
+        learning_curve(str(tmp_path / task), *options, "--folder", str(curve))
+        with open(curve / "curve.csv", newline="") as file:
+            (last,) = csv.DictReader(file)
+        report = dmcvb_gen.validate(tmp_path / task, agents=["state-bc"], only=[name], out=tmp_path / "report", **alone)
+        ((_, result),) = report.results
+        assert float(last["return"]) == result["score"]["mean"] and float(last["error"]) == result["score"]["stderr"]
+        assert float(last["test_loss"]) == result["curve"][-1]["test_loss"]
 
 
 @pytest.mark.slow
