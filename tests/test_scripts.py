@@ -40,17 +40,20 @@ def learning_curve(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_both_precisions_are_timed():
+def test_both_precisions_are_timed(monkeypatch):
+    monkeypatch.setenv("TORCHDYNAMO_DISABLE", "1")  # compiling takes a minute, and what it makes is tested elsewhere
     assert "auto takes" in run("bench_training.py", "--precisions", "--updates", "3")
 
 
 @pytest.mark.slow
-def test_a_learning_curve_paints_the_images_that_a_release_lacks(tmp_path):
+def test_a_learning_curve_paints_the_images_that_a_release_lacks(tmp_path, learning_curve):
     for task in ("walker-walk", "ant-maze-empty7x7"):
         made = {"episodes": 2, "max_steps": 20, "size": 16, "pixels": False, "progress": False}
         release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
-        command = ["learning_curve.py", str(tmp_path / task), "--subset", next(iter(release)), "--profile", "smoke"]
-        printed = run(*command, "--scores", "1", "--threads", "2", "--folder", str(tmp_path / "curve" / task))
+        command = (str(tmp_path / task), "--subset", next(iter(release)), "--profile", "smoke")
+        printed = learning_curve(
+            *command, "--scores", "1", "--threads", "2", "--folder", str(tmp_path / "curve" / task)
+        )
         assert len(printed.splitlines()) == 1
 
 
