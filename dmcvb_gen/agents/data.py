@@ -24,6 +24,7 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.parallel import ignore
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
 FRAMES = 3
@@ -461,6 +462,7 @@ def load_data(
     device: str = "cpu",
     memory: int | None = None,
     scratch: str | Path | None = None,
+    tick: Callable[[float], None] = ignore,
 ) -> TrainingData:
     """Read subsets (mixed, if there are several) for training.
 
@@ -470,6 +472,7 @@ def load_data(
       seed: seed of the episode split and of shares.
       memory: bytes of pictures to hold at most; larger data are mapped into memory from a file.
       scratch: folder of that file; the system's folder of temporary files by default.
+      tick: called with the share of the data that is read, from 0 to 1.
 
     Raises:
       DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
@@ -486,7 +489,7 @@ def load_data(
     needed = int((np.concatenate(lengths) + 1).sum()) * 3 * len(names[0]) * size * (size + 2 * PAD)
     if memory is None:  # an accelerator's pictures are read into main memory first
         memory = min(default_memory(place) for place in ("cpu", device))
-    table = StepTable.read(parts, PAD, None if needed <= memory else scratch or tempfile.gettempdir())
+    table = StepTable.read(parts, PAD, None if needed <= memory else scratch or tempfile.gettempdir(), tick)
     returns = np.concatenate([part.subset.read("return", part.episodes) for part in parts])
     return TrainingData(table, np.concatenate(held_out), stack, returns, device)
 

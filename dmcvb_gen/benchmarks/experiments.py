@@ -62,14 +62,29 @@ class _DataCache:
     def __init__(self):
         self._key, self._data = None, None
 
-    def get(self, setup: Setup, release: Release, parts: Sequence[Part], pixels: bool, stack: int) -> TrainingData:
+    def get(
+        self,
+        setup: Setup,
+        release: Release,
+        parts: Sequence[Part],
+        pixels: bool,
+        stack: int,
+        tick: ProgressCallback = ignore,
+    ) -> TrainingData:
+        """The data of some parts. `tick` is told how far its images are: painting many takes minutes."""
         digests = tuple(subset_digest(release[part.subset].commits) for part in parts)  # a release may have grown
         key = (setup.root, setup.seed, tuple(parts), digests, setup.backgrounds, setup.device, setup.memory)
         if self._key is None or self._key[0] != key or (pixels and not self._key[1]):
             self._key = self._data = None  # free the old pictures before new ones are read
-            sources = [_source(release, part) for part in parts]
+            names = " + ".join(dict.fromkeys(part.subset for part in parts))
             self._data = load_data(
-                sources, pixels=pixels, seed=setup.seed, device=setup.device, memory=setup.memory, scratch=setup.out
+                [_source(release, part) for part in parts],
+                pixels=pixels,
+                seed=setup.seed,
+                device=setup.device,
+                memory=setup.memory,
+                scratch=setup.out,
+                tick=lambda share: tick(f"images of {names}, {share:.0%}", 0) if pixels else None,
             )
             self._key = (key, pixels)
         return self._data.with_stack(stack) if pixels else self._data.states_only()
@@ -129,7 +144,7 @@ def run_pretraining(setup: Setup, work: Pretraining, tick: ProgressCallback = ig
     done = read_result(facts_path, mark)
     if done and weights_path.exists():
         return done
-    data, network = _cache.get(setup, release, work.parts, True, work.agent.stack), setup.profile.network
+    data, network = _cache.get(setup, release, work.parts, True, work.agent.stack, tick), setup.profile.network
     torch.manual_seed(setup.seed)
     encoder = make_encoder(work.agent, data.sizes, architecture=network)
     learner = make_pretrainer(work.agent, encoder, data.sizes, network).to(setup.device)
@@ -200,7 +215,7 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     started = time.perf_counter()
     before, pixels = pretraining_of(cell), not cell.agent.sees_state
     pretrained = run_pretraining(setup, before, tick) if before else None
-    data = _cache.get(setup, release, cell.policy, pixels, cell.agent.stack)
+    data = _cache.get(setup, release, cell.policy, pixels, cell.agent.stack, tick)
     policy = _make_policy(setup, cell, before, data)
     folder = setup.cells / f"{cell.id}.{mark[:12]}.run"
     subset = release[cell.policy[0].subset]

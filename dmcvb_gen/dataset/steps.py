@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ import numpy as np
 
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.parallel import ignore
 from dmcvb_gen.text import format_bytes
 
 FIELDS = ("state", "action", "reward", "discount")
@@ -81,13 +82,20 @@ class StepTable:
         self.step, self.steps = row - self.start + first, row[row < self.end]
 
     @classmethod
-    def read(cls, parts: Sequence[Selection], border: int = 0, folder: str | Path | None = None) -> StepTable:
+    def read(
+        cls,
+        parts: Sequence[Selection],
+        border: int = 0,
+        folder: str | Path | None = None,
+        tick: Callable[[float], None] = ignore,
+    ) -> StepTable:
         """Read whole episodes, few at a time.
 
         Args:
           border: pixels that each line of the frames is longer at both ends, mirrored.
           folder: the frames lie in a file there that is mapped into memory, so that the system keeps of them what
             fits. The file has no name and is gone with the process. None holds them in memory.
+          tick: called with the share of the rows that is read, from 0 to 1.
 
         Raises:
           StoreError: an episode is not there, has no pictures, or cannot be read.
@@ -101,6 +109,7 @@ class StepTable:
             frames = np.empty(shape, np.uint8) if folder is None else _mapped(shape, Path(folder))
         values: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
         row = 0
+        tick(0.0)
         for part, length in zip(parts, lengths, strict=True):
             few = max(1, READ_BYTES // (3 * size**2 * (1 + int(length.max(initial=0)))))
             part.subset.prepare(part.episodes, part.pictures)
@@ -112,6 +121,7 @@ class StepTable:
                 if frames is not None:
                     _fill(frames[row:after], [read[name] for name in part.pictures], border)
                 row = after
+                tick(row / max(1, rows))
         fields = {name: np.concatenate(found) for name, found in values.items()}
         return cls(fields, np.concatenate(lengths), frames, np.concatenate([part.episodes for part in parts]))
 

@@ -1,6 +1,7 @@
 """Progress: a bar on a terminal and rare lines in a log, that know how much is to come; for both families."""
 
 import contextlib
+import io
 import os
 import re
 import subprocess
@@ -77,15 +78,33 @@ def test_a_log_gets_nothing_of_a_quick_command(request, tmp_path, release):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_scores_are_told_while_other_cells_train(tmp_path, monkeypatch, task):
+def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, task):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0)
     release, report = str(tmp_path / "made"), str(tmp_path / "report")
-    assert invoke(["rollout", task, "--episodes", "4", "--max-steps", "12", "--out", release]).exit_code == 0
+    made = ["rollout", task, "--episodes", "4", "--max-steps", "12", "--no-pixels", "--out", release]
+    assert invoke(made).exit_code == 0
     asked = ["--profile", "smoke", "--agents", "bc,state-bc", "--train-unsound", "--out", report]
     told = invoke(["validate", release, *asked]).output.splitlines()
     scores = [place for place, line in enumerate(told) if "[smoke]" in line]
     training = [place for place, line in enumerate(told) if re.match(r".*bc.*%\|", line)]
     assert len(scores) == 2 and scores[0] < max(training), told
+    assert any(line.startswith(f"images of {task}/") and ", 100%: " in line for line in told), told
+
+
+def test_time_in_which_nothing_can_be_counted_says_nothing_of_the_rate(monkeypatch):
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0)
+    now = [0.0]
+    bar = progress.ProgressBar(total=1000, unit=" steps", file=io.StringIO())
+    monkeypatch.setattr(bar, "_time", lambda: now[0])
+    bar.start_t = bar.last_print_t = 0.0
+    for second in range(100):
+        now[0] = float(second)
+        bar.advance(f"images of walker, {second}%", 0)
+    for second in range(100, 110):
+        now[0] = float(second)
+        bar.advance("bc on walker", 5)
+    assert bar.format_dict["rate"] == pytest.approx(5, rel=0.3) and bar.n == 50
+    bar.close()
 
 
 def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
