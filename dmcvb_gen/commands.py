@@ -4,6 +4,7 @@ The options of a command are made from its function: types and defaults from the
 docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resumes if it is made again.
 """
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -441,6 +442,13 @@ def export(
         return run(str(release), to, out, as_names(only), episodes, tick=bar, **given)
 
 
+TRAINING = (
+    *("benchmarks", "agents", "profile", "scale", "seed", "train_unsound"),
+    *("threads", "device", "precision", "compile", "dino_weights"),
+)
+"""Options of `validate` that say what is trained, and how."""
+
+
 def validate(
     release: Location,
     *,
@@ -488,7 +496,12 @@ def validate(
     Raises:
       DmcvbError: there is no release, a name is unknown, or the release has no data for a benchmark.
     """
-    options = locals()
+    from dmcvb_gen.agents.catalog import split_agents
+
+    options = locals() | {"agents": split_agents(agents) if isinstance(agents, str) else as_names(agents)}
+    if checks_only:
+        usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
+        _refuse("checks_only trains nothing", **{name: options[name] != usual[name] for name in TRAINING})
     return run_validation(validation_setup(options), options)
 
 
@@ -503,6 +516,8 @@ def validation_setup(options: Mapping[str, Any]) -> "Setup":
     chosen = [parse_agent(agent) for agent in agents]
     if options["dino_weights"] is not None and not any(agent.ready_encoder for agent in chosen):
         raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
+    if options["dino_weights"] is None and any(agent.ready_encoder for agent in chosen):
+        raise DmcvbError(next(agent.ready_encoder.missing for agent in chosen if agent.ready_encoder))
     benchmarks = () if options["checks_only"] else as_names(options["benchmarks"])
     plan_validation(release, benchmarks, agents, as_names(options["only"]))  # tells mistakes before precision is timed
     given = {name: options[name] for name in ("out", "profile", "scale", "threads", "device", "precision", "compile")}

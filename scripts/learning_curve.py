@@ -39,6 +39,7 @@ from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, get_profile
 from dmcvb_gen.dataset import Subset, open_release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.painted import Painting, painted_release
+from dmcvb_gen.progress import ProgressBar
 
 COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
 
@@ -210,13 +211,16 @@ def main() -> None:
         parser.error(str(error))
     keep_options(options, parser)  # after what may refuse them
     pixels = not agent.sees_state
-    data = load_data([Source(subset)], pixels=pixels, seed=options.seed, stack=agent.stack, device=options.device)
+    chosen = {"pixels": pixels, "seed": options.seed, "stack": agent.stack, "device": options.device}
+    with ProgressBar(pixels, total=100, unit=" %", desc="images") as bar:
+        data = load_data([Source(subset)], **chosen, tick=lambda share: bar.update(int(100 * share) - bar.n))
     torch.manual_seed(options.seed)
     learner = scene.policy(data.sizes).to(options.device)
     done = [0]
 
     def count(steps: int) -> None:
         done[0] += steps
+        bar.update(steps)
 
     def say(step: int, score: dict[str, float]) -> None:
         of = f"{step:>9,} of {settings.steps:,} steps"
@@ -251,7 +255,8 @@ def main() -> None:
         compile=options.compile,
         workers=0 if options.device == "cpu" else 1,
     )
-    curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
+    with ProgressBar(total=steps, unit=" steps", desc="training") as bar:
+        curve = train(learner, data, settings, seed=options.seed, folder=options.folder, evaluate=evaluate, tick=count)
     if beside:
         scores = beside.finish()
         curve = [point | scores.get(point["step"], {}) for point in curve]

@@ -53,6 +53,12 @@ def option_names() -> tuple[str, ...]:
     return tuple(sorted("sample" if name == "sample_k" else name for name in names))
 
 
+def split_agents(text: str) -> tuple[str, ...]:
+    """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between agents and between their options."""
+    separator = rf",(?!\s*(?:\w+=|(?:{'|'.join(option_names())})\b))"
+    return tuple(name.strip() for name in re.split(separator, text) if name.strip())
+
+
 @dataclass(frozen=True)
 class Agent:
     """An agent.

@@ -438,12 +438,17 @@ def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
     order = np.random.default_rng(seed).permutation(len(names))
     count = min(source.episodes or part_count(source.share, len(names)), len(names))
     few = source.episodes is not None or source.goal_pair is not None
-    out = 0 if few else min(math.ceil(HOLD_OUT * count), count - 1)
+    out = 0 if few else count - training_episodes(count)
     chosen = order[:count]
     held = np.zeros(count, bool)
     held[:out] = True
     by_name = np.argsort(names[chosen])
     return names[chosen][by_name], held[by_name]
+
+
+def training_episodes(count: int) -> int:
+    """Episodes of `count` that agents learn from; the others are held out."""
+    return count - min(math.ceil(HOLD_OUT * count), count - 1)
 
 
 def default_memory(device: str = "cpu") -> int:
@@ -494,4 +499,4 @@ def load_data(
     return TrainingData(table, np.concatenate(held_out), stack, returns, device)
 
 
-__all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data"]
+__all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data", "training_episodes"]

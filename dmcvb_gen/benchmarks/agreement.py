@@ -70,6 +70,8 @@ def shared_cells(results: Iterable[Mapping[str, Any]]) -> list[Pair]:
         data = paper_score(task, label, setting, "data")
         if not (result["profile"]["scores"] and result.get("paper") and data) or result["data"]["mean"] <= 0:
             continue
+        if result["score"].get("limit") != result["data"].get("limit"):
+            continue  # returns of episodes that were cut elsewhere
         returns = np.array(result["score"]["returns"]) / result["data"]["mean"]
         paper = result["paper"]["mean"] / data[0]
         found.setdefault((task, f"{label} {setting} {cell['agent_name']}"), ([], paper))[0].append(returns)

@@ -64,7 +64,7 @@ def check_policy_returns(subset: Subset) -> Iterator[Issue]:
     That was over random starts and goals, in the policy's own maze, with the task's own time limit: episodes of fixed
     ones, in other mazes or of other length return what those are worth.
     """
-    if not _comparable(subset):
+    if not comparable(subset):
         return
     behaviour = subset.read("behaviour")
     for index, policy in enumerate(subset.record.policies):
@@ -86,7 +86,7 @@ def check_policy_returns(subset: Subset) -> Iterator[Issue]:
             )
 
 
-def _comparable(subset: Subset) -> bool:
+def comparable(subset: Subset) -> bool:
     """Return True if returns belong to episodes like those of the policies' evaluation and of the paper's tables."""
     return subset.setting != FIXED and subset.record.max_steps == get_task(subset.task).max_steps
 
@@ -94,7 +94,7 @@ def _comparable(subset: Subset) -> bool:
 def check_paper_returns(subset: Subset) -> Iterator[Issue]:
     """Warn if the mean return is not near the paper's table."""
     paper, expert = paper_returns(subset.task, subset.level), paper_returns(subset.task, "expert")
-    if not paper or not len(subset.returns) or not _comparable(subset):
+    if not paper or not len(subset.returns) or not comparable(subset):
         return
     if subset.record.goal_mode is not None:
         scale = abs(paper_returns(subset.task, "medium")["mean"] - expert["mean"])

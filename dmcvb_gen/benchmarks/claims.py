@@ -93,7 +93,8 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
         try:
             facts = json.loads(path.read_text())
             release = "{name} {version}".format(**facts["release"])
-            profiles[facts["profile"]["name"]] = folder
+            if facts["results"]:
+                profiles[facts["profile"]["name"]] = folder
             for result in facts["results"]:
                 results[result["fingerprint"]] = result
                 place = _place(result)

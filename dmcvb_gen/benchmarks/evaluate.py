@@ -368,7 +368,7 @@ def evaluate(
       backgrounds: "builtin" or a folder of videos.
       split: videos and maze styles to show: "val", as `validate` does, or "train", those of the data. The difference of
         the two scores is what a policy loses on distractors that it has not seen.
-      max_steps: cut episodes short.
+      max_steps: cut episodes short; they never last longer than in `validate`.
 
     Returns:
       A `Score`: mean, stderr and returns; of mazes also success and speed.
@@ -376,8 +376,12 @@ def evaluate(
     Raises:
       DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave [-1, 1].
     """
-    if episodes < 1 or stack < 1:
-        raise DmcvbError(f"episodes={episodes}, stack={stack}: give at least 1 of each")
+    counts = {"episodes": episodes, "stack": stack, "threads": threads}
+    counts |= {} if max_steps is None else {"max_steps": max_steps}
+    for name, number in (counts | {"seed": seed}).items():
+        least = int(name in counts)
+        if not isinstance(number, int | np.integer) or number < least:
+            raise DmcvbError(f"{name} is {number}; give a whole number, at least {least}")
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
     shown = dict(size=size, renderer=renderer, samples=samples, backgrounds=backgrounds, split=split)

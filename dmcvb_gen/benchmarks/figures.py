@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen.benchmarks.agreement import Pair
-from dmcvb_gen.benchmarks.checks import known_returns
+from dmcvb_gen.benchmarks.checks import comparable, known_returns
 from dmcvb_gen.benchmarks.suites import Cell
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.spec import FIXED, task_folder
+from dmcvb_gen.spec import task_folder
 
 DPI = 110
 COLUMNS = 3
@@ -74,7 +74,7 @@ def _return_figure(release: Release, known: Mapping[str, np.ndarray]) -> Figure:
         shown = name if len(name) <= NAME_BREAK else name.replace("/", "\n", 1)
         axis.set_title(shown, fontsize=9)
         axis.set(xlabel="return", ylabel="a mark an episode" if few else "episodes")
-        paper = None if subset.setting == FIXED else paper_returns(subset.task, subset.level)
+        paper = paper_returns(subset.task, subset.level) if comparable(subset) else None
         if paper:
             low = -0.12 * axis.get_ylim()[1]
             axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
@@ -184,14 +186,18 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
         ["dmcvb-gen", "rollout", "--recipe", release["name"], *([] if release.get("pixels", True) else ["--no-pixels"])]
     )
     made_of = Release(**{key: release[key] for key in ("name", "version", "digest")}, command=command)
-    rows = [
+    entries = [
         (_row_of(result, facts, made_of), _policy_of(result, folder))
         for result in facts["results"]
         if result.get("evaluation") and result["evaluation"]["goals"] is None
     ]
-    if not rows:
+    if not entries:
         raise DmcvbError(f"{folder} holds no cell that can be evaluated again; B3's goals are a release's own")
-    return {row.name: (row, path) for row, path in rows}
+    rows: dict[str, tuple[Row, Path | None]] = {}
+    for row, path in entries:  # a cell of several benchmarks is one row: the first that the paper has, too
+        if row.name not in rows or (row.paper is not None and rows[row.name][0].paper is None):
+            rows[row.name] = (row, path)
+    return rows
 
 
 def _policy_of(result: dict[str, Any], report: Path) -> Path | None:
@@ -335,8 +341,14 @@ def check_row(folder: str | Path, row: Row, evaluate: Callable[..., Any] | None 
 # -- the page -------------------------------------------------------------------------------------
 
 
-def render_page(rows: Sequence[Row], title: str = "Leaderboard") -> str:
-    """The page of some rows, as Markdown: a table for each task and setting, and the commands below it."""
+def render_page(
+    rows: Sequence[Row], title: str = "Leaderboard", folder: str = "docs/leaderboard", links: str = "leaderboard"
+) -> str:
+    """The page of some rows, as Markdown: a table for each task and setting, and the commands below it.
+
+    Args:
+      folder: the rows' folder, for commands. links: the same as seen from the page.
+    """
     source = resources.files("dmcvb_gen.benchmarks").joinpath("data/leaderboard.md.jinja").read_text()
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
@@ -344,9 +356,12 @@ def render_page(rows: Sequence[Row], title: str = "Leaderboard") -> str:
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(f"{row.task}/{row.setting}", []).append(row)
-    return environment.from_string(source).render(title=title, groups=groups)
+    return environment.from_string(source).render(
+        title=title, groups=groups, folder=shlex.quote(folder), links=quote(links)
+    )
 
 
-def write_page(path: str | Path, rows: Sequence[Row]) -> None:
-    """Write `render_page` into a file."""
-    write_text(Path(path), render_page(rows))
+def write_page(path: str | Path, rows: Sequence[Row], folder: str | Path) -> None:
+    """Write `render_page` of a folder's rows into a file."""
+    links = os.path.relpath(folder, Path(path).parent)
+    write_text(Path(path), render_page(rows, folder=str(folder), links=Path(links).as_posix()))

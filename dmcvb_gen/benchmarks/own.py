@@ -1,8 +1,9 @@
 """Load your own agents ("module:name") for a validation.
 
-The name is that of a ready policy, or of a function whose only parameter is called `data`: it gets the episodes that a
-cell learns from (`AgentData`) and returns a policy. A policy is a callable as `dmcvb_gen.evaluate` takes it. Two
-attributes of the named object, if it has them, say what its policy sees: `stack` (frames, 3) and `pixels` (True).
+The name is that of a ready policy, or of a function or class whose first parameter is called `data` and whose others
+have defaults: it gets the episodes that a cell learns from (`AgentData`) and makes a policy. A policy is a callable as
+`dmcvb_gen.evaluate` takes it. Two attributes of the named object, if it has them, say what its policy sees: `stack`
+(frames, 3) and `pixels` (True).
 """
 
 from __future__ import annotations
@@ -67,17 +68,20 @@ class OwnAgent:
             raise DmcvbError(f"cannot load agent {name} ({error}); give MODULE:NAME, run from its folder") from None
         if not callable(value):
             raise DmcvbError(f"agent {name} is a {type(value).__name__}; expected a policy or a function of `data`")
-        return cls(name, value)
+        agent = cls(name, value)
+        if isinstance(value, type) and not agent.learns:
+            raise DmcvbError(f"agent {name} is a class; expected a policy, or a function or class of `data`")
+        return agent
 
     @property
     def learns(self) -> bool:
-        """True if it is a function of data that returns a policy."""
-        if isinstance(self.value, type):
-            return False
+        """True if it makes a policy of data."""
         try:
-            return list(inspect.signature(self.value).parameters) == ["data"]
+            first, *others = inspect.signature(self.value).parameters.values()
         except (TypeError, ValueError):
             return False
+        optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        return first.name == "data" and all(o.default is not o.empty or o.kind in optional for o in others)
 
     @property
     def stack(self) -> int:

@@ -19,7 +19,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
-from dmcvb_gen.benchmarks.checks import Structure, known_returns
+from dmcvb_gen.benchmarks.checks import Structure, comparable, known_returns
 from dmcvb_gen.benchmarks.claims import claim_words, judge
 from dmcvb_gen.benchmarks.figures import (
     agreement_figures,
@@ -37,9 +37,9 @@ from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
-from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_returns, paper_task
+from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.spec import FIXED, task_folder
+from dmcvb_gen.spec import is_maze, task_folder
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import pluralize
 from dmcvb_gen.version import __version__
@@ -121,7 +121,7 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
         "warnings": [dataclasses.asdict(finding) for finding in warnings],
         "returns": {
             name: return_statistics(returns)
-            | {"paper": None if subset.setting == FIXED else paper_returns(subset.task, subset.level)}
+            | {"paper": paper_returns(subset.task, subset.level) if comparable(subset) else None}
             for name, returns in known_returns(release).items()
             for subset in [release[name]]
         },
@@ -329,11 +329,13 @@ def _groups(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     groups: dict[tuple, list[Mapping[str, Any]]] = {}
     for result in results:
         cell = result["cell"]
-        if paper_task(cell["task"]) not in MAZE_GROUPS.values() or not result["profile"]["scores"]:
+        if not is_maze(cell["task"]) or not result["profile"]["scores"]:
             continue
-        group, layouts = BENCHMARKS.get(cell["benchmark"]).group(cell["task"], cell["policy_label"])
+        group = BENCHMARKS.get(cell["benchmark"]).group(cell["task"], cell["policy_label"])
+        if group is None:
+            continue
         encoder = f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else ""
-        key = (cell["benchmark"], group, layouts, cell["setting"], cell["agent_name"] + encoder)
+        key = (cell["benchmark"], *group, cell["setting"], cell["agent_name"] + encoder)
         groups.setdefault(key, []).append(result)
     rows = []
     for key, members in groups.items():

@@ -15,7 +15,7 @@ from typing import Any
 from dmcvb_gen.agents.catalog import Agent, parse_agent
 from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.policies.paper import paper_task
+from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task
 from dmcvb_gen.registry import Registry
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import DISTRACTOR_KINDS, FIXED, LEVELS, VISIBLE, is_maze, subset_name
@@ -235,9 +235,10 @@ class Benchmark(abc.ABC):
         """Return True if another cell of the same task is that reference."""
         return (other.setting, other.agent.name, other.policy_label) == (_whole_setting(cell), "bc", "expert")
 
-    def group(self, task: str, policy_label: str) -> tuple[str, str]:
-        """(mazes, policy learns from) of the maze cells that the report takes the mean of."""
-        return paper_task(task), policy_label
+    def group(self, task: str, policy_label: str) -> tuple[str, str] | None:
+        """(mazes, policy learns from) of the maze cells that the report takes the mean of; None: of others."""
+        row = paper_task(task)
+        return (row, policy_label) if row in MAZE_GROUPS.values() else None
 
     def warnings(self, release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
         """List what makes its scores say less than they seem to."""

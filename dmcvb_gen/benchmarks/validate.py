@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import math
+import json
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from dmcvb_gen.agents.catalog import parse_agent
+from dmcvb_gen.agents.data import training_episodes
 from dmcvb_gen.agents.networks import encoder_product
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
@@ -187,6 +188,7 @@ def validate(
         asked = [replace(one, subsets=tuple(n for n in one.subsets if matches(n, patterns))) for one in missing]
         missing = [one for one in asked if one.subsets or one.left_out]
     check_writable(setup.out)
+    _check_kept_scores(setup, training=bool(cells))
     structure = check_structure(chosen, setup.backgrounds, progress.checking, workers)
     results = []
     if structure.sound or train_unsound:
@@ -276,6 +278,20 @@ def check_writable(folder: str | Path) -> None:
         raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
 
 
+def _check_kept_scores(setup: Setup, training: bool) -> None:
+    """Raises DmcvbError if the report's folder has scores that this run would replace by others."""
+    path = local_path(setup.out) / "report.json"
+    try:
+        facts = json.loads(path.read_text())
+        kept = facts["profile"]["name"], facts["settings"]["seed"]
+        scored = bool(facts["results"]) and facts["profile"]["scores"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # no report of ours, or noise
+    if scored and not (training and kept == (setup.profile.name, setup.seed)):
+        name, seed = kept
+        raise DmcvbError(f"{setup.out} holds scores of profile {name}, seed {seed}; give another --out")
+
+
 def _benchmark_warnings(release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
     for name in dict.fromkeys(cell.benchmark for cell in cells):
         yield from BENCHMARKS.get(name).warnings(release, [cell for cell in cells if cell.benchmark == name])
@@ -302,18 +318,27 @@ def _few_warnings(profile: Profile, results) -> list[Issue]:
     found = {}
     for cell, result in results:
         agent, seen = cell.agent, result.get("transitions")
-        end_to_end = not (agent.sees_state or agent.own or agent.pretrain)
+        end_to_end = not (agent.sees_state or agent.own or agent.pretrain) and len(cell.policy) == 1
         if not (seen and end_to_end and profile.scores and profile.shift_from and cell.benchmark == "b1"):
             continue
         if profile.shifts(profile.pixel_steps, seen):
             passes = profile.pixel_steps * profile.batch_size / seen
-            needed = math.floor(result["episodes"] * passes / profile.shift_from) + 1
+            needed = _unshifted(profile, seen, result["episodes"])
             subset = cell.policy[0].subset
             found[subset] = (
                 f"{profile.name} passes {passes:.0f} times over {pluralize(result['episodes'], 'episodes')}, so it "
                 f"shifts their images and learns more slowly; with {needed:,} episodes or more it does not"
             )
     return [Issue("learning", subset, text) for subset, text in found.items()]
+
+
+def _unshifted(profile: Profile, transitions: int, episodes: int) -> int:
+    """The fewest episodes of that length of which a training's share is enough not to shift pictures."""
+    each = transitions / training_episodes(episodes)
+    needed = episodes
+    while profile.shifts(profile.pixel_steps, int(training_episodes(needed) * each)):
+        needed += 1
+    return needed
 
 
 def _learning_warnings(setup: Setup, results) -> list[Issue]:

@@ -58,7 +58,7 @@ def leaderboard(context, folder, reports, patterns, data_command, check, names, 
             click.echo(f"{folder}: added {pluralize(len(added), 'rows')} of {report}.")
     rows = read_rows(folder, names)
     if page:
-        write_page(page, rows)
+        write_page(page, rows, folder)
         if not as_json:
             click.echo(f"Wrote {page}.")
     checks = []

@@ -194,13 +194,11 @@ def parse_bytes(flag: str, text: str) -> int:
 
 def split_names(flag: str, text: str) -> tuple[str, ...]:
     """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between names and in agents' options."""
-    options = ""
     if ":" in text:  # agents are not loaded for less
-        from dmcvb_gen.agents.catalog import option_names
+        from dmcvb_gen.agents.catalog import split_agents
 
-        options = "|".join(option_names())
-    separator = rf",(?!\s*(?:\w+=|(?:{options})\b))" if options else ","
-    return tuple(name.strip() for name in re.split(separator, text) if name.strip())
+        return split_agents(text)
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 FORMATS: dict[str | None, Callable[[str, str], Any]] = {

@@ -16,12 +16,6 @@ from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
-TRAINING = (
-    *("benchmarks", "agents", "own", "profile", "scale", "seed"),
-    *("train_unsound", "threads", "device", "precision", "compile", "dino_weights"),
-)
-"""Options of `validate` that say what is trained, and how."""
-
 
 @command_of(commands.validate)
 @click.option("--agent", "own", multiple=True, metavar="MODULE:NAME", help="Also score your own agent. Repeatable.")
@@ -38,7 +32,7 @@ def validate(own, strict, as_json, **options):
     """
     context = click.get_current_context()
     if options["checks_only"]:
-        refuse(context, TRAINING, "--checks-only trains nothing")
+        refuse(context, (*commands.TRAINING, "own"), "--checks-only trains nothing")
     options["agents"] = _agents(options["agents"], own)
     from dmcvb_gen.benchmarks.setup import kept_precision
 

@@ -117,9 +117,16 @@ class Scene:
                 raise DmcvbError(
                     f"an environment has no {modality}: the next frame is not known yet; remove {modality}"
                 )
+        if self.views is not None and not len(self.views):
+            raise DmcvbError("views is empty; leave it out for all of them")
+        if self.difficulty and not maze:
+            named = SubsetSpec.parse(self.task, "random", self.distractor).distractor
+            if self.distractor != named.kind and self.spec().distractor != named:
+                raise DmcvbError(f"{self.distractor} has its difficulty; remove difficulty={self.difficulty!r}")
         if self.goal and not maze:
             raise DmcvbError(f"{self.task} has no goal in its images; remove goal")
-        for name, number in (("max_steps", self.max_steps), ("threads", self.threads)):
+        counts = {"max_steps": self.max_steps, "threads": self.threads, "fixed_goals": self.fixed_goals}
+        for name, number in counts.items():
             if number is not None and (not isinstance(number, int | np.integer) or number < 1):
                 raise DmcvbError(f"{name} is {number}; give a whole number, at least 1")
         spec = self.spec()
@@ -191,6 +198,10 @@ class _Stage:
             values, (low, high) = (self.size, self.size, len(self.pictures.views), *modality.shape), modality.bounds
             observation[modality.name] = spaces.Box(low, high, values, np.dtype(modality.dtype).type)
         return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+
+    def info(self) -> dict[str, np.ndarray]:
+        """Of mazes under "fixed", the pair of start and goal in each place, (place,) int."""
+        return {"goal_pair": self.goal_pair.copy()} if self.pairs else {}
 
     def start(self, places: Iterable[int], seeds: Sequence[int]) -> None:
         """Start the next episode of some places, from the streams of their seeds."""
@@ -334,7 +345,7 @@ class DistractedEnv(gymnasium.Env):
         return observation
 
     def _info(self) -> dict[str, int]:
-        return {"goal_pair": int(self._stage.goal_pair[0])} if self._stage.pairs else {}
+        return {name: int(values[0]) for name, values in self._stage.info().items()}
 
     def render(self) -> np.ndarray | None:
         """The picture of the current frame (its first view), (size, size, 3) uint8."""
@@ -382,7 +393,7 @@ class DistractedVectorEnv(VectorEnv):
             self._stage.started[:] = 0
         self._stage.start(range(self.num_envs), self._seeds)
         self._ended[:] = False
-        return self._stage.observe(), {}
+        return self._stage.observe(), self._info()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict]:
         if self._seeds is None:
@@ -393,7 +404,12 @@ class DistractedVectorEnv(VectorEnv):
             self._stage.start(places, [self._seeds[place] for place in places])
         reward, terminated, truncated = self._stage.step(actions, ~restarted)
         self._ended = terminated | truncated
-        return self._stage.observe(), reward, terminated, truncated, {}
+        return self._stage.observe(), reward, terminated, truncated, self._info()
+
+    def _info(self) -> dict[str, np.ndarray]:
+        """What a single environment tells, and for each name, as Gymnasium has it, which places do: all."""
+        told = self._stage.info()
+        return told | {f"_{name}": np.ones(self.num_envs, bool) for name in told}
 
     def close_extras(self, **kwargs: Any) -> None:
         self._stage.renderer.close()

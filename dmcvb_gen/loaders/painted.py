@@ -26,7 +26,7 @@ from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.jobs import stream_names
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
-from dmcvb_gen.rendering.base import Renderer
+from dmcvb_gen.rendering.base import Renderer, check_size
 from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import quoted
@@ -61,6 +61,18 @@ class Painting:
     def __post_init__(self) -> None:
         if self.distractors not in DISTRACTORS:
             raise DmcvbError(f"distractors={self.distractors!r} is unknown; give one of {', '.join(DISTRACTORS)}")
+        if self.size is not None:
+            check_size(self.size)
+
+
+def _without_ellipsis(selection: Any, dimensions: int) -> tuple:
+    """An index of an array of that many dimensions, with its `...` written out."""
+    parts = list(selection) if isinstance(selection, tuple) else [selection]
+    for place, part in enumerate(parts):
+        if part is Ellipsis:
+            parts[place : place + 1] = [slice(None)] * (dimensions - len(parts) + 1)
+            break
+    return tuple(parts) or (slice(None),)
 
 
 class PaintedArray:
@@ -74,7 +86,7 @@ class PaintedArray:
         self.dimensions = ("episode", "step", "height", "width", "channel")
 
     def __getitem__(self, selection: Any) -> np.ndarray:
-        first, *rest = selection if isinstance(selection, tuple) else (selection,)
+        first, *rest = _without_ellipsis(selection, self.ndim)
         episodes = np.arange(self.shape[0])[first]
         if np.ndim(episodes) == 0:
             return self._subset.painted(int(episodes), [self.name])[self.name][tuple(rest)]

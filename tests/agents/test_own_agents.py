@@ -14,6 +14,7 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.own import OwnAgent
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -174,6 +175,33 @@ def test_what_an_agent_learns_from_is_what_it_sees_when_it_is_scored(kind, reque
     assert not facts["failed"], facts["failed"]
     seeing = [one for one in facts["results"] if "seeing" in one["cell"]["agent_name"]]
     assert seeing and all("renderer" in one["evaluation"] for one in seeing), result.output
+
+
+class Learner:
+    """A class whose objects are policies that learned from data."""
+
+    def __init__(self, data, rate=0.1):
+        self.tasks = data
+
+    def __call__(self, observation):
+        return np.zeros((len(observation["state"]), 6))
+
+
+def test_a_class_or_a_function_with_defaults_may_learn_and_other_classes_are_refused():
+    assert OwnAgent("m:Learner", Learner).learns and isinstance(OwnAgent("m:Learner", Learner).policy("data"), Learner)
+    assert OwnAgent("m:f", lambda data, k=3: None).learns and not OwnAgent("m:p", lambda observation: None).learns
+    assert not OwnAgent("m:g", lambda data, k: None).learns
+    with pytest.raises(DmcvbError, match="is a class; expected a policy, or a function or class of `data`"):
+        OwnAgent.load("pathlib:Path")
+
+
+@pytest.mark.parametrize("option", [dict(max_steps=-1), dict(max_steps=2.5), dict(episodes=2.5), dict(threads=-3)])
+def test_numbers_that_count_nothing_are_refused(option):
+    for where in ("walker-walk/none", "ant-maze-empty7x7/visible"):
+        with pytest.raises(DmcvbError, match=f"{next(iter(option))} is .*; give a whole number, at least 1"):
+            dmcvb_gen.evaluate(lambda observation: None, where, pixels=False, **option)
+    with pytest.raises(DmcvbError, match="seed is -1; give a whole number, at least 0"):
+        dmcvb_gen.evaluate(lambda observation: None, "walker-walk/none", seed=-1)
 
 
 @pytest.mark.parametrize("name, told", [("own_agnts:still", "cannot load"), ("bc", "--agents")])

@@ -224,6 +224,14 @@ def test_seeds_that_fall_at_the_same_starts_make_no_interval_narrower():
     assert interval(0.3, -0.3) == (1.0, 1.0)  # what one seed loses at a start, the other one wins
 
 
+def test_returns_of_episodes_that_were_cut_elsewhere_are_not_ranked():
+    cells = [beside("walker-walk", agent, 0.5, 500) for agent in ("bc", "id+bc", "ae+bc")]
+    assert len(shared_cells(cells)) == 3
+    for cell in cells:
+        cell["score"]["limit"], cell["data"]["limit"] = 500, 30
+    assert not shared_cells(cells)
+
+
 def test_noise_and_cells_that_the_paper_lacks_are_not_ranked():
     cells = [beside("walker-walk", agent, 0.5, 500, scores=False) for agent in ("bc", "id+bc", "ae+bc")]
     assert not shared_cells(cells)

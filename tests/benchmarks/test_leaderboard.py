@@ -144,11 +144,23 @@ def test_the_command_adds_shows_and_writes(mazes, tmp_path):
     assert done.exit_code == 0, done.output
     (row,) = read_rows(board)
     assert row.task == TINY_MAZE and f"{board}: added 1 row of {mazes}." in done.output
-    assert page.read_text() == render_page([row])
+    assert page.read_text() == render_page([row], folder=str(board), links="board")
+    assert (tmp_path / f"board/{row.name}.json").exists() and f"](board/{row.name}.json)" in page.read_text()
     shown = run(main, ["leaderboard", str(board)])
     assert shown.exit_code == 0 and "state-td3-bc" in shown.output
     told = json.loads(run(main, ["leaderboard", str(board), "--check", "--json"]).output)
     assert [one["holds"] for one in told] == [True] and told[0]["name"] == row.name
+
+
+def test_a_cell_of_two_benchmarks_is_one_row_with_the_papers_score(walkers, tmp_path):
+    facts = facts_of(walkers)
+    ours = next(one for one in facts["results"] if one["cell"]["agent_name"] == "state-bc")
+    beside_paper = ours | {"paper": {"mean": 38.0, "stderr": 3.0}}
+    again = ours | {"cell": ours["cell"] | {"benchmark": "ablations"}, "paper": None}
+    for results in ([beside_paper, again], [again, beside_paper]):
+        (tmp_path / "report.json").write_text(json.dumps(facts | {"results": results}))
+        ((row, _),) = rows_of_report(tmp_path).values()
+        assert row.paper == 38.0 and "--benchmark b1" in row.command
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import re
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,16 +22,26 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from dmcvb_gen.agents.data import training_episodes
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
+from dmcvb_gen.benchmarks.profiles import get_profile
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, render_tables
 from dmcvb_gen.benchmarks.suites import plan_benchmark
-from dmcvb_gen.benchmarks.validate import _seen_warnings, only
+from dmcvb_gen.benchmarks.validate import (
+    _check_kept_scores,
+    _seen_warnings,
+    _unshifted,
+    make_setup,
+    only,
+    validate,
+)
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.dataset.writer import commit_path, finish_release
+from dmcvb_gen.errors import DmcvbError
 from tests.conftest import maze_recipe, rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/expert/dynamic"
@@ -214,6 +226,28 @@ def test_a_wrong_name_is_told_before_the_precision_is_timed(small_release, words
     assert result.exit_code == 2 and result.output.count("\n") == 1 and "compute in" not in result.output
 
 
+@pytest.mark.parametrize("scores", [True, False])
+def test_scores_are_not_replaced_by_those_of_another_run(small_release, tmp_path, scores):
+    facts = {"profile": {"name": "quick", "scores": scores}, "settings": {"seed": 0}, "results": [{}]}
+    (tmp_path / "report.json").write_text(json.dumps(facts))
+    plan = make_setup(small_release, out=tmp_path, training=False)
+    with contextlib.nullcontext() if not scores else pytest.raises(DmcvbError, match="quick, seed 0; give another"):
+        validate(small_release, plan, benchmarks=())
+    again = replace(plan, profile=replace(plan.profile, name="quick"))
+    _check_kept_scores(again, training=True)  # the same command goes on
+    if scores:
+        with pytest.raises(DmcvbError, match="holds scores"):
+            _check_kept_scores(replace(again, seed=1), training=True)
+
+
+@pytest.mark.parametrize("steps, held", [(500, 100), (37, 5), (500, 1)])
+def test_the_episodes_that_are_enough_are_enough_and_no_fewer(steps, held):
+    profile = get_profile("quick").scaled(8)
+    needed = _unshifted(profile, steps * training_episodes(held), held)
+    shifts = [profile.shifts(profile.pixel_steps, steps * training_episodes(count)) for count in (needed - 1, needed)]
+    assert shifts == [True, False]
+
+
 def test_subsets_left_out_by_only_are_called_so_and_not_missing(small_release, tmp_path):
     result = run(
         *("validate", small_release, "--only", "walker-walk/random/none", "--agents", "state-bc", "--threads", 1),
@@ -237,6 +271,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--agents", "bc:k=5"), "'k=5' is an option of id: remove it"),
         ((release, "--checks-only", "--agents", "bc"), "--checks-only trains nothing; remove it"),
         ((release, "--checks-only", "--benchmark", "b2"), "--benchmark has no effect"),
+        ((release, "--agents", "dino+bc"), "--dino-weights"),
         ((release, "--only", "cheetah-run/*"), NAME),
         ((tmp_path,), "no release"),
     ):

@@ -195,6 +195,8 @@ def test_pictures_painted_on_reading_are_the_stored_ones(made, which):
     for name, subset in stored.subsets.items():
         for array in subset.pixel_arrays:
             assert np.array_equal(fresh[name].read(array), subset.read(array)), (name, array)
+            for index in np.s_[..., 0], np.s_[..., 0:1], np.s_[0, ..., 1], np.s_[:1, 2], np.s_[...]:
+                assert np.array_equal(fresh[name].array(array)[index], subset.array(array)[index]), (array, index)
         one, other = (next(iter(s.batches(4, seed=1))) for s in (subset, fresh[name]))
         assert all(np.array_equal(one[key], other[key]) for key in one)
 

@@ -176,7 +176,8 @@ def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     env.unwrapped._stage.pictures = env.unwrapped._stage.pictures.__class__(("top",), hide_goal=False)
     assert (env.unwrapped._stage.observe()["pixels"][0] != observation["pixels"]).any()  # it was hidden
     vector = gymnasium.make_vec(f"dmcvb_gen/{maze}-fixed-v0", 2, goal_pair=1, goal_seed=3, views=views, **SMALL)
-    states, _ = vector.reset(seed=0)
+    states, told = vector.reset(seed=0)
+    assert told["goal_pair"].tolist() == [1, 1] and told["_goal_pair"].all()
     for state in states["state"]:
         goal = task.layout.grid(state[task.state_slices["target_position"]][None, :2])[0]
         assert tuple(int(x) for x in np.rint(goal)) == pairs[1][1]
@@ -247,6 +248,14 @@ def test_mistakes_are_answered():
     for made in (lambda **options: DistractedVectorEnv(1, "walker-walk", **options), DistractedEnv):
         with pytest.raises(DmcvbError, match="unknown option of environments 'siz'. Did you mean 'size'?"):
             made(**({"task": "walker-walk"} if made is DistractedEnv else {}), siz=16)
+    for name in ("dynamic_hard", "dynamic_0.35"):
+        with pytest.raises(DmcvbError, match="has its difficulty; remove difficulty='easy'"):
+            DistractedEnv("walker-walk", name, difficulty="easy")
+    for number in (0, -1):
+        with pytest.raises(DmcvbError, match=f"fixed_goals is {number}"):
+            DistractedEnv("ant-maze-empty7x7", "fixed", fixed_goals=number)
+    with pytest.raises(DmcvbError, match="views is empty"):
+        DistractedEnv("ant-maze-empty7x7", "visible", views=())
     with pytest.raises(DmcvbError, match="remove difficulty"):
         DistractedEnv("ant-maze-empty7x7", "visible", difficulty="hard")
     with pytest.raises(DmcvbError, match="remove goal"):
