@@ -15,6 +15,8 @@ from typing import Any
 from dmcvb_gen.agents.catalog import Agent, parse_agent
 from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.dataset import Release
+from dmcvb_gen.generate.inputs import BUILTIN, video_source
+from dmcvb_gen.policies.bundled import bundled_levels
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task
 from dmcvb_gen.registry import Registry
 from dmcvb_gen.release.issue import Issue
@@ -185,7 +187,7 @@ class SubsetFinder:
         settings = dict.fromkeys(setting for _, setting in have + lacking)
         counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
         count = max(counts, default=DEFAULT_EPISODES)
-        shape = self._shape(task)
+        shape = self._shape(task) + self._sources(task, levels)
         rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
         out = f"--out releases/{slug(benchmark)}"
         if not is_maze(task):
@@ -194,6 +196,12 @@ class SubsetFinder:
         asked = [f"--goal {setting}" for setting in goals] + [f"--episodes {count}"] * bool(goals)
         asked += [f"--fixed-goals {FIXED_GOALS}"] * (FIXED in settings)
         return f"{rollout} {' '.join(asked)}{shape} {out}"
+
+    def _sources(self, task: str, levels: Iterable[str]) -> str:
+        """Options for policies and videos that the package does not bring, with names to be filled in."""
+        sources = {video_source(self.release.root, r) for r in self._records.values() if r.task == task}
+        brought = {"random", *bundled_levels(task)}
+        return " --behaviour RUN" * (not set(levels) <= brought) + " --backgrounds FOLDER" * bool(sources - {BUILTIN})
 
     def _shape(self, task: str) -> str:
         """Options that give new subsets the images' size and the time limit of what there is of a task."""

@@ -125,6 +125,16 @@ def test_what_is_missing_gets_the_shape_of_what_is_there(task, setting):
     assert "--episodes 100 --size 32 --max-steps 60 --out" in missing.command
 
 
+def test_policies_and_videos_that_the_package_does_not_bring_are_to_be_given():
+    _, [missing] = plan_benchmark("b1", release_of("hopper-hop/random/none"))
+    assert "--level expert" in missing.command and " --behaviour RUN " in missing.command
+    _, [missing] = plan_benchmark("b1", release_of("walker-walk/expert/none"))
+    assert "--behaviour" not in missing.command and "--backgrounds" not in missing.command
+    videos = {"source": "/videos", "digest": "0" * 64}
+    _, [missing] = plan_benchmark("b1", release_of("walker-walk/expert/dynamic", shape=dict(backgrounds=videos)))
+    assert " --backgrounds FOLDER " in missing.command
+
+
 def test_subsets_that_the_user_left_out_are_not_said_to_be_missing():
     chosen = release_of("walker-walk/expert/none")
     _, [missing] = plan_benchmark("b1", chosen, left_out={"walker-walk/expert/static", "walker-walk/medium/none"})
