@@ -53,7 +53,7 @@ from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.storage import Storage, open_storage
 from dmcvb_gen.storage.base import in_parallel, unfinished
 from dmcvb_gen.storage.remote import local_path, storage_errors
-from dmcvb_gen.text import format_bytes
+from dmcvb_gen.text import format_bytes, quoted
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def fetch(
       tick: called with the bytes of each file.
 
     Raises:
-      StoreError: no release is there; a file has other bytes than its digest says; `out` holds something else;
-        there is no room; access is refused.
+      StoreError: no release is there, or it is `out` itself; a file has other bytes than its digest says; `out` holds
+        something else; there is no room; access is refused.
     """
     folder, source = local_path(out), Source.find(url, options)
     with Download.at(folder, source, only, episodes, workers, tick) as download:
@@ -195,7 +195,10 @@ class Source:
     def listed(self, path: str) -> FileRecord:
         """Return the index's entry of a file."""
         if path not in self._by_path:
-            raise StoreError(f"{self.place}/{INDEX} does not list {path}; publish the release again")
+            cure = "publish the release again"
+            if not self.manifest.complete:
+                cure = "finish the rollout there, or fetch what is there with --only and --episodes"
+            raise StoreError(f"{self.place}/{INDEX} does not list {path}; {cure}")
         return self._by_path[path]
 
     def metadata(self, records: Iterable[SubsetRecord]) -> list[FileRecord]:
@@ -264,11 +267,13 @@ class Download:
         Raises:
           StoreError: see `fetch`.
         """
+        _refuse_itself(out, source)
         shards = chosen_shards(source.manifest, only, episodes)
         download = cls(out, source, shards, workers, tick)
         with storage_errors(out, "write to"):
             out.mkdir(parents=True, exist_ok=True)
             with write_lock(out):
+                download.local = taken_up(out, source)  # again: another process may have painted here meanwhile
                 download._keep_painted()
                 download._check_room(with_pictures)
                 coming = [file for _, commit in download.commits.values() for file in commit.files]
@@ -319,13 +324,24 @@ class Download:
         wanted = [file for _, commit in self.commits.values() for file in commit.files] + self._metadata
         if with_pictures:
             wanted += [f for key, (_, c) in self.commits.items() if key not in self._kept for f in c.pictures]
-        needed = sum(file.bytes for file in wanted if not (self.out / file.path).exists())
+        needed = self._new_bytes(wanted)
         free = shutil.disk_usage(self.out).free
         if needed > free:
             raise StoreError(
                 f"{format_bytes(needed)} are needed and {format_bytes(free)} are free at {self.out}; make "
                 "room, choose another --out, or fetch less with --only and --episodes"
             )
+
+    def _new_bytes(self, wanted: Iterable[FileRecord]) -> int:
+        """Bytes that files will take here. Equal files become links to one file, so one of them counts."""
+        counted: set[str] = set()
+        needed = 0
+        for file in wanted:
+            names = {file.path, *self._equal.get(file.path, ())}
+            if not (names & counted or any((self.out / name).exists() for name in names)):
+                needed += file.bytes
+            counted.add(file.path)
+        return needed
 
     def bring(self, arrived: Callable[[ShardKey], None] = lambda key: None) -> Moved:
         """Bring the shards, in their order; each is there once its commit record is, and that is after its files.
@@ -409,6 +425,15 @@ def _by_subset(commits: dict[ShardKey, tuple[bytes, CommitRecord]]) -> dict[str,
 
 def _bare(record: SubsetRecord) -> SubsetRecord:
     return record.model_copy(update={"digest": None})
+
+
+def _refuse_itself(out: Path, source: Source) -> None:
+    """Raise StoreError if a release would be fetched to its own folder, which would make a part of it."""
+    folder = source.storage.folder
+    if folder and folder.resolve() == out.resolve():
+        raise StoreError(
+            f"{out} is the release itself; choose another --out, or render its images: dmcvb-gen paint {quoted(out)}"
+        )
 
 
 def taken_up(out: Path, source: Source) -> Manifest | None:

@@ -155,12 +155,12 @@ def publish(
     storage, tag = open_storage(url, options), (f"v{manifest.version}", f"{manifest.name} {manifest.version}")
     storage.begin()
     before, same = _published(storage, index, manifest)
-    if same and before is not None and set(index.files) <= set(before):
+    kept = _kept(storage, before or ())
+    if same and set(index.files) <= kept:
         storage.tag(*tag)
         return Moved(len(index.files), total, 0)
     fresh = storage.needs_claim and _claim(storage, index.manifest_sha256, manifest, take_over)
     fresh = fresh and before is None and storage.read(INDEX) is None
-    kept = set(before or ())
     todo = [file for file in index.files if file not in kept]
     expect(tick, len(todo))
     moved = sum(storage.upload_all(root, part, workers, tick, fresh) for part in _in_order(todo))
@@ -228,6 +228,14 @@ def _published(storage: Storage, index: Index, manifest: Manifest) -> tuple[tupl
         f"{place} already holds {what}, and a published version never changes; publish {manifest.name} "
         f"{manifest.version} to another URL (a changed byte is a new version)"
     )
+
+
+def _kept(storage: Storage, listed: Sequence[FileRecord]) -> set[FileRecord]:
+    """Return those listed files that are there at their size: others were deleted since, and are sent again."""
+    if not listed or not storage.lists_sizes:
+        return set(listed)
+    there = storage.list()
+    return {file for file in listed if file.path in there and there[file.path].bytes == file.bytes}
 
 
 def _claim(storage: Storage, digest: str, manifest: Manifest, take_over: bool) -> bool:

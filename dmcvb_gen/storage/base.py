@@ -285,9 +285,11 @@ class Storage(abc.ABC):
           new: the last one must not be there yet.
 
         Returns:
-          False if it was.
+          False if it was; then the others are what they were, unless somebody wrote it in the same moment.
         """
         *others, (path, data) = contents.items()
+        if new and self.size(path) is not None:
+            return False
         for other, content in others:
             self.write(other, content)
         if new:

@@ -58,8 +58,13 @@ def newest_of(url: str) -> tuple[dict[str, str], str]:
     return {"repo_id": repository, "repo_type": "dataset"}, folder
 
 
-def new_api() -> Any:
-    """A `huggingface_hub.HfApi` with the environment's token.
+def client_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of the Hub's file system that its client has, too."""
+    return {name: options[name] for name in ("endpoint", "token") if name in options}
+
+
+def new_api(endpoint: str | None = None, token: str | bool | None = None) -> Any:
+    """A `huggingface_hub.HfApi`; with the environment's endpoint and token by default.
 
     Raises:
       StoreError: the package is missing.
@@ -68,7 +73,7 @@ def new_api() -> Any:
         from huggingface_hub import HfApi
     except ImportError:
         raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
-    return HfApi()
+    return HfApi(endpoint=endpoint, token=token)
 
 
 @contextlib.contextmanager
@@ -96,14 +101,18 @@ class HubStorage(ObjectStorage):
 
     needs_claim = False
 
+    @property
+    def _api(self) -> Any:
+        return new_api(**client_options(dict(self.options)))
+
     def begin(self) -> None:
         with client_errors(self.place):
-            new_api().create_repo(**newest_of(self.url)[0], exist_ok=True)
+            self._api.create_repo(**newest_of(self.url)[0], exist_ok=True)
         self._head[:] = [self._last_commit()]
 
     def _last_commit(self) -> str:
         with client_errors(self.place):
-            return new_api().repo_info(**newest_of(self.url)[0]).sha
+            return self._api.repo_info(**newest_of(self.url)[0]).sha
 
     def _open(self, path: str) -> tuple[fsspec.AbstractFileSystem, str]:
         parse_hub_url(self.url)
@@ -125,7 +134,7 @@ class HubStorage(ObjectStorage):
         ]
         given = dict(operations=operations, commit_message=message, parent_commit=parent)
         with client_errors(self.place):
-            return new_api().create_commit(**where, **given).oid
+            return self._api.create_commit(**where, **given).oid
 
     def _write(self, path: str, data: bytes) -> None:
         self._commit({path: data}, path)
@@ -167,7 +176,7 @@ class HubStorage(ObjectStorage):
         where, folder = newest_of(self.url)
         name = "-".join([*folder.split("/")[:-1], name])
         with client_errors(self.place):
-            new_api().create_tag(**where, tag=name, tag_message=message, revision=self._head[0], exist_ok=True)
+            self._api.create_tag(**where, tag=name, tag_message=message, revision=self._head[0], exist_ok=True)
 
     def _contents(self, paths: Sequence[str]) -> dict[str, set[str]]:
         """Return the Hub's names of the contents of those files that exist."""
@@ -176,7 +185,7 @@ class HubStorage(ObjectStorage):
         with client_errors(self.place):
             for first in range(0, len(paths), ASKED):
                 asked = [folder + path for path in paths[first : first + ASKED]]
-                for entry in new_api().get_paths_info(**where, paths=asked):
+                for entry in self._api.get_paths_info(**where, paths=asked):
                     large = getattr(entry, "lfs", None)
                     names = {getattr(entry, "blob_id", None), large.sha256 if large else None}
                     found[entry.path.removeprefix(folder)] = {name for name in names if name}
@@ -188,7 +197,7 @@ class HubStorage(ObjectStorage):
     def _fetch(self, file: Digested, partial: Path, root: Path) -> None:
         repository, folder, revision = parse_hub_url(self.url)
         where = dict(repo_id=repository, repo_type="dataset", revision=revision, local_dir=_stage(root))
-        os.replace(new_api().hf_hub_download(**where, filename=folder + file.path), partial)
+        os.replace(self._api.hf_hub_download(**where, filename=folder + file.path), partial)
 
     def tidy(self, root: Path) -> None:
         shutil.rmtree(_stage(root), ignore_errors=True)

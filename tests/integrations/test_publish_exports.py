@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import http.server
 import shutil
+import threading
 from unittest import mock
 
 import pytest
@@ -14,6 +16,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.export.registry import all_formats
+from dmcvb_gen.release.publish import publish_folder
 
 SUBSETS = ("walker-walk/random/static", "ant-maze-tiny/random/hidden")
 
@@ -102,6 +105,65 @@ def test_the_hub_keeps_an_export_from_a_release_and_from_other_exports(stored, t
         api.list_repo_files.return_value = [".gitattributes", "other/manifest.json", "other/old.hdf5", "in/README.md"]
         publish_export(folder, "hf://datasets/me/demo/in", api=api)
         api.upload_folder.assert_called_once()
+
+
+def test_what_a_killed_export_left_is_not_published(stored, tmp_path):
+    from huggingface_hub import HfApi
+    from huggingface_hub.utils import filter_repo_objects
+
+    for name in SUBSETS:
+        out, place = tmp_path / name.partition("/")[0], tmp_path / "there" / name.partition("/")[0]
+        [folder] = export(str(stored[name].folder), "hdf5", out, [name])
+        whole, killed = content(out), folder.parent / ".dynamic.m@1-2.x.partial"
+        shutil.copytree(folder, killed / "dynamic")
+        (folder / ".data.hdf5.m@1-2.x.partial").write_bytes(b"half")
+        sent = publish_export(out, f"file://{place}")
+        assert content(place) == whole and sent.files == len(whole)
+        api = mock.create_autospec(HfApi, instance=True)
+        api.list_repo_files.return_value = []
+        publish_export(out, "hf://datasets/me/demo", api=api)
+        ignored = api.upload_folder.call_args.kwargs["ignore_patterns"]
+        assert set(filter_repo_objects(map(str, content(out)), ignore_patterns=ignored)) == set(map(str, whole))
+        shutil.rmtree(folder)
+        assert export_format(out) is None and export_format(killed) == "hdf5"
+
+
+def test_an_export_goes_to_an_empty_folder(stored, tmp_path):
+    for name in SUBSETS:
+        for to, merge in (("lerobot", True), ("hdf5", False)):
+            out = tmp_path / to / name.partition("/")[0]
+            place = out if merge else out / name
+            place.mkdir(parents=True)
+            assert export(str(stored[name].folder), to, out, [name], merge=merge) == [place]
+            assert export_format(place) == to
+    (place / ".dmcvb-gen.json").write_text("{}")
+    with pytest.raises(StoreError, match="is there already"):
+        export(str(stored[name].folder), to, out, [name])
+
+
+class Refusing(http.server.BaseHTTPRequestHandler):
+    """A Hub that refuses everybody and keeps who asked for what."""
+
+    def do_POST(self):
+        self.server.asked.append((self.path, self.headers["Authorization"]))
+        self.send_error(403)
+
+    def log_message(self, *_):
+        pass
+
+
+def test_a_hub_of_ones_own_is_asked_with_the_token_of_the_options(small_release, small_mazes, stored, tmp_path):
+    pytest.importorskip("huggingface_hub")
+    with http.server.HTTPServer(("127.0.0.1", 0), Refusing) as server:
+        server.asked = []
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        options = {"endpoint": f"http://127.0.0.1:{server.server_port}", "token": "hf_mine"}
+        [folder] = export(str(stored[SUBSETS[0]].folder), "hdf5", tmp_path, [SUBSETS[0]])
+        for sent in (small_release, small_mazes, folder):
+            with pytest.raises(StoreError, match="refuses access"):
+                publish_folder(sent, "hf://datasets/me/demo", options=options)
+        server.shutdown()
+    assert server.asked == [("/api/repos/create", "Bearer hf_mine")] * 3
 
 
 def test_what_is_no_export_is_refused(tmp_path):

@@ -138,7 +138,7 @@ class StorageTests:
         assert storage.read("manifest.json") == b"4"
         if storage.needs_claim:
             assert not storage.write_last({"files.json": b"5", "manifest.json": b"6"}, new=True)
-            assert storage.read("manifest.json") == b"4"
+            assert storage.read("manifest.json") == b"4" and storage.read("files.json") == b"3"
         storage.tag("v1.0.0", "the first version")
 
     def test_it_travels_to_workers_and_equals_itself(self, storage):

@@ -40,6 +40,8 @@ class _Work:
         if not self.folder.exists():
             return False
         with contextlib.suppress(OSError, ValueError):
+            if not any(self.folder.iterdir()):
+                return False
             if parse_json((self.folder / STAMP).read_bytes()) == self.stamp:
                 return True
         raise StoreError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,7 +15,7 @@ from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export.registry import all_formats
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.storage import open_storage
-from dmcvb_gen.storage.hub import client_errors, new_api, newest_of, on_the_hub
+from dmcvb_gen.storage.hub import client_errors, client_options, new_api, newest_of, on_the_hub
 
 LEROBOT_INFO = "meta/info.json"
 NO_DATA = ("README.md", "LICENSE")
@@ -25,9 +25,16 @@ NO_DATA = ("README.md", "LICENSE")
 def export_format(folder: str | Path) -> str | None:
     """The format of the exports in a folder, by the file that only that format has; None if there is no export."""
     for name, kind in all_formats().items():
-        if any(True for _ in Path(folder).rglob(kind.mark)):
+        if any(True for _ in _whole(Path(folder), kind.mark)):
             return name
     return None
+
+
+def _whole(folder: Path, pattern: str) -> Iterator[Path]:
+    """Paths below a folder that match a pattern, without what a killed export left in the making."""
+    for path in folder.rglob(pattern):
+        if not any(part.endswith(files.PARTIAL) for part in path.relative_to(folder).parts):
+            yield path
 
 
 def publish_export(
@@ -57,12 +64,12 @@ def publish_export(
         raise StoreError(
             f"{folder} holds neither a release nor an export; give the folder that `rollout` or `export` made"
         )
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    paths = sorted(path for path in _whole(folder, "*") if path.is_file())
     records = [_record(path, folder) for path in paths]
     total = sum(record.bytes for record in records)
     expect(tick, len(records))
     if on_the_hub(url):
-        _to_hub(folder, kind, url, records, api)
+        _to_hub(folder, kind, url, records, api or new_api(**client_options(options or {})))
         tick(len(records))
         return Moved(len(records), total, len(records))
     storage = open_storage(url, options)
@@ -104,13 +111,14 @@ def _to_hub(folder: Path, kind: str, url: str, records: Sequence[FileRecord], ap
             f"LeRobot finds one data set a repository: publish one folder with {LEROBOT_INFO} to "
             "hf://datasets/OWNER/NAME, or export the subsets as one data set with --merge"
         )
-    api = api or new_api()
     with client_errors(url):
         api.create_repo(**where, exist_ok=True)
         there = [name.removeprefix(inside) for name in api.list_repo_files(**where) if name.startswith(inside)]
         _refuse_others(url, there, records)
         message = f"{folder.name}: exported to {kind} by dmcvb-gen"
-        api.upload_folder(**where, folder_path=folder, path_in_repo=inside, commit_message=message)
+        partial = [f"*{files.PARTIAL}", f"*{files.PARTIAL}/*"]
+        given = dict(folder_path=folder, path_in_repo=inside, commit_message=message, ignore_patterns=partial)
+        api.upload_folder(**where, **given)
         if kind == "lerobot":
             version = json.loads((folder / LEROBOT_INFO).read_text())["codebase_version"]
             if version in {tag.name for tag in api.list_repo_refs(**where).tags}:
