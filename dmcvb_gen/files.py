@@ -1,9 +1,13 @@
 """Write files atomically: bytes, text or JSON become a whole file, flushed to the disk, or none.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
-disturb each other. The name says who makes it (machine, process namespace, process and its start), so that files of a
-killed process can be told from those of a running one. Containers have process namespaces of their own: their files are
-left alone, even if they share the machine's name.
+disturb each other. The name says who makes it (machine, its start, process namespace, process and its start), so that
+files of a killed process can be told from those of a running one, even if the machine was started again since::
+
+    .NAME.<machine>-<start and namespace>[+<host>]@<process>-<its start>.<random>.partial
+
+Containers have process namespaces of their own and no host: their files are left alone, even if they share the
+machine's name.
 """
 
 from __future__ import annotations
@@ -26,7 +30,14 @@ PARTIAL = ".partial"
 """Ending of files in the making."""
 LARGEST_YAML = 100_000
 """Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
-_OWNED = re.compile(rf"\..+\.([^.@]+)@(\d+)(?:-(\d+))?\.[^.]+{re.escape(PARTIAL)}")
+BOOT, HOST = Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id")
+"""Files of Linux: an id of the system's start, and one that stays the machine's."""
+HOST_NAMESPACE = "pid:[4026531836]"
+"""Process namespace of a Linux system itself; containers have others."""
+_OWNED = re.compile(
+    r"\..+\.(?P<machine>[^.@+]+)(?:\+(?P<host>[0-9a-f]+))?@(?P<process>\d+)(?:-(?P<started>\d+))?\.[^.]+"
+    + re.escape(PARTIAL)
+)
 
 
 @contextlib.contextmanager
@@ -64,8 +75,9 @@ def replacing(path: str | Path, new: bool = False) -> Iterator[Path]:
 
 
 def _owner() -> str:
-    started = _start_of(os.getpid())
-    return f"{_machine()}@{os.getpid()}" + ("" if started is None else f"-{started}")
+    started, host = _start_of(os.getpid()), _host()
+    owner = _machine() + (f"+{host}" if host else "")
+    return f"{owner}@{os.getpid()}" + ("" if started is None else f"-{started}")
 
 
 @functools.cache
@@ -74,8 +86,18 @@ def _machine() -> str:
     name = re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()) or "unknown"
     facts = ""
     with contextlib.suppress(OSError):  # of Linux alone
-        facts = Path("/proc/sys/kernel/random/boot_id").read_text() + os.readlink("/proc/self/ns/pid")
+        facts = BOOT.read_text() + os.readlink("/proc/self/ns/pid")
     return f"{name}-{sha256_bytes(facts.encode())[:8]}"
+
+
+@functools.cache
+def _host() -> str | None:
+    """Return what stays the same when this machine is started again; None if that is not known, and in containers."""
+    with contextlib.suppress(OSError):
+        host = HOST.read_text().strip()
+        if len(host) == 32 and os.readlink("/proc/self/ns/pid") == HOST_NAMESPACE:
+            return sha256_bytes(f"{socket.gethostname()} {host}".encode())[:8]
+    return None
 
 
 def _umask() -> int:
@@ -202,7 +224,7 @@ def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = T
     """
     for path in _partial_files(Path(folder), below):
         owner = _OWNED.fullmatch(path.name)
-        if not (owner[1] == _machine() and not _alive(int(owner[2]), owner[3]) if owner else foreign):
+        if not (_is_dead(owner) if owner else foreign):
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -214,14 +236,22 @@ def others_at_work(folder: str | Path) -> list[str]:
     """Other running processes that are making something in a folder: "process 12", or "a process of machine NAME"."""
     found = set()
     for path in _partial_files(Path(folder), below=False):
-        if (owner := _OWNED.fullmatch(path.name)) is None:
+        owner = _OWNED.fullmatch(path.name)
+        if owner is None or _is_dead(owner):
             continue
-        machine, process = owner[1], int(owner[2])
+        machine, process = owner["machine"], int(owner["process"])
         if machine != _machine():
             found.add(f"a process of machine {machine.rpartition('-')[0]}")
-        elif process != os.getpid() and _alive(process, owner[3]):
+        elif process != os.getpid():
             found.add(f"process {process}")
     return sorted(found)
+
+
+def _is_dead(owner: re.Match[str]) -> bool:
+    """Return True if a process of this machine has ended, at the latest when the machine was started again."""
+    if owner["machine"] == _machine():
+        return not _alive(int(owner["process"]), owner["started"])
+    return owner["host"] is not None and owner["host"] == _host()
 
 
 def _partial_files(folder: Path, below: bool) -> list[Path]:

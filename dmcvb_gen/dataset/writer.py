@@ -121,13 +121,22 @@ def _clear(root: Path, manifest: Manifest | None = None, foreign: bool = False) 
             remove_partial((root / path).parent, foreign=foreign, below=False)
 
 
-def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...], rows: int, attributes: dict) -> None:
+def create_subset(
+    root: Path,
+    subset: SubsetRecord,
+    specs: tuple[ArraySpec, ...],
+    rows: int,
+    attributes: dict,
+    exact: bool = False,
+) -> None:
     """Create a subset's group and arrays (metadata alone), unless they are there already.
 
     Data are never at risk: where shards are committed, only metadata that is missing is written.
 
     Args:
       attributes: attributes of the group; its "schema_version" decides where arrays lie.
+      exact: arrays that are there get room for the subset's episodes and no others, whatever their metadata say; for
+        a folder of metadata alone, which growing that was interrupted may have left half changed.
 
     Raises:
       StoreError: the folder cannot be written.
@@ -136,33 +145,45 @@ def create_subset(root: Path, subset: SubsetRecord, specs: tuple[ArraySpec, ...]
     shape = (subset.episodes, rows, subset.episodes_per_shard, picture_layout_for(subset.spec.camera_moves))
     with storage_errors(path, "write to"):
         if not (path / CREATED).exists():
+            exact = False  # it will be, as nothing is there
             # File by file, each whole: of two who begin at the same time, none may clear away what the other wrote.
             _write_metadata(path, specs, attributes, shape, keep=any((root / "commits" / subset.name).glob("*.json")))
             mark_created(root, subset)  # an interrupted creation is done again from the start
-        _grow(root, subset, attributes)
+        _grow(root, subset, attributes, exact)
 
 
-def _grow(root: Path, subset: SubsetRecord, attributes: Mapping[str, Any]) -> None:
+def _grow(root: Path, subset: SubsetRecord, attributes: Mapping[str, Any], exact: bool) -> None:
     """Make room for more episodes in the arrays that are there: metadata alone.
 
     The group's file, which holds a copy of all arrays' metadata, is put in place last: while it is the old one, what
-    was interrupted is done again.
+    was interrupted is done again. `exact`: see `create_subset`.
     """
     path = root / subset_path(subset.name)
     with storage_errors(path / ZARR_JSON, decoding=True):
         node = parse_json((path / ZARR_JSON).read_bytes())
         known = (node.get("consolidated_metadata") or {}).get("metadata", {}).values()
-        if all(array["shape"][0] >= subset.episodes for array in known if "shape" in array) and known:
+        if all(array["shape"][0] >= subset.episodes for array in known if "shape" in array) and known and not exact:
             return
     with tempfile.TemporaryDirectory() as folder:
         for name in metadata_paths(root, subset):
             copy_file(root / name, Path(folder) / (root / name).relative_to(path))
         group = zarr.open_group(folder, mode="r+", use_consolidated=False)
         for _, array in group.members(max_depth=None):
-            if isinstance(array, zarr.Array) and array.shape[0] < subset.episodes:
+            if isinstance(array, zarr.Array) and (exact or array.shape[0] < subset.episodes):
                 array.resize((subset.episodes, *array.shape[1:]))
         group.attrs["release"] = attributes.get("release", "")
         _put_metadata(Path(folder), path)
+
+
+def fits(root: Path, subset: SubsetRecord) -> bool:
+    """Return True if the metadata that are there give each array room for the subset's episodes, and no more."""
+    rows = set()
+    for name in metadata_paths(root, subset):
+        with storage_errors(root / name, decoding=True):
+            node = parse_json((root / name).read_bytes())
+            copies = (node.get("consolidated_metadata") or {}).get("metadata", {}).values()
+            rows |= {array["shape"][0] for array in (node, *copies) if "shape" in array}
+    return rows <= {subset.episodes}
 
 
 def _put_metadata(folder: Path, path: Path, keep: bool = False) -> None:

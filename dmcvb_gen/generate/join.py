@@ -65,10 +65,12 @@ def join_folders(recipe: Recipe, parts: Sequence[str | Path], out: str | Path) -
     """Write the release of a recipe from folders of its parts. Files become hard links, or copies on another disk.
 
     Raises:
-      StoreError: see `join`; `out` holds something already, or a part lacks a file.
+      StoreError: see `join`; `out` is a file or holds something already, or a part lacks a file.
     """
     manifest, index = join(recipe, parts)
     out = Path(out)
+    if out.is_file():
+        raise StoreError(f"{out} is a file; give another folder")
     if out.exists() and any(out.iterdir()):
         raise StoreError(f"{out} is not empty; give another folder")
     with storage_errors(out, "write to"):

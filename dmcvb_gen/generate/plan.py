@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from dmcvb_gen.dataset.index import (
     POLICIES,
     ZARR_JSON,
     metadata_files,
+    metadata_paths,
     parse_index,
     refuse_altered,
     refuse_altered_folder,
@@ -32,7 +33,14 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.dataset.shards import chosen_shards
-from dmcvb_gen.dataset.writer import create_subset, finish_release, finish_together, mark_created, start_release
+from dmcvb_gen.dataset.writer import (
+    create_subset,
+    finish_release,
+    finish_together,
+    fits,
+    mark_created,
+    start_release,
+)
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.files import copy_file, free_bytes, json_bytes, sha256_bytes, sha256_file, write_bytes
@@ -345,18 +353,29 @@ def _prepare_bucket(plan: Plan, target: Target) -> Manifest:
     """Put everything but shards into a bucket, the manifest last; the manifest of whoever was first."""
     with _temporary_folder(target) as folder:
         begun = _begun(folder, plan, plan.manifest, plan.manifest.subsets)
-        strange = set(target.storage.list()) - set(begun) - {MANIFEST}
-        if strange and target.manifest() is None:
-            raise StoreError(
-                f"{target.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
-            )
-        in_parallel(lambda name: target.storage.write(name, begun[name].read_bytes()), list(begun), CONNECTIONS, ignore)
-    if target.storage.create(MANIFEST, json_bytes(plan.manifest)):
-        return plan.manifest
-    first = target.manifest()
-    if first is None:
-        raise StoreError(f"the manifest of {target.place} vanished; rerun the same command")
+        with target.lock() as lock:  # of two who begin at once, the second changes nothing before it has looked
+            first = target.manifest()
+            if first is None:
+                _refuse_other_files(target, begun)
+                _send(target, begun, begun, lock.keep)
+                lock.check()
+                target.storage.write(MANIFEST, json_bytes(plan.manifest))
+                return plan.manifest
     return _grow_bucket(plan, target, first)
+
+
+def _refuse_other_files(target: Target, begun: Iterable[str]) -> None:
+    """Raises StoreError if a bucket without a release holds other files than those with which it begins."""
+    strange = set(target.storage.list()) - set(begun)
+    if strange:
+        raise StoreError(
+            f"{target.place} holds no release but other files ({min(strange)}); choose an empty place for --out"
+        )
+
+
+def _send(target: Target, made: Mapping[str, Path], names: Iterable[str], tick: Callable = ignore) -> None:
+    """Put files that were made here into a bucket, under their names."""
+    in_parallel(lambda name: target.storage.write(name, made[name].read_bytes()), names, CONNECTIONS, tick)
 
 
 @contextlib.contextmanager
@@ -370,13 +389,16 @@ def _begun(root: Path, plan: Plan, manifest: Manifest, records: Sequence[SubsetR
     """Everything of subsets but shards, made in a folder: path in the release -> file."""
     if plan.inputs is not None:
         copy_inputs(root, records, plan.inputs)
-    create_groups(root, manifest, records)
+    create_groups(root, manifest, records, exact=True)
     made = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
     return {name: path for name, path in made.items() if not Path(name).name.startswith(".")}
 
 
 def _grow_bucket(plan: Plan, target: Target, there: Manifest) -> Manifest:
     """The manifest of a bucket once it holds all that is asked for; what is new is put there first, the manifest last.
+
+    Arrays' metadata are written under the lock, for the manifest that is there then: a grower that comes too late
+    changes nothing. The index goes first, so that what a killed grower left is no damage for the next one.
 
     Raises:
       StoreError: what is there contradicts what is asked for, or its manifest vanished.
@@ -393,14 +415,16 @@ def _grow_bucket(plan: Plan, target: Target, there: Manifest) -> Manifest:
                 _bring_metadata(target, record, listed, root)
         begun = _begun(root, plan, manifest, changed)
         _refuse_altered_bucket(target, there, begun)
-        new = [name for name in begun if name not in listed or name.endswith("/zarr.json")]
-        in_parallel(lambda name: target.storage.write(name, begun[name].read_bytes()), new, CONNECTIONS, ignore)
-    with target.lock():
-        now = target.manifest()
-        if now == there:
-            target.storage.remove(INDEX)  # written again when the release is finished
-            target.storage.write(MANIFEST, json_bytes(manifest))
-            return manifest
+        metadata = {name for name in begun if name.endswith(f"/{ZARR_JSON}")}
+        _send(target, begun, begun.keys() - metadata - listed.keys())
+        with target.lock() as lock:
+            now = target.manifest()
+            if now == there:
+                target.storage.remove(INDEX)  # written again when the release is finished
+                _send(target, begun, metadata, lock.keep)
+                lock.check()
+                target.storage.write(MANIFEST, json_bytes(manifest))
+                return manifest
     if now is None:
         raise StoreError(f"the manifest of {target.place} vanished; rerun the same command")
     return _grow_bucket(plan, target, now)  # another process changed it meanwhile
@@ -464,15 +488,18 @@ def _copy_videos(source: str, target: Path) -> None:
                     copy_file(file, copy)
 
 
-def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord]) -> None:
+def create_groups(root: Path, manifest: Manifest, records: Iterable[SubsetRecord], exact: bool = False) -> None:
     """Create the (empty) Zarr groups of subsets, if they are not there already.
+
+    Args:
+      exact: see `create_subset`.
 
     Raises:
       StoreError: the folder cannot be written.
     """
     for record in records:
         specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
-        create_subset(root, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
+        create_subset(root, record, specs, record.max_steps + 1, subset_attributes(record, manifest), exact)
 
 
 def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any]:
@@ -496,7 +523,8 @@ def subset_attributes(record: SubsetRecord, manifest: Manifest) -> dict[str, Any
 
 def finish(plan: Plan) -> Manifest:
     """Write the digests of what is whole into the manifest, when all workers are through."""
-    return plan.manifest if _is_done(plan.manifest, plan) else finish_target(plan.target)
+    stopped = plan.target.uploads and plan.target.storage.size(INDEX) is None  # by a killed grower
+    return plan.manifest if _is_done(plan.manifest, plan) and not stopped else finish_target(plan.target)
 
 
 def _is_done(manifest: Manifest, plan: Plan) -> bool:
@@ -522,6 +550,15 @@ def finish_target(target: Target) -> Manifest:
     return _finish_bucket(target, manifest)
 
 
+def _fit_arrays(root: Path, manifest: Manifest) -> list[str]:
+    """Take away the room that a killed grower left in arrays; paths of the metadata that were changed."""
+    records = [record for record in manifest.subsets if not fits(root, record)]
+    for record in records:
+        mark_created(root, record)
+    create_groups(root, manifest, records, exact=True)
+    return [path for record in records for path in metadata_paths(root, record)]
+
+
 def _finish_bucket(target: Target, there: Manifest) -> Manifest:
     """See `finish_target`. If another process changes the manifest meanwhile, it is read again and nothing is lost."""
     _refuse_altered_bucket(target, there, {})
@@ -538,11 +575,13 @@ def _finish_bucket(target: Target, there: Manifest) -> Manifest:
                 write_bytes(mirror / path, data)
 
         in_parallel(bring, small, CONNECTIONS, ignore)
+        mended = _fit_arrays(mirror, there)
         manifest = finish_release(mirror, there, commits)
-        with target.lock():
+        with target.lock() as lock:
             now = target.manifest()
             if now == there:
-                for name in (INDEX, MANIFEST):
+                lock.check()
+                for name in (*mended, INDEX, MANIFEST):
                     target.storage.write(name, (mirror / name).read_bytes())
                 return manifest
     if now is None:

@@ -16,7 +16,15 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.dataset.index import INDEX, POLICIES, VIDEOS, ZARR_JSON, restore_index, restored_commit, trusted_index
-from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord, environment, parse_commit
+from dmcvb_gen.dataset.manifest import (
+    MANIFEST,
+    CommitRecord,
+    Manifest,
+    SubsetRecord,
+    environment,
+    local_manifest,
+    parse_commit,
+)
 from dmcvb_gen.dataset.pictures import SHOWN, stored_pictures
 from dmcvb_gen.dataset.reader import load_manifest
 from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
@@ -268,9 +276,9 @@ class Regeneration:
         """Write a new release from the manifest of `root`; run again, it resumes.
 
         Args:
-          out: folder of the new release.
+          out: folder of the new release, which may have grown or been painted since.
 
-        Raises: see `check`.
+        Raises: see `check`; `out` holds another release.
         """
         root, manifest = load_manifest(self.root)
         out = local_path(out)
@@ -279,12 +287,15 @@ class Regeneration:
         shards = chosen_shards(manifest, self.only, self.episodes)
         records = _unique(shards.values())
         check_makeable(manifest, records)
+        _check_out(out, manifest)
         fresh = start_release(out, _unfinished(manifest))
-        create_groups(out, fresh, records)
+        there = {record.name: record for record in fresh.subsets}
+        create_groups(out, fresh, [there[record.name] for record in records])
         digests = _Digests(root, manifest)
-        for record in records:
-            digests.copy_metadata(out, record)
         done = {record.name: read_commits(out, record) for record in records}
+        for record in records:
+            if not done[record.name] and _same_arrays(there[record.name], record):
+                digests.copy_metadata(out, record)
         todo = {key: record for key, record in shards.items() if key[1] not in done[key[0]]}
         commits = [commit for name in done for commit in done[name].values() if (name, commit.shard) in shards]
         commits += self._make(manifest, todo, out, progress, copy=True)
@@ -360,6 +371,27 @@ def check_makeable(manifest: Manifest, records: Sequence[SubsetRecord]) -> None:
                 f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "
                 "repaint that release again instead of regenerating this one"
             )
+
+
+def _check_out(out: Path, manifest: Manifest) -> None:
+    """Refuse a folder that holds any release but the one that is made again, or what that has grown into."""
+    if not (out / MANIFEST).exists():
+        return
+    there = local_manifest(out)
+    same = there.recipe == manifest.recipe
+    for name in ("additions", "lineage"):
+        before, now = getattr(manifest, name), getattr(there, name)
+        same &= now[: len(before)] == before
+    if not same:
+        raise StoreError(
+            f"{out} holds {there.name} {there.version}, which was not made from {manifest.name} {manifest.version}; "
+            "give another --out"
+        )
+
+
+def _same_arrays(one: SubsetRecord, other: SubsetRecord) -> bool:
+    """Return True if one metadata of arrays serves both: neither has grown or been painted since."""
+    return (one.episodes, one.pixels) == (other.episodes, other.pixels)
 
 
 def _unfinished(manifest: Manifest) -> Manifest:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import json
 import os
 import shutil
 import tempfile
@@ -136,26 +135,14 @@ class Target:
         return found
 
     @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
-        """Keep other writers from the manifest at a URL while the block runs, which must be short.
-
-        The lock is a file that is created only if it is absent. One that stays the same for `LOCK_SECONDS` was left by
-        a killed process, and is taken over.
-        """
-        token, seen, since = uuid.uuid4().hex.encode(), None, time.monotonic()
-        while not self.storage.create(LOCK, token):
-            there = self.storage.read(LOCK)
-            if there != seen:
-                seen, since = there, time.monotonic()
-            elif there is not None and time.monotonic() - since > LOCK_SECONDS:
-                self.storage.remove(LOCK)
-            else:
-                time.sleep(LOCK_PAUSE)
+    def lock(self) -> Iterator[Lock]:
+        """Keep other writers from the manifest and the arrays' metadata at a URL while the block runs."""
+        lock = Lock(self.storage)
+        lock.take()
         try:
-            yield
+            yield lock
         finally:
-            if self.storage.read(LOCK) == token:
-                self.storage.remove(LOCK)
+            lock.leave()
 
     def bring_metadata(self, record: SubsetRecord, folder: Path) -> None:
         """Put the Zarr metadata of a subset into a folder, as the release has it."""
@@ -164,9 +151,8 @@ class Target:
         if text is None:
             raise StoreError(f"{self.place}/{path} is missing; run the same rollout again (on a cluster: --init)")
         files.write_bytes(folder / path, text)
-        for name, node in json.loads(text)["consolidated_metadata"]["metadata"].items():
-            bare = {key: value for key, value in node.items() if key != "consolidated_metadata"}  # it would grow stale
-            files.write_json(folder / subset_path(record.name) / name / "zarr.json", bare)
+        for name, node in _consolidated(text, f"{self.place}/{path}").items():
+            files.write_json(folder / subset_path(record.name) / name / "zarr.json", node)
 
     def inputs(self, record: SubsetRecord, folder: Path) -> Inputs:
         """The release's own copies of what a subset is made from, brought into `folder` if they are not here."""
@@ -230,6 +216,72 @@ class Target:
                 f"{other.environment.get('cpu', 'another machine')}; make a release with one version of all "
                 "packages (`dmcvb-gen regenerate --check` says what differs)"
             )
+
+
+def _consolidated(text: bytes, where: str) -> dict[str, dict[str, Any]]:
+    """The metadata of all arrays and groups that a group's zarr.json holds, by their path in the group.
+
+    Raises:
+      StoreError: it is damaged.
+    """
+    try:
+        nodes = {name: dict(node) for name, node in files.parse_json(text)["consolidated_metadata"]["metadata"].items()}
+    except (ValueError, LookupError, TypeError, AttributeError):
+        raise StoreError(f"{where} is damaged; put it there from a copy, or choose another --out") from None
+    for node in nodes.values():
+        node.pop("consolidated_metadata", None)  # of a group within the group, which would grow stale
+    return nodes
+
+
+class Lock:
+    """A file at a URL that one writer has: it is created only if it is absent.
+
+    One that stays the same for `LOCK_SECONDS` was left by a killed process, and is taken over. Several may do so at
+    once: each writes its token over the old one, so that the file is never absent, and the last one has the lock.
+    """
+
+    def __init__(self, storage: Storage):
+        self._storage, self._token, self._renewed = storage, _new_token(), 0.0
+
+    def take(self) -> None:
+        """Wait until no other writer has it."""
+        seen, since = None, time.monotonic()
+        while not self._storage.create(LOCK, self._token):
+            there = self._storage.read(LOCK)
+            if there != seen:
+                seen, since = there, time.monotonic()
+            elif there is not None and time.monotonic() - since > LOCK_SECONDS:
+                self._storage.write(LOCK, self._token)
+                time.sleep(LOCK_PAUSE)
+                if self._is_mine():
+                    break
+            else:
+                time.sleep(LOCK_PAUSE)
+        self._renewed = time.monotonic()
+
+    def keep(self, *_: object) -> None:
+        """Say now and then that this writer is still at work, see `check`; what it is given has no effect."""
+        if time.monotonic() - self._renewed > LOCK_SECONDS / 4:
+            self.check()
+            self._token, self._renewed = _new_token(), time.monotonic()
+            self._storage.write(LOCK, self._token)
+
+    def check(self) -> None:
+        """Raises StoreError if another writer took it over, because this one seemed to be killed."""
+        if not self._is_mine():
+            raise StoreError(f"another process took over {self._storage.place} meanwhile; rerun the same command")
+
+    def leave(self) -> None:
+        """Let the next writer have it."""
+        if self._is_mine():
+            self._storage.remove(LOCK)
+
+    def _is_mine(self) -> bool:
+        return self._storage.read(LOCK) == self._token
+
+
+def _new_token() -> bytes:
+    return uuid.uuid4().hex.encode()
 
 
 # -- staging folders ------------------------------------------------------------------------------

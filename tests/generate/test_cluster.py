@@ -10,11 +10,13 @@ import shutil
 import subprocess
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
+from dmcvb_gen import files
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release, writer
 from dmcvb_gen.dataset.manifest import local_manifest
@@ -23,12 +25,20 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.jobs import left_to_do, part_of
-from dmcvb_gen.generate.plan import describe, finish, make_plan, prepare
+from dmcvb_gen.generate.plan import (
+    _prepare_bucket,
+    _refuse_altered_bucket,
+    describe,
+    finish,
+    make_plan,
+    prepare,
+)
 from dmcvb_gen.generate.progress import progress_of
 from dmcvb_gen.generate.recipe import make_recipe
-from dmcvb_gen.generate.target import Target, UploadQueue, staging_folder_of
+from dmcvb_gen.generate.target import LOCK, Target, UploadQueue, staging_folder_of
 from dmcvb_gen.parallel import Ray
 from dmcvb_gen.spec import ANT_MAZE
+from dmcvb_gen.storage.local import LocalStorage
 from tests.conftest import TINY_MAZE, roll_out
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
@@ -239,11 +249,181 @@ def test_growing_in_a_bucket_is_refused_where_something_is_damaged_and_goes_on_w
         grow(bucket, 4)
     path.write_bytes(before)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(type(bucket.storage), "remove", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        stop_before_manifest(patch, bucket)
         prepare(make_plan(quick_recipe(WALKER | {"episodes": 4}), bucket))
     assert path.read_bytes() != before
     assert grow(bucket, 4).digest == wanted.digest
     assert contents(tmp_path / "bucket") == contents(tmp_path / "r")
+
+
+def stop_before_manifest(patch, bucket):
+    """Interrupt whoever has written all but a bucket's manifest."""
+    write = type(bucket.storage).write
+
+    def written(storage, path, data):
+        if path == "manifest.json":
+            raise KeyboardInterrupt
+        write(storage, path, data)
+
+    patch.setattr(type(bucket.storage), "write", written)
+
+
+def begin(place, episodes=2):
+    """Prepare a release without images; nothing is rolled out."""
+    return prepare(light_plan(place, episodes)).manifest
+
+
+def light_plan(place, episodes=2):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": episodes}
+    return make_plan(quick_recipe(pattern), place, pixels=False)
+
+
+def arrays(folder):
+    return {name: data for name, data in contents(folder).items() if name.endswith("zarr.json")}
+
+
+def test_of_two_who_begin_in_one_new_bucket_with_other_settings_the_second_changes_nothing(tmp_path):
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    recipe = quick_recipe({"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2}, size=16)
+    second = make_plan(recipe, bucket)  # when nothing is there yet
+    begin(bucket)
+    before = contents(tmp_path / "bucket")
+    with pytest.raises(StoreError, match="size 8, asked for 16"):
+        _prepare_bucket(second, bucket)
+    assert contents(tmp_path / "bucket") == before
+
+
+def test_a_bucket_grows_to_fewer_episodes_than_a_killed_grower_wanted(tmp_path, monkeypatch):
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    begin(bucket)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        stop_before_manifest(patch, bucket)
+        begin(bucket, 6)
+    wide = next(tmp_path.glob("bucket/**/state/zarr.json"))
+    assert json.loads(wide.read_bytes())["shape"][0] == 6
+    wide.write_bytes(wide.read_bytes().replace(b"6,", b"2,", 1))  # killed before it wrote this one
+    begin(bucket, 4)
+    begin(tmp_path / "r")
+    begin(tmp_path / "r", 4)
+    assert arrays(tmp_path / "bucket") == arrays(tmp_path / "r")
+
+
+def test_a_bucket_is_finished_as_it_was_before_a_killed_grower(tmp_path, monkeypatch):
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    plan = prepare(light_plan(bucket))
+    list(run_jobs(plan.jobs))
+    finish(plan)
+    before = contents(tmp_path / "bucket")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        stop_before_manifest(patch, bucket)
+        begin(bucket, 6)
+    assert contents(tmp_path / "bucket") != before
+    finish(prepare(light_plan(bucket)))
+    assert contents(tmp_path / "bucket") == before
+
+
+def test_a_grower_of_a_bucket_that_comes_too_late_changes_nothing(tmp_path, monkeypatch):
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    begin(bucket)
+    others = []
+
+    def grown_meanwhile(*arguments):
+        if not others:
+            others.append(None)
+            others.append(begin(bucket, 6))
+            others.append(contents(tmp_path / "bucket"))
+        return _refuse_altered_bucket(*arguments)
+
+    monkeypatch.setattr("dmcvb_gen.generate.plan._refuse_altered_bucket", grown_meanwhile)
+    with pytest.raises(StoreError, match="holds 6 episodes .* asked for 4"):
+        begin(bucket, 4)
+    assert contents(tmp_path / "bucket") == others[2] and bucket.manifest() == others[1]
+
+
+class SlowStorage(LocalStorage):
+    """A folder that is slow to change."""
+
+    def _remove(self, path):
+        time.sleep(0.4)
+        super()._remove(path)
+
+    def _write(self, path, data):
+        time.sleep(0.4)
+        super()._write(path, data)
+
+
+def test_of_several_who_take_over_the_lock_of_a_killed_process_one_has_it_at_a_time(tmp_path, monkeypatch):
+    for name, seconds in {"LOCK_SECONDS": 0.6, "LOCK_PAUSE": 1}.items():
+        monkeypatch.setattr(f"dmcvb_gen.generate.target.{name}", seconds)
+    (tmp_path / LOCK).write_text("of a killed process")
+    holding, together = [], []
+
+    def hold(storage):
+        with replace(Target.at(f"file://{tmp_path}"), storage=storage).lock():
+            holding.append(storage)
+            together.append(len(holding))
+            time.sleep(0.8)
+            holding.remove(storage)
+
+    storages = (kind(tmp_path, f"file://{tmp_path}") for kind in (SlowStorage, LocalStorage))
+    threads = [threading.Thread(target=hold, args=(storage,)) for storage in storages]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.1)  # so that the slow one is the first to see that the lock is old, and the last to act on it
+    for thread in threads:
+        thread.join()
+    assert together == [1, 1] and not (tmp_path / LOCK).exists()
+
+
+def test_who_lost_the_lock_of_a_bucket_writes_no_manifest(tmp_path):
+    target = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path)
+    with pytest.raises(StoreError, match="took over .*bucket meanwhile; rerun"), target.lock() as lock:
+        lock.check()
+        target.storage.write(LOCK, b"of another process")
+        lock.check()
+    assert target.storage.read(LOCK) == b"of another process"
+
+
+@pytest.mark.parametrize("damaged", [b"{", b"[]", b'{"consolidated_metadata": null}', b"\xff"])
+def test_damaged_metadata_of_a_bucket_in_the_making_are_one_line(tmp_path, damaged):
+    bucket = Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")
+    [record] = begin(bucket).subsets
+    (tmp_path / f"bucket/{record.name}.zarr/zarr.json").write_bytes(damaged)
+    with pytest.raises(StoreError, match="bucket/walker-walk/random/none.zarr/zarr.json is damaged; put it there"):
+        bucket.bring_metadata(record, tmp_path / "staged")
+
+
+def test_what_was_left_before_the_machine_was_started_again_keeps_nobody_waiting(tmp_path, monkeypatch):
+    def start(boot, host="a" * 32):
+        for name, text in {"BOOT": boot, "HOST": host}.items():
+            (tmp_path / name).write_text(text)
+            monkeypatch.setattr(files, name, tmp_path / name)
+        monkeypatch.setattr(files, "HOST_NAMESPACE", os.readlink("/proc/self/ns/pid"))
+        for known in (files._machine, files._host):
+            known.cache_clear()
+
+    def leave(name, host="a" * 32):
+        start("the last start", host)
+        with files.folder_in_the_making(tmp_path / "r", name) as folder:
+            pass
+        folder.mkdir()  # as if the machine had failed before it went
+        return folder
+
+    (tmp_path / "r").mkdir()
+    try:
+        mine, of_another_host = leave("shards"), leave("regenerate", "b" * 32)
+        old = tmp_path / "r" / re.sub(r"\+[0-9a-f]+@", "@", mine.name)  # of a version that did not name the host
+        old.mkdir()
+        start("this start")
+        assert files.others_at_work(tmp_path / "r") == [f"a process of machine {files._machine().rpartition('-')[0]}"]
+        files.remove_partial(tmp_path / "r")
+        assert {path.name for path in (tmp_path / "r").iterdir()} == {old.name, of_another_host.name}
+        shutil.rmtree(of_another_host)
+        start("the last start")
+        assert files.others_at_work(tmp_path / "r") == []  # this process's own
+    finally:
+        for known in (files._machine, files._host):
+            known.cache_clear()
 
 
 def test_no_room_for_the_digests_of_a_bucket_is_one_line(tmp_path, monkeypatch):

@@ -87,6 +87,8 @@ def test_the_folder_of_joined_parts_is_the_release_of_one_rollout(made, tmp_path
     assert write_card(out) and not check_card(out)
     with pytest.raises(StoreError, match="is not empty"):
         join_folders(whole, parts, out)
+    with pytest.raises(StoreError, match="manifest.json is a file; give another folder"):
+        join_folders(whole, parts, out / MANIFEST)
     shutil.copytree(made / "walker", tmp_path / "walker")
     (tmp_path / "walker" / action).unlink()
     with pytest.raises(StoreError, match="action/c/0/0/0 is in none of the parts"):

@@ -18,9 +18,11 @@ from dmcvb_gen.dataset.shards import chosen_shards
 from dmcvb_gen.dataset.writer import commit_path, finish_release, sha256_file
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
+from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.inputs import release_inputs
 from dmcvb_gen.generate.jobs import make_jobs
-from dmcvb_gen.generate.plan import make_plan
+from dmcvb_gen.generate.paint import paint_release
+from dmcvb_gen.generate.plan import finish, make_plan, prepare
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.release.verify import verify
 from tests.conftest import roll_out, small_recipe
@@ -217,6 +219,48 @@ def test_beside_it_makes_an_equal_release(small_release, tmp_path):
     assert list(open_release(tmp_path / "beside").subsets) == ["walker-walk/random/none"]
     with pytest.raises(StoreError, match="remove --out"):
         Regeneration(small_release).remake(small_release)
+
+
+def tiny_recipe(episodes, **changes):
+    short = {"settings": "none", "episodes": episodes, "episodes_per_shard": 2, "max_steps": 3}
+    return small_recipe(size=8, subsets=[LOCOMOTION | {"levels": "random"} | short], **changes)
+
+
+def light_release(folder, episodes=4, **changes):
+    """A tiny release without images, or one that is there grown to as many episodes."""
+    plan = prepare(make_plan(tiny_recipe(episodes, **changes), folder, pixels=False))
+    list(run_jobs(plan.jobs))
+    return finish(plan)
+
+
+def test_beside_it_goes_on_in_what_has_grown_or_been_painted_since(tmp_path):
+    light_release(tmp_path / "light")
+    again = Regeneration(tmp_path / "light")
+    again.remake(tmp_path / "grown")
+    light_release(tmp_path / "grown", 6)
+    assert again.remake(tmp_path / "grown").sound and verify(tmp_path / "grown").sound
+
+    Regeneration(tmp_path / "light", episodes=(0, 2)).remake(tmp_path / "painted")
+    paint_release(tmp_path / "painted")
+    assert Regeneration(tmp_path / "light", episodes=(2, 4)).remake(tmp_path / "painted").sound
+    assert paint_release(tmp_path / "painted").shards == 1 and verify(tmp_path / "painted").sound
+    paint_release(tmp_path / "light")
+    images = "walker-walk/random/none.zarr/pixels"
+    for path, data in files_of(tmp_path / "light" / images).items():
+        assert (tmp_path / "painted" / images / path.relative_to(tmp_path / "light" / images)).read_bytes() == data
+
+
+def test_beside_it_leaves_another_release_alone(small_release, maze_release, tmp_path):
+    shutil.copytree(maze_release, tmp_path / "mazes")
+    prepare(make_plan(small_recipe(), tmp_path / "grown"))
+    prepare(make_plan(small_recipe(subsets=[MAZE]), tmp_path / "grown"))
+    prepare(make_plan(small_recipe(), tmp_path / "other"))
+    prepare(make_plan(small_recipe(subsets=[LOCOMOTION]), tmp_path / "other"))
+    for source, out in ((small_release, "mazes"), (tmp_path / "grown", "other")):
+        before = files_of(tmp_path / out)
+        with pytest.raises(StoreError, match="was not made from small .*give another --out"):
+            Regeneration(source).remake(tmp_path / out)
+        assert files_of(tmp_path / out) == before
 
 
 def test_bad_requests_say_what_to_do(small_release, tmp_path, copy):
