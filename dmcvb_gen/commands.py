@@ -496,9 +496,10 @@ def validate(
     Raises:
       DmcvbError: there is no release, a name is unknown, or the release has no data for a benchmark.
     """
+    options = locals()
     from dmcvb_gen.agents.catalog import split_agents
 
-    options = locals() | {"agents": split_agents(agents) if isinstance(agents, str) else as_names(agents)}
+    options["agents"] = split_agents(agents) if isinstance(agents, str) else as_names(agents)
     if checks_only:
         usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
         _refuse("checks_only trains nothing", **{name: options[name] != usual[name] for name in TRAINING})

@@ -151,6 +151,9 @@ def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
         (lambda out: dmcvb_gen.verify(out, everything=True), "always read whole"),
         (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
         (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
+        (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), "checks_only trains nothing"),
+        (lambda out: dmcvb_gen.validate(out, checks_only=True, profile="paper"), "--profile has no effect"),
+        (lambda out: dmcvb_gen.validate(out, agents="bc,state-bc"), "no release"),
     ],
 )
 def test_errors_are_those_of_the_commands(call, message, tmp_path):
