@@ -144,7 +144,7 @@ def rollout(
     plan = prepare_rollout(rollout_plan(options, request, target), options)
     with progress_bar(progress, f" {plan.unit}", plan.manifest.name) as bar:
         run_plan(plan, workers, bar, finishing=part is None)
-    return open_for_reading(target.place, storage_options)
+    return open_for_reading(target.place if out is None else str(out), storage_options)  # a place lacks a URL's "#..."
 
 
 def paint(

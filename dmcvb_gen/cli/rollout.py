@@ -68,6 +68,10 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
         return click.echo(script_for_slurm(slurm_script, workers), nl=False)
     target = target_for(options, request)
     if finishing:
+        if request and (more := rollout_plan(options, request, target).growth):
+            raise click.UsageError(
+                f"{target.place} does not have {', '.join(more[:3])}, and --finish makes nothing; remove --finish."
+            )
         return _finish(target, finish_target, as_json)
     plan = rollout_plan(options, request, target)
     if request:

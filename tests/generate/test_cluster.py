@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+import dmcvb_gen
 from dmcvb_gen import files
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release, writer
@@ -649,3 +650,34 @@ def test_a_ray_cluster_verifies_exports_and_validates_as_one_process_does(tmp_pa
         ray.shutdown()
     for what in ("verify", "export", "validate"):
         assert told["ray", what] == told["here", what] and told["here", what], what
+
+
+@pytest.mark.parametrize("task, other", [("walker-walk", "cheetah-run"), ("ant-maze-empty7x7", "ant-maze-easy7x7a")])
+def test_finishing_does_not_pass_over_what_is_asked_for(tmp_path, task, other):
+    def finishing(*request):
+        words = [
+            "rollout",
+            *request,
+            "--level",
+            "random",
+            "--max-steps",
+            "5",
+            "--no-pixels",
+            "--out",
+            str(tmp_path / "r"),
+            "--finish",
+        ]
+        return CliRunner().invoke(main, words)
+
+    made = {"levels": ["random"], "episodes": 2, "max_steps": 5, "pixels": False, "progress": False}
+    dmcvb_gen.rollout(task, out=tmp_path / "r", **made)
+    assert finishing(task, "--episodes", "2").exit_code == 0
+    for request in ((other, "--episodes", "2"), (task, "--episodes", "4")):
+        result = finishing(*request)
+        assert result.exit_code == 2 and "--finish makes nothing; remove --finish" in result.output, result.output
+
+
+def test_a_rollout_to_a_url_with_a_hash_sign_is_opened_there(tmp_path):
+    made = {"levels": ["random"], "episodes": 1, "max_steps": 5, "pixels": False, "progress": False}
+    release = dmcvb_gen.rollout("walker-walk", out=f"file://{tmp_path}/run#1", **made)
+    assert list(release) == ["walker-walk/random/none"] and (tmp_path / "run#1").is_dir()
