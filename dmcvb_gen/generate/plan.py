@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,7 +42,16 @@ from dmcvb_gen.dataset.writer import (
 )
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
-from dmcvb_gen.files import copy_file, free_bytes, json_bytes, sha256_bytes, sha256_file, write_bytes
+from dmcvb_gen.files import (
+    copy_file,
+    folder_in_the_making,
+    free_bytes,
+    json_bytes,
+    remove_partial,
+    sha256_bytes,
+    sha256_file,
+    write_bytes,
+)
 from dmcvb_gen.generate.inputs import BUILTIN, Inputs
 from dmcvb_gen.generate.jobs import Job, left_to_do, make_jobs, part_of
 from dmcvb_gen.generate.recipe import Recipe, SubsetRequest, expand
@@ -381,8 +389,9 @@ def _send(target: Target, made: Mapping[str, Path], names: Iterable[str], tick: 
 @contextlib.contextmanager
 def _temporary_folder(target: Target) -> Iterator[Path]:
     """A temporary folder in a target's scratch; a full disk is an error of one line."""
-    with storage_errors(target.scratch, "write to"), tempfile.TemporaryDirectory(dir=target.scratch) as folder:
-        yield Path(folder)
+    remove_partial(target.scratch, below=False)  # what a killed rollout left
+    with storage_errors(target.scratch, "write to"), folder_in_the_making(target.scratch, "metadata") as folder:
+        yield folder
 
 
 def _begun(root: Path, plan: Plan, manifest: Manifest, records: Sequence[SubsetRecord]) -> dict[str, Path]:

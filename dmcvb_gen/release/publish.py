@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -110,9 +109,11 @@ def light_copy(path: str | Path) -> Iterator[str]:
     from dmcvb_gen.release.card import README, write_card
 
     folder = Path(path)
-    with storage_errors(folder, "write beside"):
-        made = tempfile.TemporaryDirectory(dir=folder.resolve().parent, prefix=f".{folder.name}-light-")
-    with made as light:
+    beside = folder.resolve().parent
+    files.remove_partial(beside, below=False)  # what a killed publish left
+    with contextlib.ExitStack() as stack:
+        with storage_errors(folder, "write beside"):
+            light = str(stack.enter_context(files.folder_in_the_making(beside, f"{folder.name}-light")))
         without_pictures(folder, light)
         if (folder / README).is_file():
             with storage_errors(folder):

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -681,3 +682,19 @@ def test_a_rollout_to_a_url_with_a_hash_sign_is_opened_there(tmp_path):
     made = {"levels": ["random"], "episodes": 1, "max_steps": 5, "pixels": False, "progress": False}
     release = dmcvb_gen.rollout("walker-walk", out=f"file://{tmp_path}/run#1", **made)
     assert list(release) == ["walker-walk/random/none"] and (tmp_path / "run#1").is_dir()
+
+
+def test_folders_of_killed_processes_are_removed_by_the_next_ones(tmp_path):
+    killed = subprocess.Popen([sys.executable, "-c", ""])
+    killed.wait()
+    scratch, release = tmp_path / "scratch/dmcvb-gen", tmp_path / "release"
+    left = [scratch / ".metadata.OWNER.x8.partial", tmp_path / ".release-light.OWNER.x8.partial"]
+    left = [path.with_name(path.name.replace("OWNER", f"{files._machine()}@{killed.pid}")) for path in left]
+    for folder in left:
+        (folder / "arrays").mkdir(parents=True)
+    prepare(light_plan(Target.at(f"file://{tmp_path}/bucket", scratch=tmp_path / "scratch")))
+    assert not left[0].exists()
+    made = {"levels": ["random"], "episodes": 1, "max_steps": 5, "size": 16, "progress": False}
+    dmcvb_gen.rollout("walker-walk", out=release, **made)
+    dmcvb_gen.publish(release, f"file://{tmp_path}/there", pixels=False, progress=False)
+    assert not list(tmp_path.rglob("*.partial"))
