@@ -68,7 +68,8 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
         return click.echo(script_for_slurm(slurm_script, workers), nl=False)
     target = target_for(options, request)
     if finishing:
-        if request and (more := rollout_plan(options, request, target).growth):
+        begun = target.manifest() is not None
+        if begun and request and (more := rollout_plan(options, request, target).growth):
             raise click.UsageError(
                 f"{target.place} does not have {', '.join(more[:3])}, and --finish makes nothing; remove --finish."
             )
