@@ -285,7 +285,7 @@ class Storage(abc.ABC):
           new: the last one must not be there yet.
 
         Returns:
-          False if it was; then the others are what they were, unless somebody wrote it in the same moment.
+          False if it was there. Then nothing is written, unless another process wrote it at the same moment.
         """
         *others, (path, data) = contents.items()
         if new and self.size(path) is not None:

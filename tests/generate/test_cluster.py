@@ -395,7 +395,7 @@ def test_damaged_metadata_of_a_bucket_in_the_making_are_one_line(tmp_path, damag
         bucket.bring_metadata(record, tmp_path / "staged")
 
 
-def test_what_was_left_before_the_machine_was_started_again_keeps_nobody_waiting(tmp_path, monkeypatch):
+def test_folders_left_before_a_restart_of_the_machine_are_of_no_running_process(tmp_path, monkeypatch):
     def start(boot, host="a" * 32):
         for name, text in {"BOOT": boot, "HOST": host}.items():
             (tmp_path / name).write_text(text)
