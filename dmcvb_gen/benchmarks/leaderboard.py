@@ -251,7 +251,7 @@ def _row_of(result: dict[str, Any], facts: dict[str, Any], release: Release) -> 
 
 
 def _command(result: dict[str, Any], facts: dict[str, Any]) -> str:
-    """The command that trains and scores a cell, run beside its release."""
+    """The command that trains and scores a cell, run beside its release; FOLDER and FILE stand for a user's own."""
     cell, machine = result["cell"], result["machine"]
     subsets = dict.fromkeys(part["subset"] for part in (*cell["pretrain"], *cell["policy"]))
     profile, _, scale = result["profile"]["name"].partition(" x")
@@ -262,7 +262,19 @@ def _command(result: dict[str, Any], facts: dict[str, Any]) -> str:
         words[-2:] = ["--agent", cell["agent_name"], "--agents", "state-bc"]
     words += [word for subset in subsets for word in ("--only", subset)]
     words += ["--seed", str(result["seed"]), "--precision", machine["precision"]]
+    if (videos := result["evaluation"].get("backgrounds")) and videos != _builtin_videos():
+        words += ["--backgrounds", "FOLDER"]
+    if cell["agent"]["pretrain"] == "dino":
+        words += ["--dino-weights", "FILE"]
     return shlex.join(words)
+
+
+def _builtin_videos() -> str:
+    """Digest of the package's own videos of the evaluation."""
+    from dmcvb_gen.benchmarks.evaluate import SPLIT
+    from dmcvb_gen.distractors import load_backgrounds
+
+    return load_backgrounds("builtin", SPLIT).digest
 
 
 def add_rows(folder: str | Path, rows: dict[str, tuple[Row, Path | None]]) -> list[Row]:
@@ -314,7 +326,6 @@ def check_row(folder: str | Path, row: Row, evaluate: Callable[..., Any] | None 
     """
     from dmcvb_gen.benchmarks import evaluate as evaluation
     from dmcvb_gen.benchmarks.trained import load_agent
-    from dmcvb_gen.distractors import load_backgrounds
 
     if row.policy is None:
         return Check(row, (), None, f"no policy file; train it: {row.command}")
@@ -322,7 +333,7 @@ def check_row(folder: str | Path, row: Row, evaluate: Callable[..., Any] | None 
     if not path.exists() or sha256_file(path) != row.policy:
         raise DmcvbError(f"{path} is not the row's policy file (SHA-256 {row.policy[:16]}...); get it again")
     how, agent = row.evaluation, load_agent(path)
-    if how.backgrounds and load_backgrounds("builtin", evaluation.SPLIT).digest != how.backgrounds:
+    if how.backgrounds and how.backgrounds != _builtin_videos():
         raise DmcvbError(f"{row.name} was evaluated with videos of its own, which this package does not have")
     pictures = dict(size=how.size, renderer=how.renderer, samples=how.samples) if agent.pixels else {}
     limits = dict(episodes=how.episodes, seed=how.seed, max_steps=how.steps)

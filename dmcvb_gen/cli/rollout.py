@@ -18,7 +18,7 @@ from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.cli.unused_options import check_exclusive_options
 from dmcvb_gen.progress import ProgressBar
-from dmcvb_gen.storage.remote import is_url
+from dmcvb_gen.storage.remote import check_place, is_url
 from dmcvb_gen.text import format_bytes, pluralize
 
 OPTION_GROUPS = {
@@ -63,6 +63,7 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     check_exclusive_options(click.get_current_context())
     request, workers = request_of(options), options["workers"]
     if slurm_script:
+        check_place(options["out"] or "")
         if request:
             describe(request, pixels=options["pixels"])  # or says why each task would be refused; this needs no GPU
         return click.echo(script_for_slurm(slurm_script, workers), nl=False)

@@ -129,6 +129,18 @@ def test_a_rows_command_names_its_cell(walkers, mazes):
             assert only == f"{task_folder(row.task)}/{row.data}/{row.setting}"
 
 
+def test_a_rows_command_asks_for_the_videos_and_weights_that_are_a_users(walkers, tmp_path):
+    facts = facts_of(walkers)
+    result = next(r for r in facts["results"] if r["evaluation"].get("backgrounds"))
+    result["evaluation"]["backgrounds"] = "another digest"
+    result["cell"]["agent"]["pretrain"] = "dino"
+    (tmp_path / "report.json").write_text(json.dumps(facts | {"results": [result]}))
+    [(row, _)] = rows_of_report(tmp_path).values()
+    assert row.command.endswith("--backgrounds FOLDER --dino-weights FILE")
+    for other, _ in rows_of_report(walkers).values():
+        assert "FOLDER" not in other.command and "FILE" not in other.command
+
+
 def test_a_row_says_whether_its_release_has_pictures(walkers, tmp_path):
     facts = facts_of(walkers)
     for pixels, command in ((True, "--recipe small"), (False, "--recipe small --no-pixels")):

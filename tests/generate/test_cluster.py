@@ -547,8 +547,9 @@ def test_no_slurm_script_is_printed_for_what_each_task_would_refuse(tmp_path):
     for arguments in (
         ["walker-wlak"],
         ["walker-walk", "--distractor", "static", "--backgrounds", str(tmp_path / "no")],
+        ["walker-walk", "--out", "s3:/bucket/x"],
     ):
-        result = CliRunner().invoke(main, ["rollout", *arguments, "--out", "s3://bucket/x", "--slurm-script", "3"])
+        result = CliRunner().invoke(main, ["rollout", "--out", "s3://bucket/x", *arguments, "--slurm-script", "3"])
         assert result.exit_code == 2 and "#SBATCH" not in result.output
 
 
