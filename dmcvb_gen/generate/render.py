@@ -15,10 +15,10 @@ from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
-from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.generate.modalities import Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.rendering import available_renderers, make_renderer
+from dmcvb_gen.rendering import make_renderer, renderer_class
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import get_task
@@ -33,12 +33,9 @@ SIMULATION_STREAMS = ("initial_state", "policy")
 
 
 def check_renderer(name: str) -> None:
-    """Raises an error when a renderer is unknown or cannot start here."""
-    available = available_renderers()
-    if name not in available:
-        raise UnknownNameError("renderer", name, available)
-    if available[name]:
-        raise RenderingError(f"renderer {name!r} cannot start here: {available[name]}")
+    """Raises an error when a renderer is unknown or cannot start here. The others are not tried: OpenGL takes long."""
+    if reason := renderer_class(name).unavailable():
+        raise RenderingError(f"renderer {name!r} cannot start here: {reason}")
 
 
 def renderer_for(
