@@ -7,12 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.parallel import IN_FLIGHT, Future, open_pool, run_all
+from dmcvb_gen.parallel.base import Needs
+from dmcvb_gen.parallel.ray_pool import RayPool
 
 
 def square(number, tick):
@@ -159,3 +162,52 @@ def test_workers_end_when_their_parent_was_killed(tmp_path):
     while any(os.path.exists(f"/proc/{pid}") for pid in workers) and time.time() < deadline:
         time.sleep(0.05)
     assert not any(os.path.exists(f"/proc/{pid}") for pid in workers)
+
+
+# -- Ray ------------------------------------------------------------------------------------------
+
+
+class SlowCluster(types.ModuleType):
+    """The part of Ray that the pool uses; work is done at the third look at it."""
+
+    def __init__(self, **resources):
+        super().__init__("ray")
+        self.exceptions = types.SimpleNamespace(RayTaskError=ZeroDivisionError)
+        self.looks, self.resources = 0, resources
+
+    def is_initialized(self):
+        return True
+
+    def remote(self, **_):
+        return lambda function: types.SimpleNamespace(remote=lambda *arguments: (function, arguments))
+
+    def wait(self, running, **_):
+        self.looks += 1
+        return (running[:1], []) if self.looks > 2 else ([], running)
+
+    def get(self, reference):
+        function, arguments = reference
+        return function(*arguments)
+
+    def nodes(self):
+        return [{"Alive": True, "Resources": self.resources}, {"Alive": False, "Resources": {"CPU": 9, "GPU": 9}}]
+
+    def cluster_resources(self):
+        return self.resources
+
+
+@pytest.mark.parametrize(
+    ("needs", "told"),
+    [
+        (Needs(cpus=2, memory=4_000_000_000), []),
+        (Needs(gpus=1), ["waiting for a Ray node with 1 CPU, 1 GPU: no node has that"]),
+        (Needs(cpus=4), ["waiting for a Ray node with 4 CPUs: no node has that"]),
+        (Needs(memory=9_000_000_000), ["waiting for a Ray node with 1 CPU, 9.0 GB of memory: no node has that"]),
+    ],
+)
+def test_a_cluster_without_a_node_for_the_work_says_once_what_it_waits_for(needs, told, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "ray", SlowCluster(CPU=2.0, memory=8e9))
+    pool = RayPool(needs=needs)
+    pool.submit("a", square, 3)
+    assert list(pool.results()) == [("a", 9)]
+    assert [record.getMessage() for record in caplog.records] == told
