@@ -26,6 +26,7 @@ from dmcvb_gen.options import (
     Share,
     Span,
     Split,
+    checked,
 )
 from dmcvb_gen.parallel import Workers, ignore
 from dmcvb_gen.parallel.cores import usable_cores
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from dmcvb_gen.release.verify import Verification
 
 
+@checked
 def rollout(
     tasks: Names = (),
     *,
@@ -147,6 +149,7 @@ def rollout(
     return open_for_reading(target.place if out is None else str(out), storage_options)  # a place lacks a URL's "#..."
 
 
+@checked
 def paint(
     release: Local,
     *,
@@ -186,6 +189,7 @@ def paint(
         return paint_release(release, as_names(only), episodes, config)
 
 
+@checked
 def repaint(
     release: Location,
     *,
@@ -210,7 +214,7 @@ def repaint(
       release (RELEASE): Folder of the release.
       only (PATTERN): Use only these subsets.
       distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: the subset's own]
-      difficulty: Strength of the distractors. [default: the subset's own]
+      difficulty: Strength of the distractors. [default: the subset's own; medium with --distractor]
       size: Width and height in pixels. [default: the subset's own]
       renderer: native, warp or opengl. [default: the subset's own]
       samples: Samples per pixel: 1, 2, 4 or 8.
@@ -235,6 +239,7 @@ def repaint(
     return open_for_reading(str(out))
 
 
+@checked
 def regenerate(
     release: Location | None = None,
     *,
@@ -282,6 +287,7 @@ def regenerate(
         return work.remake(out, bar) if out else work.check(bar) if check else work.repair(bar)
 
 
+@checked
 def verify(
     release: Location,
     *,
@@ -316,6 +322,7 @@ def verify(
         return run(release, None if backgrounds is None else str(backgrounds), bar, workers or 1)
 
 
+@checked
 def publish(
     release: Location,
     url: str,
@@ -346,6 +353,7 @@ def publish(
         return publish_folder(release, url, tick=bar, **given)
 
 
+@checked
 def fetch(
     url: str,
     out: Local,
@@ -406,6 +414,7 @@ def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore)
         return fetch_and_paint(*what, painter=painter, tick=moved, **given)
 
 
+@checked
 def export(
     release: Location,
     to: str,
@@ -449,6 +458,7 @@ TRAINING = (
 """Options of `validate` that say what is trained, and how."""
 
 
+@checked
 def validate(
     release: Location,
     *,

@@ -5,11 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import inspect
+import numbers
+import types
+import typing
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, ParamSpec, TypeVar
 
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.spec import DIFFICULTIES, GOAL_PICTURES, REWARDS, SPLITS
 
 
@@ -20,6 +26,16 @@ class Between:
     lowest: float
     highest: float | None = None
     open: bool = False
+
+    def allow(self, value: float) -> bool:
+        """Whether a number is within the bounds."""
+        above = value > self.lowest if self.open else value >= self.lowest
+        return above and (self.highest is None or value <= self.highest)
+
+    def __str__(self) -> str:
+        """The bounds in words."""
+        lowest = f"above {self.lowest:g}" if self.open else f"of at least {self.lowest:g}"
+        return lowest + (f" and at most {self.highest:g}" if self.highest is not None else "")
 
 
 LOCAL = "local"
@@ -41,3 +57,65 @@ GoalPictures = Annotated[str, GOAL_PICTURES]
 Precision = Annotated[str, ("auto", "float32", "bfloat16")]
 Reward = Annotated[str, REWARDS]
 Split = Annotated[str, SPLITS]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: a function refuses arguments that its types do not allow, as its command does.
+
+    Numbers become Python's own, and iterators tuples, so that they can be read more than once.
+
+    Raises:
+      DmcvbError: at a call, a number that is none or out of bounds. UnknownNameError: a word that is no choice.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        given = signature.bind(*args, **kwargs)
+        for name, value in given.arguments.items():
+            given.arguments[name] = _checked(name, value, signature.parameters[name].annotation)
+        return function(*given.args, **given.kwargs)
+
+    return call
+
+
+def _checked(name: str, value: Any, annotation: Any) -> Any:
+    kinds, marks = parts_of(annotation)
+    if value is None:
+        return value
+    if any(typing.get_origin(kind) is Sequence for kind in kinds):
+        return value if isinstance(value, str | Path) or not hasattr(value, "__iter__") else tuple(value)
+    choices = next((mark for mark in marks if isinstance(mark, tuple)), None)
+    if choices and value not in choices:
+        raise UnknownNameError(name, value, choices)
+    numeric = {int, float} & set(kinds)
+    if not numeric or any(isinstance(kind, type) and isinstance(value, kind) for kind in set(kinds) - numeric):
+        return value
+    bounds = next((mark for mark in marks if isinstance(mark, Between)), None)
+    return _number(name, value, float not in numeric, bounds)
+
+
+def _number(name: str, value: Any, whole: bool, bounds: Between | None) -> int | float:
+    wanted = "a whole number" if whole else "a number"
+    fits = isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
+    if not fits:
+        raise DmcvbError(f"{name} is {value!r}; give {wanted}")
+    number = int(value) if whole else float(value)
+    if bounds and not bounds.allow(number):
+        raise DmcvbError(f"{name} is {number}; give {wanted} {bounds}")
+    return number
+
+
+def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:
+    """The types of a union but None, and the marks that `Annotated` sets on them."""
+    if typing.get_origin(annotation) is Annotated:
+        inner, *marks = typing.get_args(annotation)
+        kinds, more = parts_of(inner)
+        return kinds, [*marks, *more]
+    if typing.get_origin(annotation) not in (typing.Union, types.UnionType):
+        return ([] if annotation is type(None) else [annotation]), []
+    parts = [parts_of(part) for part in typing.get_args(annotation)]
+    return [kind for kinds, _ in parts for kind in kinds], [mark for _, marks in parts for mark in marks]

@@ -168,6 +168,8 @@ class Distractor:
     def __post_init__(self) -> None:
         if self.kind not in DISTRACTOR_KINDS and self.kind not in distractor_kinds():
             raise UnknownNameError("distractor", self.kind, distractor_kinds())
+        if not isinstance(self.difficulty, str):
+            raise DmcvbError(f"difficulty is {self.difficulty!r}; give a word, e.g. 'medium' or '0.35'")
         object.__setattr__(self, "difficulty", _canonical(self.difficulty))
         if self.difficulty not in DIFFICULTIES and self.kind == "none":
             raise DmcvbError(f"distractor none has no difficulty; {self.difficulty} is for static or dynamic")
@@ -187,6 +189,11 @@ class Distractor:
     def varies(self, part: str) -> bool:
         """Return True if a part (of `ALL_PARTS`) varies; none does under a user's own kind."""
         return self.kind in DISTRACTOR_KINDS and self.kind != "none" and part in _strengths(self.difficulty)
+
+    @property
+    def shows_videos(self) -> bool:
+        """Whether the background is a video; a user's own kind may show one."""
+        return self.varies("background") or self.kind not in DISTRACTOR_KINDS
 
     def scale_of(self, part: str) -> float:
         """The scale s of a part's ranges, or the correlation of a cue; 0 if it does not vary."""

@@ -17,9 +17,9 @@ def quoted(place: str | Path) -> str:
     return shlex.quote(str(place))
 
 
-def as_names(value: str | Iterable) -> tuple[str, ...]:
+def as_names(value: str | Path | Iterable) -> tuple[str, ...]:
     """One name or several, as several."""
-    return (value,) if isinstance(value, str) else tuple(map(str, value))
+    return (str(value),) if isinstance(value, str | Path) else tuple(map(str, value))
 
 
 def format_bytes(count: float) -> str:

@@ -13,7 +13,13 @@ from dmcvb_gen.progress import ProgressBar
 @click.command()
 @click.option("--videos", type=click.IntRange(1), default=8, show_default=True, help="Clips for each of train and val.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed of the clips.")
-@click.option("--out", type=OutPath(path_type=Path), default=Path("data/backgrounds"), show_default=True)
+@click.option(
+    "--out",
+    type=OutPath(path_type=Path),
+    default=Path("data/backgrounds"),
+    show_default=True,
+    help="Folder of the clips.",
+)
 @click.option("--sheet", type=OutPath(path_type=Path), help="Also write a contact sheet of them, a PNG.")
 @json_option
 def backgrounds(videos, seed, out, sheet, as_json):
@@ -23,6 +29,8 @@ def backgrounds(videos, seed, out, sheet, as_json):
     dmcvb-gen backgrounds --videos 60 --seed 1 --out data/backgrounds --sheet sheet.png
     dmcvb-gen rollout walker-walk --distractor dynamic --backgrounds data/backgrounds
     """
+    if sheet and sheet.suffix.lower() != ".png":
+        raise click.UsageError(f"--sheet {sheet} is no PNG: give a name that ends in .png")
     from PIL import Image
 
     from dmcvb_gen.distractors.clips import clip_sheet, make_clips

@@ -40,7 +40,7 @@ def info(path, options, as_json):
     rows = []
     for subset in facts["subsets"]:
         planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
-        mark = " *" if subset["paper"] and subset["shorter"] else ""
+        mark = " *" if subset["paper"] and subset["other_length"] else ""
         rows.append(
             (
                 subset["name"] + mark,
@@ -65,8 +65,8 @@ def info(path, options, as_json):
     if facts["disk_bytes"] not in (None, facts["bytes"]):
         size += f" ({format_bytes(facts['disk_bytes'])} on disk)"
     click.echo(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}")
-    if any(subset["paper"] and subset["shorter"] for subset in facts["subsets"]):
-        click.echo("* Episodes end sooner than the paper's, so their returns cannot be compared.")
+    if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
+        click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
         paint = f"fetch {public(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(path)}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")

@@ -16,7 +16,6 @@ switched off (pixels: --no-pixels). With `workers` come --executor and --ray-add
 import functools
 import inspect
 import re
-import types
 import typing
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
@@ -25,7 +24,7 @@ import click
 
 from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
 from dmcvb_gen.cli.unused_options import is_given
-from dmcvb_gen.options import LOCAL, Between
+from dmcvb_gen.options import LOCAL, Between, parts_of
 from dmcvb_gen.parallel import Ray, Workers
 
 METAVARS = {"RANGE": "A:B", "BEHAVIOUR": "FILE|RUN|MODULE:FUNCTION"}
@@ -104,18 +103,6 @@ def help_of(function: Callable) -> dict[str, tuple[str | None, str]]:
     found = re.findall(r"^  (\w+)(?: \((.+?)\))?: (.+(?:\n   .+)*)", block, re.MULTILINE)
     found = [(name, METAVARS.get(metavar, metavar), text) for name, metavar, text in found]
     return {name: (metavar or None, re.sub(r"\s+", " ", text).replace(" [d", "  [d")) for name, metavar, text in found}
-
-
-def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:
-    """The types of a union but None, and the marks that `Annotated` sets on them."""
-    if typing.get_origin(annotation) is Annotated:
-        inner, *marks = typing.get_args(annotation)
-        kinds, more = parts_of(inner)
-        return kinds, [*marks, *more]
-    if typing.get_origin(annotation) not in (typing.Union, types.UnionType):
-        return ([] if annotation is type(None) else [annotation]), []
-    parts = [parts_of(part) for part in typing.get_args(annotation)]
-    return [kind for kinds, _ in parts for kind in kinds], [mark for _, marks in parts for mark in marks]
 
 
 def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:

@@ -215,12 +215,11 @@ def diff_command(one, other, data, options, as_json):
     dmcvb-gen diff releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen diff releases/imported releases/mine --data
     """
-    from dmcvb_gen.dataset import open_release
     from dmcvb_gen.release.compare import compare
-    from dmcvb_gen.release.diff import diff
+    from dmcvb_gen.release.diff import diff, open_both
 
     found = diff(one, other, options)
-    compared = compare(open_release(one, options), open_release(other, options)) if data else []
+    compared = compare(*open_both(one, other, options)) if data else []
     facts: dict[str, Any] = {"differences": [dataclasses.asdict(difference) for difference in found]}
     facts["data"] = [dataclasses.asdict(row) | {"z": row.z} for row in compared]
     answer(as_json, facts, *(map(str, found) if found else ["no difference"]))

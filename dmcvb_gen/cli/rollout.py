@@ -176,7 +176,7 @@ def _show_plan(plan, workers, as_json):
         facts |= dict(
             steps=cost.steps, bytes=round(cost.bytes), disk_bytes=round(disk), core_hours=cost.core_seconds / 3600
         )
-        facts |= dict(hours=cost.seconds(workers) / 3600, workers=workers)
+        facts |= dict(hours=cost.seconds(min(workers, cores)) / 3600, workers=workers)
         rates = {name: dataclasses.asdict(rate) for name, rate in cost.rates.items()}
         for rate in rates.values():
             rate["steps_per_second"] = 1 / rate.pop("seconds_per_step")
@@ -189,13 +189,13 @@ def _show_plan(plan, workers, as_json):
         ],
         title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
     )
-    spans = {count: format_duration(cost.seconds(count)) for count in (workers, cores, 64)}
+    asked, here, many = (format_duration(cost.seconds(count)) for count in (min(workers, cores), cores, 64))
     click.echo(f"release: {plan.target.place}")
     size = format_bytes(cost.bytes) + (f" ({format_bytes(disk)} on disk)" if disk < 0.99 * cost.bytes else "")
     click.echo(
         f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; {cost.steps:,} steps, {size}"
     )
     click.echo(
-        f"core time: {format_duration(cost.core_seconds)}; {spans[workers]} with --workers {workers}, "
-        f"{spans[cores]} with the {cores} cores here, {spans[64]} with 64"
+        f"core time: {format_duration(cost.core_seconds)}; {asked} with --workers {workers}, "
+        f"{here} with the {cores} cores here, {many} with 64"
     )

@@ -251,6 +251,11 @@ class Manifest(_Model):
                 generator = addition.generator if addition.subsets[subset][0] == 0 else generator
         return version, generator
 
+    def labels_of(self, subset: str) -> tuple[str, ...]:
+        """Modalities that a repaint stored in a subset, which rollouts do not make."""
+        made = [entry["labels"] for entry in self.lineage if entry.get("labels") and subset in entry["subsets"]]
+        return tuple(dict.fromkeys(label for labels in made for label in labels))
+
 
 def subset_path(name: str) -> str:
     """Folder of a subset's Zarr group inside the release."""

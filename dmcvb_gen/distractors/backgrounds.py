@@ -129,10 +129,11 @@ def _open(source: str, split: str, videos: tuple, stamps: tuple) -> Backgrounds:
 
 
 def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:
+    folders = _split_folders(root)
     for name in _SPLITS[split]:
-        if (root / name).is_dir():
+        if name in folders:
             return _find_videos(root / name)
-    if any((root / name).is_dir() for names in _SPLITS.values() for name in names):
+    if folders:
         raise BackgroundError(f"{root} has no {' or '.join(_SPLITS[split])} folder beside its other split")
     videos = _find_videos(root)
     if len(videos) == 1:
@@ -140,10 +141,20 @@ def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:
     return videos[1::2] if split == "val" else videos[::2]
 
 
+def _split_folders(root: Path) -> list[str]:
+    """Folders of a split, like "train". One of images alone among other videos is a video: DAVIS has a "train"."""
+    found = [name for names in _SPLITS.values() for name in names if (root / name).is_dir()]
+    if len(found) != 1:
+        return found
+    kinds = {path.suffix.lower() for path in _listed(root / found[0])}
+    one_of_many = any(name.partition("/")[0] != found[0] for name, _ in _find_videos(root))
+    return [] if kinds and kinds <= PICTURES and one_of_many else found
+
+
 def videos_by_split(source: str | Path) -> dict[str, int] | None:
     """Return how many videos each split takes; None if the folder is split already, or holds fewer than two."""
     root = Path(source)
-    if not root.is_dir() or any((root / name).is_dir() for names in _SPLITS.values() for name in names):
+    if not root.is_dir() or _split_folders(root):
         return None
     count = len(_find_videos(root))
     return {split: len(_find_split(root, split)) for split in _SPLITS} if count > 1 else None
@@ -184,6 +195,8 @@ def _decode(files: tuple[Path, ...]) -> np.ndarray:
                 parts.append(_read_pictures(path))
             else:
                 parts.append(_read_video(path))
+        except ModuleNotFoundError:  # the command says what to install
+            raise
         except Exception as error:  # decoders raise many kinds; all mean the same to the user
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise BackgroundError(f"cannot read background {path} ({reason}); remove or replace the file") from None
@@ -205,8 +218,15 @@ def _read_pictures(path: Path) -> np.ndarray:
                 picture.seek(index)
             except EOFError:
                 break
-            frames.append(square(picture.convert("RGB")))
+            frames.append(square(_eight_bits(picture).convert("RGB")))
     return np.stack(frames)
+
+
+def _eight_bits(picture: Image.Image) -> Image.Image:
+    """Scale images of 16 bits, which `convert` would cut at 255."""
+    return (
+        picture.convert("I").point(lambda value: value / 257).convert("L") if picture.mode.startswith("I") else picture
+    )
 
 
 def _read_video(path: Path) -> np.ndarray:

@@ -89,4 +89,4 @@ def floor_alpha_for(task: Task, setting: Distractor) -> float:
 
     Walker and cheetah 1.0, reacher 0.0, otherwise 0.3 (Distracting Control Suite); untouched if no background is shown.
     """
-    return task.floor_alpha if setting.varies("background") or setting.kind not in KINDS else 1.0
+    return task.floor_alpha if setting.shows_videos else 1.0

@@ -26,7 +26,7 @@ RADIUS_RANGE = (0.5, 1.5)  # times s: how much nearer and farther than r0, as a 
 
 @dataclass(frozen=True)
 class CameraRange:
-    """Range of the camera: radius (m), polar angle from +z in [0, pi/2], azimuth in [-pi, 0], roll (radians)."""
+    """Range of the camera: radius (m), polar angle from +z, azimuth, roll (radians)."""
 
     low: np.ndarray
     high: np.ndarray
@@ -63,14 +63,21 @@ def _cartesian(radius: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.n
 def camera_range(offset: np.ndarray, setting: Distractor) -> CameraRange:
     """The ranges around a nominal camera.
 
+    The camera stays above the agent's center of mass and on its side of the plane y = 0, in front of the scenery. A
+    nominal camera that is below keeps its range if no part of that is above.
+
     Args:
       offset: (3,) nominal camera minus centre of mass, meters.
     """
     radius, polar, azimuth = spherical(offset)
     scale = setting.scale_of("camera")
     angle = ANGLE_RANGE * scale
-    low = np.array([radius * (1 - RADIUS_RANGE[0] * scale), max(polar - angle, 0.0), max(azimuth - angle, -np.pi)])
-    high = np.array([radius * (1 + RADIUS_RANGE[1] * scale), min(polar + angle, np.pi / 2), min(azimuth + angle, 0.0)])
+    horizon = np.pi / 2 if polar - angle < np.pi / 2 else np.pi
+    side = (-np.pi, 0.0) if azimuth <= 0 else (0.0, np.pi)
+    low = np.array([radius * (1 - RADIUS_RANGE[0] * scale), max(polar - angle, 0.0), max(azimuth - angle, side[0])])
+    high = np.array(
+        [radius * (1 + RADIUS_RANGE[1] * scale), min(polar + angle, horizon), min(azimuth + angle, side[1])]
+    )
     return CameraRange(low, high, float(radius), angle)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import metadata
 
 from dmcvb_gen import seeding
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, OPTIONAL_LABELS
 from dmcvb_gen.distractors.background import Background
 from dmcvb_gen.distractors.base import KINDS, Distractor, DistractorPart
 from dmcvb_gen.distractors.camera import Camera
@@ -37,6 +37,8 @@ def register_distractor(distractor: type[DistractorPart]) -> type[DistractorPart
             raise ValueError(f"distractor kind {kind!r}: give a new word of letters, digits and '-'")
     if unknown := set(distractor.names) - set(DISTRACTOR_STATE_NAMES):
         raise ValueError(f"labels {sorted(unknown)} are not among {DISTRACTOR_STATE_NAMES}")
+    if optional := set(distractor.names) & OPTIONAL_LABELS.keys():
+        raise ValueError(f"label {', '.join(optional)} is stored only if `light` varies: use --vary light")
     if distractor.stream not in seeding.STREAMS:
         raise ValueError(f"stream {distractor.stream!r} is not one of {seeding.STREAMS}")
     for kind in distractor.kinds:

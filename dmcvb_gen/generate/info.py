@@ -58,7 +58,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 renderer=subset.record.renderer.get("name"),
                 digest=subset.record.digest,
                 returns=return_statistics(subset.returns),
-                shorter=subset.record.max_steps < PAPER_STEPS[is_maze(subset.task)],
+                other_length=subset.record.max_steps != PAPER_STEPS[is_maze(subset.task)],
                 paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
             )
         )

@@ -63,7 +63,7 @@ class RenderOverrides:
       goal: of mazes, only the pictures with the goal ("visible") or without it ("hidden").
 
     Raises:
-      DmcvbError: a size that no renderer takes, or an unknown kind of goal.
+      DmcvbError: a size that no renderer takes, no view at all, or an unknown kind of goal.
     """
 
     size: int | None = None
@@ -73,6 +73,8 @@ class RenderOverrides:
     def __post_init__(self):
         if self.size is not None:
             check_size(self.size)
+        if self.views is not None and not self.views:
+            raise DmcvbError("views names no view; leave it out to have them all")
         if self.goal not in (None, *GOAL_PICTURES):
             raise DmcvbError(f"goal {self.goal!r} is unknown; give one of {', '.join(GOAL_PICTURES)}")
 

@@ -147,6 +147,7 @@ def make_plan(
     jobs = part_of(make_jobs(grown, shards, target, None if target.uploads else inputs, device), part)
     left = left_to_do(jobs, done)
     growth = _growth(there, records) if there is not None else ()
+    _refuse_labels(there, left, target.place)
     return Plan(target, manifest, inputs, left, _count(jobs) - _count(left), growth)
 
 
@@ -168,6 +169,16 @@ def _refuse_half_painted(
             raise StoreError(
                 f"{record.name} of {place} has images, but {len(lacking)} of its shards have none yet; before it "
                 f"grows, paint them: dmcvb-gen paint {quoted(place)} --only {record.name}"
+            )
+
+
+def _refuse_labels(there: Manifest | None, jobs: Iterable[Job], place: str) -> None:
+    """Raises StoreError for shards to be made in a subset with labels that a rollout does not store."""
+    for record in (record for job in jobs for record in job.subsets):
+        if there and (labels := there.labels_of(record.name)):
+            raise StoreError(
+                f"{record.name} of {place} was repainted with {' and '.join(labels)}, which rollout does not store; "
+                "run that repaint again if it was stopped, or grow its source and repaint that into another --out"
             )
 
 

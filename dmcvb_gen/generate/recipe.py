@@ -340,7 +340,7 @@ def check_options_used(recipe: Recipe, given: Collection[str]) -> None:
       given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".
     """
     subsets = [(t, level, s) for p in recipe.subsets for t in p.tasks for level in p.levels for s in p.settings]
-    videos = any(parse_setting(task, setting)[0].kind != "none" for task, _, setting in subsets)
+    videos = any(parse_setting(task, setting)[0].shows_videos for task, _, setting in subsets)
     mazes = {is_maze(task) for task, _, _ in subsets}
     cures = {
         "backgrounds": (videos, "no subset shows videos; ask for --distractor static or dynamic"),
@@ -370,9 +370,9 @@ def load_recipe(source: str | Path) -> Recipe:
       RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
     """
     path = Path(source)
-    if not path.exists() and not path.suffix and path.name == str(source) and str(source) not in shipped_recipes():
+    if not path.is_file() and not path.suffix and path.name == str(source) and str(source) not in shipped_recipes():
         raise UnknownNameError("recipe", source, shipped_recipes())
-    shipped = not path.exists() and str(source) in shipped_recipes()
+    shipped = not path.is_file() and str(source) in shipped_recipes()
     try:
         data = read_yaml(
             resources.files("dmcvb_gen.generate") / "data" / "recipes" / f"{source}.yaml" if shipped else path

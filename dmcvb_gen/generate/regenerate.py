@@ -236,8 +236,11 @@ class Regeneration:
         if not manifest.complete and any(outcome.repaired for outcome in outcomes):
             finish_together(root)
         elif manifest.complete:
+            inputs = release_inputs(root, records, self.backgrounds)
+            with storage_errors(root, "write to"):
+                digests.remove_damaged_inputs()
             before = _input_files(root)
-            copy_inputs(root, records, release_inputs(root, records, self.backgrounds))
+            copy_inputs(root, records, inputs)
             restored += sorted(_input_files(root) - before)
             commits = {record.name: read_commits(root, record) for record in manifest.subsets}
             repaired = [commits[found.subset][found.shard] for found in outcomes if found.repaired]
@@ -508,6 +511,12 @@ class _Digests:
             restored.append(path)
         mark_created(self.root, record)
         return restored
+
+    def remove_damaged_inputs(self) -> None:
+        """Remove policies and videos that do not have their digests, so that they are copied again."""
+        for path in _input_files(self.root) & self._digests.keys():
+            if sha256_file(self.root / path) != self._digests[path]:
+                (self.root / path).unlink()
 
     def _source(self, path: str) -> Path | None:
         """The file itself, or one of another subset with its digest."""

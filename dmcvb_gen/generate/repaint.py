@@ -147,10 +147,20 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
 
 def _check_options_used(request: Repainting, records: Sequence[SubsetRecord]) -> None:
     """Refuse options of distractors that none of the new subsets has."""
-    kinds = {record.distractor.kind for record in records}
-    for name in ("difficulty", "backgrounds"):
-        if getattr(request, name) and kinds <= {"none"}:
-            raise RecipeError(f"--{name} has no effect here: these subsets have no distractors; remove it")
+    varied = any(record.distractor.kind != "none" for record in records)
+    videos = any(record.distractor.shows_videos for record in records)
+    heard = {
+        "difficulty": (varied, "have no distractors"),
+        "backgrounds": (videos, "show no videos"),
+        "split": (videos or any(is_maze(record.task) for record in records), "show no videos"),
+    }
+    for name, (has_effect, why) in heard.items():
+        if getattr(request, name) and not has_effect:
+            raise RecipeError(f"--{name} has no effect here: these subsets {why}; remove it")
+    if request.difficulty and "_" in (request.distractor or ""):
+        raise RecipeError(
+            f"{request.distractor} names its strength itself: remove --difficulty, or give the kind alone"
+        )
 
 
 def _check_out(out: Path, new: Manifest) -> None:

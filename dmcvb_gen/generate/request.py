@@ -206,7 +206,7 @@ def _difficulty(given: Mapping[str, Any]) -> str:
 def _layout_task(layout: str | Path) -> str:
     from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, layout_task_id
 
-    if Path(layout).suffix or Path(layout).exists():
+    if Path(layout).suffix or Path(layout).is_file():
         return layout_task_id(layout)
     task, known = str(MazeName(str(layout))), [name.removeprefix(f"{ANT_MAZE}-") for name in ANT_MAZE_TASKS]
     maze = MazeName.parse(task)

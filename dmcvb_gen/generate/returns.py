@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Between, Local, Location, Names, Seed
-from dmcvb_gen.spec import Level, is_maze
+from dmcvb_gen.options import Between, Local, Location, Names, Seed, checked
+from dmcvb_gen.spec import Level, is_maze, task_folder
 from dmcvb_gen.text import as_names
 
 
+@checked
 def evaluate_behaviour(
     tasks: Names = (),
     *,
@@ -72,7 +73,7 @@ def evaluate_behaviour(
                 panels[f"{level}, {success:.0%} at the goal"] = walked_paths(task, out)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
         if pictures and panels:
-            save_paths_picture(task.layout, panels, Path(pictures) / f"{task_id}.png")  # type: ignore[attr-defined]
+            save_paths_picture(task.layout, panels, Path(pictures) / f"{task_folder(task_id)}.png")  # type: ignore[attr-defined]
     return rows
 
 

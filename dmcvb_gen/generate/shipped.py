@@ -90,7 +90,7 @@ def manifest_source(source: str | Path) -> Iterator[Path]:
     if path.is_file() and not name.endswith(ENDING):
         yield path
         return
-    if path.is_dir():
+    if path.is_dir() and name not in shipped_manifests():
         raise StoreError(f"{path} is a folder; give it without --manifest, or the file {path / MANIFEST}")
     if not path.is_file() and (path.suffix or path.name != name):
         raise StoreError(f"{path} is not there; give a manifest's file or a name: {', '.join(shipped_manifests())}")

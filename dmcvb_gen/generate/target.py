@@ -43,7 +43,7 @@ from dmcvb_gen.generate.inputs import BUILTIN, Inputs, release_inputs
 from dmcvb_gen.parallel.base import TIDY
 from dmcvb_gen.storage import Storage, open_storage
 from dmcvb_gen.storage.base import in_parallel
-from dmcvb_gen.storage.remote import is_url, local_path, storage_errors
+from dmcvb_gen.storage.remote import check_no_options, is_url, local_path, storage_errors
 
 CONNECTIONS = 8
 """Files of a shard that are sent at once."""
@@ -85,7 +85,8 @@ class Target:
           scratch, scratch_bytes: where shards of a URL are made before they are sent, and how much room they may take,
             over all `workers`; half of what is free by default.
         """
-        if not is_url(str(place)):
+        if not is_url(place):
+            check_no_options(place, options)
             return cls(open_storage(local_path(place)), local_path(place))
         if str(place).startswith("memory:"):
             raise StoreError(f"{place} is lost when this process ends; give a folder or a URL such as s3://bucket/name")

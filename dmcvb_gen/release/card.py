@@ -57,7 +57,7 @@ CITATION = """@inproceedings{ortiz2024dmcvb,
 
 
 def write_card(root: str | Path, out: str | Path | None = None, url: str | None = None) -> list[Path]:
-    """Write README.md, croissant.json, pictures, the table of episodes, and a CHANGELOG.md if there is none.
+    """Write README.md, croissant.json, pictures and the table of episodes; CHANGELOG.md gets the versions it lacks.
 
     Args:
       out: folder of these files; the release by default.
@@ -77,8 +77,7 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
         with replacing(folder / TABLE) as part:
             write_table(release, part)
         texts = _texts(release, folder / TABLE, published)
-        if not (folder / CHANGELOG).exists():
-            texts[CHANGELOG] = _changelog(release.manifest)
+        texts[CHANGELOG] = _changelog(release.manifest, folder / CHANGELOG)
         for name, text in texts.items():
             write_text(folder / name, text)
         with replacing(folder / PLOT) as part:
@@ -92,16 +91,24 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     return [folder / name for name in (*texts, PLOT, SHEET, TABLE)]
 
 
-def _changelog(manifest: Manifest) -> str:
-    """The text of a new CHANGELOG.md: the newest version first, and what each one added."""
+def _changelog(manifest: Manifest, path: Path) -> str:
+    """The text of CHANGELOG.md, the newest version first: what is there, and what each version added that it lacks."""
     first = manifest.recipe.get("version", manifest.version) if manifest.additions else manifest.version
     versions = [(first, ["First release."])]
     for entry in manifest.additions:
         counts = {name: pluralize(end - start, "episodes") for name, (start, end) in entry.subsets.items()}
         more = {name: "more episodes" if start else "a new subset" for name, (start, _) in entry.subsets.items()}
         versions.append((entry.version, [f"`{name}`: {more[name]}, {count}." for name, count in counts.items()]))
-    parts = [f"## {version}\n\n" + "".join(f"- {line}\n" for line in lines) for version, lines in versions[::-1]]
-    return "\n".join([f"# Changelog of {manifest.name}\n", *parts])
+    there = path.read_text(errors="replace") if path.is_file() else f"# Changelog of {manifest.name}\n"
+    parts = [
+        f"## {version}\n\n" + "".join(f"- {line}\n" for line in lines)
+        for version, lines in versions[::-1]
+        if f"## {version}\n" not in there
+    ]
+    if not parts:
+        return there
+    head, mark, older = there.partition("\n## ")
+    return "\n".join([head.rstrip("\n") + "\n", *parts, *([f"## {older}"] if mark else [])])
 
 
 def _told(folder: Path, manifest: Manifest) -> Publication:
@@ -278,7 +285,7 @@ def card_text(
             statistics=STATISTICS,
             deviation=deviation,
             compared=_compared(facts["subsets"]),
-            shorter=_shorter(facts["subsets"]),
+            other_length=_of_other_length(facts["subsets"]),
             far=[f"`{name}`" for name in far_subsets(facts["subsets"])],
             levels=level_statistics(release),
             level_episodes=STATISTICS_EPISODES,
@@ -326,13 +333,13 @@ def far_subsets(subsets: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def _compared(subsets: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Subsets of whole episodes that the paper has, too."""
-    return [subset for subset in subsets if subset["paper"] and not subset["shorter"]]
+    """Subsets of episodes as long as the paper's, if it has them, too."""
+    return [subset for subset in subsets if subset["paper"] and not subset["other_length"]]
 
 
-def _shorter(subsets: Sequence[Mapping[str, Any]]) -> str:
-    """How many subsets have episodes that end sooner than the paper's, in words; "" if none."""
-    count = sum(bool(subset["paper"] and subset["shorter"]) for subset in subsets)
+def _of_other_length(subsets: Sequence[Mapping[str, Any]]) -> str:
+    """How many subsets have episodes of another length than the paper's, in words; "" if none."""
+    count = sum(bool(subset["paper"] and subset["other_length"]) for subset in subsets)
     return "" if not count else "all subsets" if count == len(subsets) else pluralize(count, "subsets")
 
 

@@ -93,9 +93,9 @@ def check_values(subset: Subset) -> Iterator[Issue]:
             or (length < subset.record.max_steps) > values["terminated"]
         ):
             yield Issue("lengths", subset.name, "length, discount and terminated do not agree", episode)
-        key = values["action"].tobytes()
+        key = values["state"].tobytes() + values["action"].tobytes()
         if key in seen:
-            yield Issue("duplicates", subset.name, f"has the actions of episode {seen[key]}", episode)
+            yield Issue("duplicates", subset.name, f"is episode {seen[key]} again", episode)
         seen[key] = episode
 
 

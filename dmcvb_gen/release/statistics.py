@@ -152,14 +152,14 @@ def _mean_length(vectors: list[np.ndarray]) -> float:
 
 
 def _root_columns(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the root's horizontal motion in qpos and qvel: x and y of a free joint, or the slide along x.
+    """Find the root's horizontal motion in qpos and qvel: x and y of a free joint, or the slides along x and y.
 
-    None if the model has neither (a finger, an arm that is fixed to its base).
+    The root is the first body with a joint. None if it has neither (a finger, an arm that is fixed to its base).
     """
-    for joint in range(model.njnt):
-        position, velocity = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            return position + np.arange(2), velocity + np.arange(2)
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and model.jnt_axis[joint][0]:
-            return np.array([position]), np.array([velocity])
-    return None
+    joints = np.flatnonzero(model.jnt_bodyid == model.jnt_bodyid[0]) if model.njnt else np.array([], int)
+    positions, velocities = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    free = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_FREE
+    if free.any():
+        return positions[free][0] + np.arange(2), velocities[free][0] + np.arange(2)
+    slides = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE) & model.jnt_axis[joints][:, :2].any(axis=1)
+    return (positions[slides], velocities[slides]) if slides.any() else None

@@ -262,5 +262,5 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
         return []
     try:
         return list(contents.check_contents(subset, backgrounds))
-    except StoreError as error:
+    except DmcvbError as error:
         return [Issue("files", subset.name, str(error))]

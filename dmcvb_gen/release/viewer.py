@@ -41,7 +41,7 @@ SHEET_SIDE = 4096
 WEBP_QUALITY = 85
 LEVELS = 65535
 """Steps of a number's range that the file distinguishes."""
-CAMERA_AXES = {"camera_position": "xyz", "camera_quaternion": "wxyz", "material_rgb": "rgb"}
+CAMERA_AXES = {"camera_position": "xyz", "camera_quaternion": "wxyz", "material_rgb": "rgb", "light_shift": "xyz"}
 
 
 @dataclass(frozen=True)
@@ -143,12 +143,13 @@ def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
 
 
 def _command(release: Release, path: str, subset: SubsetReader, index: int) -> str:
-    """The command that makes an episode again from the release's manifest; "" if the release was imported."""
-    if release.manifest.imported or subset.record.imported:
-        return ""
-    place = public(path) if is_url(path) else Path(path).resolve().name
+    """The command that makes an episode again, or fetches one of a URL; "" if nothing can make it."""
     what = f"--only {shlex.quote(subset.name)} --episodes {index}:{index + 1}"
-    return f"dmcvb-gen regenerate {shlex.quote(place)} {what} --out again"
+    if is_url(path):
+        return f"dmcvb-gen fetch {shlex.quote(public(path))} {what} --out again"
+    if release.manifest.imported or subset.record.imported or release.manifest.labels_of(subset.name):
+        return ""
+    return f"dmcvb-gen regenerate {shlex.quote(Path(path).resolve().name)} {what} --out again"
 
 
 # -- one episode ----------------------------------------------------------------------------------
@@ -197,6 +198,8 @@ def _label_columns(label: str, values: np.ndarray, views: Sequence[str]) -> Iter
     if values.ndim == 1:
         yield label, values
         return
+    if values.ndim == 2:
+        values = values[:, None]
     for row in range(values.shape[1]):
         name = (views[row] if row < len(views) else str(row)) if label.startswith("camera") else str(row)
         name = "" if values.shape[1] == 1 else f"{name} "

@@ -15,6 +15,7 @@ from importlib import metadata
 
 from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.rendering.base import Renderer
+from dmcvb_gen.spec import task_folder
 from dmcvb_gen.tasks.base import Task
 
 ENTRY_POINTS = "dmcvb_gen.renderers"
@@ -87,7 +88,7 @@ def default_renderer(task: Task) -> str:
         renderer_class("native").check_task(task)
     except RenderingError as error:
         other = "warp" if renderer_class("opengl").unavailable() else "opengl"
-        _log.warning("%s is painted by %s: %s", task.id, other, error)
+        _log.warning("%s is painted by %s: %s", task_folder(task.id), other, error)
         return other
     return "native"
 

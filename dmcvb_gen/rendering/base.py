@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -125,6 +126,8 @@ def moved_lamps(
 
 def check_size(size: int) -> None:
     """Raise RenderingError for a size that no renderer takes."""
+    if not isinstance(size, numbers.Integral):
+        raise RenderingError(f"size is {size!r}; give a whole number of pixels a side")
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise RenderingError(
             f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)"

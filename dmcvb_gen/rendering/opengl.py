@@ -30,6 +30,8 @@ from dmcvb_gen.tasks.cameras import camera_ids, matrices
 RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 SKY_WIDTH = 800
 """Texels a side of a background on the sky (the skybox's own width)."""
+MAX_GEOMS = 20_000
+"""Shapes of a picture, at most; MuJoCo leaves out the others. A maze of 31 x 31 cells can have 1,026."""
 _PROBE = "from mujoco.egl import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
 
 
@@ -93,7 +95,7 @@ class OpenglRenderer(Renderer):
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=1000)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
         self._option = mujoco.MjvOption()
         self._perturb = mujoco.MjvPerturb()
         self._camera = mujoco.MjvCamera()
@@ -185,6 +187,11 @@ class OpenglRenderer(Renderer):
 
     def _show_background(self, video: int, frame: int) -> None:
         """Put a video frame on the sky: a square texture, which MuJoCo repeats on the six faces."""
+        if self._sky < 0 and video >= 0:
+            raise RenderingError(
+                f"{self.task.id} has no sky for 'opengl' to show a video on; use --renderer native, or add a texture "
+                'of type="skybox" to its model'
+            )
         if self._sky < 0 or (video, frame) == self._shown:
             return
         if video < 0 and self._own_sky:
@@ -214,6 +221,8 @@ class OpenglRenderer(Renderer):
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
+        if self._scene.ngeom >= MAX_GEOMS:
+            raise RenderingError(f"{self.task.id} has more than {MAX_GEOMS:,} shapes, which 'opengl' cannot draw")
         rectangle = mujoco.MjrRect(0, 0, self.size, self.size)
         mujoco.mjr_render(rectangle, self._scene, self._context)
         picture = np.empty((self.size, self.size, 3), np.uint8)
@@ -241,7 +250,7 @@ def offscreen(model: mujoco.MjModel, size: int) -> Iterator[Callable[[mujoco.MjD
     gl.make_current()
     context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-    scene, option, camera = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption(), mujoco.MjvCamera()
+    scene, option, camera = mujoco.MjvScene(model, maxgeom=MAX_GEOMS), mujoco.MjvOption(), mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
     rectangle = mujoco.MjrRect(0, 0, size, size)
 

@@ -42,9 +42,10 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 BUCKET_PROTOCOLS = ("s3", "gs", "gcs", "az", "abfs", "hf")
 
 
-def is_url(path: str) -> bool:
+def is_url(path: str | Path) -> bool:
     """Return True if a path is a URL rather than a folder ("file:..." counts as a URL)."""
-    return "://" in path or path.startswith("file:")
+    text = str(path)
+    return "://" in text or text.startswith("file:")
 
 
 def check_no_options(folder: str | Path, options: Mapping[str, Any] | None) -> None:

@@ -99,6 +99,8 @@ class SuiteTask(Task):
             raise DmcvbError(
                 f"cannot start task {id} ({reason}); make its environment run in dm_control first"
             ) from error
+        if not domain:
+            _check_actions(id, environment)
         self._environment = environment
         self.substeps = environment._n_sub_steps
         limit = environment._step_limit / ACTION_REPEAT
@@ -108,6 +110,8 @@ class SuiteTask(Task):
         self._begin(0)
         physics = environment.physics
         self._model = copy.deepcopy(physics.model._model)
+        if not self._model.ncam:
+            raise DmcvbError(f"{id} has no camera to look through; add a <camera> to its model")
         self.model_entries = self._changed_entries()
         self.state_fields = {
             name: int(np.size(part)) for name, part in environment.task.get_observation(physics).items()
@@ -182,6 +186,26 @@ def _check_environment(id: str, environment: Any) -> None:
             raise DmcvbError(
                 f"{id} observes {name!r} in different shapes ({shapes[0].get(name)} and {now.get(name)}); "
                 "observations must have a fixed shape"
+            )
+
+
+def _check_actions(id: str, environment: Any) -> None:
+    """Refuse an environment that does not take actions as they are here: from -1 to 1, straight to the actuators."""
+    task, physics = environment.task, environment.physics
+    low, high = task.action_spec(physics).minimum, task.action_spec(physics).maximum
+    if (np.isfinite(low) & (low != -1)).any() or (np.isfinite(high) & (high != 1)).any():
+        raise DmcvbError(
+            f"{id} takes actions from {np.min(low):g} to {np.max(high):g}; actions here are from -1 to 1: give its "
+            'actuators ctrlrange="-1 1", and their strength as gear'
+        )
+    for value in (-1.0, 0.5):
+        action = np.full(physics.model.nu, value)
+        with physics.reset_context():
+            task.initialize_episode(physics)
+        task.before_step(action, physics)
+        if not np.array_equal(physics.control(), action):
+            raise DmcvbError(
+                f"{id} changes actions in before_step, which does not run here; let its actuators take them as they are"
             )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed
+from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed, checked
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.spec import MazeName, task_folder
 from dmcvb_gen.text import as_names, quoted
@@ -51,6 +51,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @_one_thread()
+@checked
 def train_behaviour(
     task: str | None = None,
     *,

@@ -182,7 +182,7 @@ def test_a_card_of_cut_episodes_does_not_compare_them(tmp_path):
     run("rollout", "walker-walk", "--level", "random", "--distractor", "static", *TINY, "--out", out)
     write_card(out)
     text = " ".join((out / "README.md").read_text().split())
-    assert "Episodes of all subsets end sooner than the paper's, so their returns cannot be compared." in text
+    assert "Episodes of all subsets have another length than the paper's, so their returns cannot be compared." in text
     assert "z is" not in text and "z =" not in text and "All subsets have fewer steps" in text
     changes = (out / "CHANGELOG.md").read_text()
     assert changes.index("## 1.1.0") < changes.index("## 1.0.0") and changes.endswith("- First release.\n")

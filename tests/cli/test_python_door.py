@@ -144,6 +144,17 @@ def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
     [
         (lambda out: dmcvb_gen.rollout("walker-wlak", out=out), "walker-walk"),
         (lambda out: dmcvb_gen.rollout(), "recipe"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", episodes=0, out=out), "episodes is 0; give a whole number of at"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", episodes=2.5, out=out), "episodes is 2.5; give a whole number"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", size="64", out=out), "size is '64'; give a whole number"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", correlated=1.5, out=out), "above 0 and at most 1"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", difficulty="hrad", out=out), "Did you mean 'hard'"),
+        (lambda out: dmcvb_gen.rollout("ant-maze-empty7x7", reward="geodesik", out=out), "Did you mean 'geodesic'"),
+        (lambda out: dmcvb_gen.paint(out, views=[]), "views names no view"),
+        (
+            lambda out: dmcvb_gen.evaluate_behaviour("walker-walk", episodes=1),
+            "episodes is 1; give a whole number of at",
+        ),
         (lambda out: dmcvb_gen.rollout("ant-maze-empty7x7", distractors="dynamic", out=out), "goal"),
         (lambda out: dmcvb_gen.rollout("walker-walk", episodes=2, steps=9, out=out), "not both"),
         (lambda out: dmcvb_gen.rollout("walker-walk", sample=True, out=out), "level random is always drawn"),
@@ -160,3 +171,15 @@ def test_errors_are_those_of_the_commands(call, message, tmp_path):
     with pytest.raises(DmcvbError, match=message):
         call(tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_arguments_may_be_paths_numpys_numbers_and_iterators(tmp_path):
+    few = dict(episodes=np.int64(1), max_steps=np.int32(2), size=np.uint8(16), progress=False)
+    layout = tmp_path / "ring.txt"
+    layout.write_text("*****\n*   *\n* * *\n*   *\n*****\n")
+    made = dmcvb_gen.rollout(layouts=layout, levels=iter(["random"]), out=tmp_path / "maze", **few)
+    assert list(made) == ["ant-maze-ring/random/visible"]
+    made = dmcvb_gen.rollout(iter(["walker-walk"]), out=tmp_path / "walker", **few)
+    assert made["walker-walk/random/none"].record.size == 16
+    rows = dmcvb_gen.evaluate_behaviour("walker-walk", levels=(level for level in ["random"]), episodes=2)
+    assert [row["level"] for row in rows] == ["random"]

@@ -62,6 +62,8 @@ def assert_refused(result, options, cure):
         ([WALKER, "--backgrounds", "builtin"], "--distractor static or dynamic"),
         ([MAZE, "--backgrounds", "builtin"], "no subset shows videos"),
         ([WALKER, "--split", "val"], "--distractor static or dynamic"),
+        ([WALKER, "--distractor", "dynamic", "--vary", "camera", "--backgrounds", "builtin"], "shows videos"),
+        ([WALKER, "--distractor", "dynamic", "--vary", "camera,light", "--split", "val"], "shows videos"),
         ([WALKER, "--sample"], "level random is always drawn"),
         ([MAZE, "--independent"], "always have their own episodes"),
         ([WALKER, "--scratch", "x"], "--out is no URL"),

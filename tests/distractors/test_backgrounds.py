@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import shutil
+import sys
 
 import imageio.v3 as iio
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from PIL import Image
 
 from dmcvb_gen.distractors import backgrounds as backgrounds_module
-from dmcvb_gen.distractors.backgrounds import load_backgrounds
+from dmcvb_gen.distractors.backgrounds import load_backgrounds, videos_by_split
 from dmcvb_gen.errors import BackgroundError
 
 
@@ -190,3 +192,30 @@ def test_a_file_in_place_of_a_folder_is_named(tmp_path):
     write_video(tmp_path / "a.webp", clip())
     with pytest.raises(BackgroundError, match="is a file; give the folder"):
         load_backgrounds(tmp_path / "a.webp")
+
+
+def test_a_video_that_is_named_like_a_split_is_a_video(tmp_path):
+    for name in ("bear", "train", "walking"):
+        (tmp_path / name).mkdir()
+        for index, frame in enumerate(clip(5)):
+            Image.fromarray(frame).save(tmp_path / name / f"{index:05d}.jpg")
+    assert load_backgrounds(tmp_path, "train").names == ("bear", "walking")
+    assert load_backgrounds(tmp_path, "val").names == ("train",) and load_backgrounds(tmp_path).lengths == (5, 5)
+    assert videos_by_split(tmp_path) == {"train": 2, "val": 1}
+    for name in ("bear", "walking"):
+        shutil.rmtree(tmp_path / name)
+    assert load_backgrounds(tmp_path, "train").lengths == (1,) * 5  # with nothing beside it, it is the split
+
+
+def test_images_of_sixteen_bits_keep_their_brightness(tmp_path):
+    ramp = np.linspace(0, 65535, 256).astype(np.uint16)
+    Image.fromarray(np.tile(ramp, (256, 1))).save(tmp_path / "ramp.png")
+    frame = load_backgrounds(tmp_path).frames(0)[0].astype(int)
+    assert np.abs(frame - np.arange(256)[None, :, None]).max() <= 1
+
+
+def test_a_missing_decoder_says_what_to_install(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4", clip())
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ModuleNotFoundError, match="imageio_ffmpeg"):
+        load_backgrounds(tmp_path)

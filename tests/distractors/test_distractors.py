@@ -77,6 +77,20 @@ def test_dynamic_stays_in_its_ranges(task_id, difficulty, scale):
     assert speed.max() <= 2 * 0.4 * scale * r0 / 4 + slack  # two ticks a frame
 
 
+@pytest.mark.parametrize("difficulty", ["easy", "hard", "0.02"])
+@pytest.mark.parametrize("task_id", ["quadruped-walk", "fish-upright", "acrobot-swingup", "manipulator-bring_ball"])
+def test_the_range_is_around_every_nominal_camera(task_id, difficulty):
+    task = get_task(task_id)
+    offset = task.model.cam_poscom0[camera_ids(task)[0]]
+    setting = Distractor("dynamic", difficulty)
+    bounds, nominal = camera_range(offset, setting), spherical(offset)
+    assert (bounds.low <= bounds.high).all()
+    assert (np.abs(np.stack([bounds.low, bounds.high]) - nominal)[:, 1:] <= np.pi / 2 * setting.scale + 1e-9).all()
+    walks, _ = camera_walk(bounds, setting, 60, [np.random.default_rng(seed) for seed in range(4)])
+    places = spherical(walks)
+    assert (places >= bounds.low - 1e-6).all() and (places <= bounds.high + 1e-6).all()
+
+
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_the_camera_looks_where_the_nominal_one_does(task_id):
     """MuJoCo's own camera of every moment, its line of sight as far as the agent's centre of mass is away."""

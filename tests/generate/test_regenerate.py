@@ -343,3 +343,19 @@ def test_lost_videos_are_put_back_and_named(tmp_path):
     assert result.exit_code == 0 and "2 other files put back" in result.output, result.output
     assert "nothing" not in result.output and verify(tmp_path / "r").sound
     assert "nothing is damaged" in CliRunner().invoke(main, command).output
+    [picture, _] = sorted((tmp_path / "r/backgrounds").rglob("*.png"))
+    picture.write_bytes(picture.read_bytes()[:20])
+    found = {(finding.check, finding.subset) for finding in verify(tmp_path / "r").findings}
+    assert any(check == "files" for check, _ in found), found
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0 and "nothing" not in result.output and verify(tmp_path / "r").sound
+
+
+def test_a_damaged_policy_is_put_back(tmp_path):
+    pattern = LOCOMOTION | {"levels": "expert", "settings": "none", "episodes": 1, "max_steps": 3}
+    roll_out(small_recipe(subsets=[pattern]), tmp_path / "r")
+    [policy] = (tmp_path / "r/policies").iterdir()
+    policy.write_bytes(policy.read_bytes()[:20])
+    assert not verify(tmp_path / "r").sound
+    outcome = Regeneration(tmp_path / "r").repair()
+    assert outcome.restored == (f"policies/{policy.name}",) and verify(tmp_path / "r").sound

@@ -147,6 +147,23 @@ def test_labels_have_the_views_that_the_subset_has(tmp_path):
     assert all(subset.read(name).any() for name in depth)
 
 
+@pytest.mark.parametrize("what", [["walker-walk"], ["ant-maze-empty7x7", "--goal=hidden"]], ids=["walker", "maze"])
+def test_a_release_with_labels_does_not_grow_without_them(what, tmp_path):
+    asked = ["rollout", *what, "--level=random", "--max-steps=3", "--size=8", "--no-pixels"]
+    for command in (
+        [*asked, "--episodes=1", "--out", tmp_path / "source"],
+        ["paint", tmp_path / "source"],
+        ["repaint", tmp_path / "source", "--label", "depth", "--out", tmp_path / "labels"],
+    ):
+        result = CliRunner().invoke(main, list(map(str, command)))
+        assert result.exit_code == 0, result.output
+    before = (tmp_path / "labels/manifest.json").read_bytes()
+    more = [word for word in asked if word != "--no-pixels"]
+    result = CliRunner().invoke(main, [*more, "--episodes=2", "--out", str(tmp_path / "labels")])
+    assert result.exit_code == 2 and "was repainted with depth, which rollout does not store" in result.output
+    assert (tmp_path / "labels/manifest.json").read_bytes() == before
+
+
 def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "native")
@@ -179,9 +196,12 @@ def test_a_folder_with_another_release_is_left_alone(small_release, small_mazes,
 
 
 def test_mistakes_are_refused_before_any_painting(small_release, small_mazes, tmp_path):
-    for options in (dict(difficulty="hard"), dict(backgrounds="builtin")):
-        with pytest.raises(RecipeError, match="these subsets have no distractors"):
+    for options in (dict(difficulty="hard"), dict(backgrounds="builtin"), dict(split="val")):
+        with pytest.raises(RecipeError, match="these subsets (have no distractors|show no videos)"):
             repaint(Repainting(small_release, tmp_path / "r", ["*/*/none"], **options))
+    with pytest.raises(RecipeError, match="dynamic_hard names its strength itself"):
+        strengths = dict(distractor="dynamic_hard", difficulty="easy")
+        repaint(Repainting(small_release, tmp_path / "r", ["*/*/none"], **strengths))
     with pytest.raises(RecipeError, match="--backgrounds has no effect"):
         repaint(Repainting(small_mazes, tmp_path / "r", backgrounds="builtin"))
     with pytest.raises(RecipeError, match="both become walker-walk/random/static.*--only"):

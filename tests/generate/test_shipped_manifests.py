@@ -15,9 +15,11 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.index import INDEX, parse_index
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 from dmcvb_gen.dataset.reader import load_manifest
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_file
+from dmcvb_gen.generate.recipe import load_recipe
 from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.request import make_request
 from dmcvb_gen.generate.shipped import (
     ENDING,
     SHARDS,
@@ -165,3 +167,17 @@ def test_other_manifests_are_refused_in_one_line(given, message, tmp_path):
     done = run("--manifest", given, "--out", tmp_path / "out")
     assert done.exit_code in (1, 2) and message in done.output and "Traceback" not in done.output
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_the_same_name_hides_nothing_that_is_shipped(tmp_path, monkeypatch):
+    """`rollout --recipe quickstart --out quickstart` is run again to resume."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("quickstart", "empty7x7"):
+        (tmp_path / name).mkdir()
+    assert load_recipe("quickstart").name == "quickstart"
+    assert make_request(["walker-walk"], None, episodes=1).name == "walker-walk-random"
+    assert make_request([], None, layouts=("empty7x7",)).subsets[0].tasks == ("ant-maze-empty7x7",)
+    with manifest_source("quickstart") as folder:
+        assert (folder / "manifest.json").is_file()
+    with pytest.raises(RecipeError, match="Is a directory"):
+        load_recipe("./quickstart")

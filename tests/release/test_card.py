@@ -23,6 +23,7 @@ from dmcvb_gen.files import PARTIAL
 from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.card import check_card, write_card
+from tests.conftest import roll_out, small_recipe
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +154,32 @@ def test_a_changelog_of_the_authors_is_kept(copy):
     (copy / "CHANGELOG.md").write_text("# Ours\n\n## 1.0.0\n\n- Much better.\n")
     result = CliRunner().invoke(main, ["card", str(copy)])
     assert result.exit_code == 0 and "Much better" in (copy / "CHANGELOG.md").read_text() and check_card(copy) == []
+
+
+def test_a_changelog_gets_the_versions_that_it_lacks(tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 3}
+    recipe = small_recipe(subsets=[pattern], size=8)
+    roll_out(recipe, tmp_path / "r")
+    write_card(tmp_path / "r")
+    changes = tmp_path / "r/CHANGELOG.md"
+    changes.write_text(changes.read_text() + "- By hand.\n")
+    more = recipe.subsets[0].model_copy(update={"episodes": 2})
+    roll_out(recipe.model_copy(update={"subsets": (more,)}), tmp_path / "r")
+    write_card(tmp_path / "r")
+    text = changes.read_text()
+    assert text.startswith("# Changelog of") and text.endswith("## 1.0.0\n\n- First release.\n- By hand.\n")
+    assert "\n\n## 1.1.0\n\n- `walker-walk/random/none`: more episodes, 1 episode.\n\n## 1.0.0" in text
+    assert check_card(tmp_path / "r") == []
+    write_card(tmp_path / "r")
+    assert changes.read_text() == text
+
+
+def test_longer_episodes_are_not_compared_with_the_papers(tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 501}
+    roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "r")
+    write_card(tmp_path / "r")
+    text = " ".join((tmp_path / "r/README.md").read_text().split())
+    assert "Episodes of all subsets have another length than the paper's" in text and "z = " not in text
 
 
 def test_a_card_is_replaced_whole_or_not_at_all(copy, monkeypatch):

@@ -140,3 +140,12 @@ def test_data_of_two_releases_are_compared(maze_release, small_release, tmp_path
         assert max(map(len, shown.splitlines()[-30:])) <= 80 and "return" in shown and "std 2" in shown
     result = CliRunner().invoke(main, ["diff", str(small_release), str(maze_release), "--data"])
     assert result.exit_code == 2 and "no subset in common" in result.output
+
+
+def test_options_are_for_urls(small_release):
+    option = ["--option", "auto_mkdir=true"]
+    result = CliRunner().invoke(main, ["diff", str(small_release), f"file://{small_release}", *option])
+    assert result.exit_code == 0 and "no difference" in result.output
+    for command in (["diff", str(small_release), str(small_release)], ["status", str(small_release)]):
+        result = CliRunner().invoke(main, [*command, *option])
+        assert result.exit_code == 2 and "--option has no effect" in result.output

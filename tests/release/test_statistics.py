@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.release.statistics import level_statistics, state_statistics, states_json
+from dmcvb_gen.release.statistics import _root_columns, level_statistics, state_statistics, states_json
 from dmcvb_gen.tasks import get_task
 
 
@@ -24,6 +24,22 @@ def test_every_number_of_the_states(fixture, request):
     told = json.loads(states_json(release))[subset.task]["fields"]
     for name, place in get_task(subset.task).state_slices.items():
         np.testing.assert_allclose(told[name]["mean"], rows.mean(axis=0)[place], rtol=1e-4)
+
+
+ROOTS = {
+    "point_mass-easy": [0, 1],
+    "swimmer-swimmer6": [0, 1],
+    "manipulator-bring_ball": None,
+    "walker-walk": [1],
+    "fish-upright": [0, 1],
+}
+"""Task -> its root's columns of qpos along x and y."""
+
+
+@pytest.mark.parametrize(("task_id", "columns"), ROOTS.items())
+def test_the_root_moves_along_x_and_y(task_id, columns):
+    found = _root_columns(get_task(task_id).model)
+    assert (found and found[0].tolist()) == columns
 
 
 def test_how_levels_move(small_release, small_mazes):

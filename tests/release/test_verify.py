@@ -199,3 +199,11 @@ def test_files_that_no_digest_speaks_of_are_named(copy):
     found = verify(copy).findings
     assert {(finding.check, finding.subset) for finding in found} == {("files", place) for place in extra.values()}
     assert all("not part of the release" in finding.message for finding in found)
+
+
+def test_equal_actions_alone_are_no_duplicate(copy):
+    def repeat(group):
+        group["action"][2] = group["action"][0]
+
+    rewrite(copy, NAME, repeat)
+    assert ("duplicates", NAME) not in checks(copy)

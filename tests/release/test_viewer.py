@@ -22,6 +22,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.release.viewer import view
+from tests.conftest import roll_out, small_recipe
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
@@ -171,3 +172,18 @@ def test_serving_gives_the_file_and_nothing_else(tmp_path):
             with pytest.raises(urllib.error.HTTPError):
                 urllib.request.urlopen(f"{address}/{other}")
         server.shutdown()
+
+
+def test_lamps_have_curves_and_a_url_the_command_that_fetches(tmp_path):
+    pattern = {
+        "tasks": "walker-walk",
+        "levels": "random",
+        "settings": "dynamic_camera0.2-light0.2",
+        "episodes": 1,
+        "max_steps": 3,
+    }
+    roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "lamps")
+    here = view(str(tmp_path / "lamps"), tmp_path / "here.html").path.read_text()
+    assert all(f"light_shift {axis}" in here for axis in "xyz") and "dmcvb-gen regenerate lamps --only" in here
+    there = view(f"file://{tmp_path / 'lamps'}", tmp_path / "there.html").path.read_text()
+    assert f"dmcvb-gen fetch file://{tmp_path / 'lamps'} --only" in there and "regenerate" not in there

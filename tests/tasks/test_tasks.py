@@ -163,7 +163,11 @@ def ten_lines(tmp_path, monkeypatch, code):
     monkeypatch.delenv(ALLOWED, raising=False)
 
 
-GROWING = """
+ARM = """<mujoco><worldbody><light pos="0 0 3"/><camera name="side" pos="0 -2 1"/>
+<body pos="0 0 .8"><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body>
+</worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
+GROWING = (
+    """
 from dm_control import suite
 def reach():
     environment = suite.load("reacher", "easy")
@@ -173,7 +177,26 @@ def number():
     return 7
 def broken():
     return 1 / 0
+def strong():
+    return mjcf_environment(ARM.replace("-1 1", "-5 5"))
+def odd():
+    environment = mjcf_environment(ARM)
+    environment.task.before_step = lambda action, physics: physics.set_control(2 * action - 1)
+    return environment
+def blind():
+    return mjcf_environment(ARM.replace('<camera name="side" pos="0 -2 1"/>', ""))
+ARM = """
+    + repr(ARM)
+    + """
+def mjcf_environment(xml):
+    import tempfile
+    from dmcvb_gen.tasks import own
+    with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
+        file.write(xml)
+        file.flush()
+        return own.mjcf_environment(file.name, lambda physics: 0.0)
 """
+)
 
 
 @pytest.mark.parametrize(
@@ -183,6 +206,9 @@ def broken():
         ("number", "gives a int; give a function that returns"),
         ("broken", "cannot start task arm_tasks:broken .division by zero"),
         ("missing", "cannot find task arm_tasks:missing"),
+        ("strong", "takes actions from -5 to 5; actions here are from -1 to 1"),
+        ("odd", "changes actions in before_step"),
+        ("blind", "has no camera to look through"),
     ],
 )
 def test_a_task_of_ones_own_that_cannot_be_used_is_refused(tmp_path, monkeypatch, name, message):

@@ -9,6 +9,7 @@ import numpy as np
 
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.cameras import camera_ids
 
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 """MuJoCo's numbers of the kinds of geoms painted here."""
@@ -254,6 +255,12 @@ def _not_painted(task: Task, what: str) -> RenderingError:
     return RenderingError(f"{task.id} has {what}, which 'native' does not paint; use --renderer opengl or warp")
 
 
+def _is_special(model: mujoco.MjModel, camera: int) -> bool:
+    """Whether a camera is more than its field of view."""
+    perspective = model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    return not perspective or bool(model.cam_sensorsize[camera].any())
+
+
 def _refuse_what_is_not_painted(
     task: Task, material: np.ndarray, kind: np.ndarray, size: np.ndarray, alpha: np.ndarray
 ) -> None:
@@ -266,6 +273,7 @@ def _refuse_what_is_not_painted(
     faults = {
         f"geoms of type {', '.join(others)}": bool(others),
         "a skin": model.nskin > 0,
+        "an orthographic camera, or one with a sensor's size": any(_is_special(model, i) for i in camera_ids(task)),
         "bodies with a texture that is no cube": bool((model.tex_type[textures[textured]] == 0).any()),
         f"more than {MAX_GEOMS} geoms": len(kind) > MAX_GEOMS,
         "transparent bodies": bool((alpha[kind != PLANE] < 1).any()),
