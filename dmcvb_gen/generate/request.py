@@ -199,6 +199,9 @@ def _difficulty(given: Mapping[str, Any]) -> str:
         raise RecipeError("give --difficulty or --intensity, not both")
     if "video_count" in given and given.get("vary") and "background" not in given["vary"]:
         raise RecipeError("--video-count has no effect if --vary leaves the background out: remove it")
+    if (word or intensity is not None) and "video_count" in given and set(given.get("vary") or ()) == {"background"}:
+        flag = "--difficulty" if word else "--intensity"
+        raise RecipeError(f"{flag} has no effect if only the background varies and --video-count is given: remove it")
     scale = DIFFICULTY_SCALES[word] if word else intensity
     return difficulty_of(scale, given.get("vary") or (), given.get("video_count"), given.get("correlated"))
 

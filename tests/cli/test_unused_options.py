@@ -63,6 +63,10 @@ def assert_refused(result, options, cure):
         ([MAZE, "--backgrounds", "builtin"], "no subset shows videos"),
         ([WALKER, "--split", "val"], "--distractor static or dynamic"),
         ([WALKER, "--distractor", "dynamic", "--vary", "camera", "--backgrounds", "builtin"], "shows videos"),
+        (
+            [WALKER, "--distractor", "dynamic", "--vary", "background", "--video-count", "3", "--intensity", "0.9"],
+            "--intensity has no effect if only the background varies",
+        ),
         ([WALKER, "--distractor", "dynamic", "--vary", "camera,light", "--split", "val"], "shows videos"),
         ([WALKER, "--sample"], "level random is always drawn"),
         ([MAZE, "--independent"], "always have their own episodes"),
