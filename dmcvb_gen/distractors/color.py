@@ -8,7 +8,9 @@ import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
-from dmcvb_gen.tasks.base import ACTION_REPEAT
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.spec import ALL_PARTS, CUE
+from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
 from dmcvb_gen.tasks.cameras import seen_materials
 
 STEP_STD = 0.03
@@ -43,6 +45,12 @@ def color_walk(
     return out
 
 
+def check_colors_are_seen(task: Task) -> None:
+    """Raise DmcvbError if no material of a task's model is seen, so that other colors would change no picture."""
+    if (seen_materials(task.model) < 0).all():
+        raise DmcvbError(f"{task.id} has no materials, so its colors cannot vary; give its geoms materials")
+
+
 class Color(DistractorPart):
     """A color for every material; those that no geom or site shows keep the model's."""
 
@@ -52,6 +60,8 @@ class Color(DistractorPart):
 
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         own = scene.task.material_colors
+        if not any(scene.setting.varies(part) for part in ALL_PARTS if part not in (self.stream, CUE)):
+            check_colors_are_seen(scene.task)
         self._colors = color_walk(own, scene.setting, scene.frames, generators)
         unseen = np.setdiff1d(np.arange(len(own)), seen_materials(scene.task.model))
         self._colors[:, :, unseen] = own[unseen]  # a label that nobody sees would only cost bytes

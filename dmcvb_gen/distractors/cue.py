@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dmcvb_gen.distractors.base import DistractorPart, Scene
+from dmcvb_gen.distractors.color import check_colors_are_seen
 
 SHADE = 0.15
 """Added to or taken from every channel of every material that is seen."""
@@ -24,6 +25,7 @@ class Cue(DistractorPart):
     names = ()
 
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
+        check_colors_are_seen(scene.task)
         drawn = np.stack([rng.random(scene.frames) for rng in generators])
         self._follows = drawn < (1 + scene.setting.scale_of("cue")) / 2
         self._coin = drawn < 0.5

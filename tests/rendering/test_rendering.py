@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.distractors import Distractor, floor_alpha_for, load_backgrounds, sample_distractors
-from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, RenderingError, UnknownNameError
 from dmcvb_gen.rendering import available_renderers, default_renderer, make_renderer, warp
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import STREAMS, episode_stream
@@ -267,3 +267,11 @@ def test_native_refuses_cameras_that_are_more_than_a_field_of_view(tmp_path):
     special = PLAIN.replace('name="top"', 'name="top" projection="orthographic"')
     with pytest.raises(RenderingError, match="an orthographic camera"):
         make_renderer("native", plain_task(tmp_path, special), 16)
+
+
+@pytest.mark.parametrize("difficulty", ["color0.2", "camera0.2-cue0.9", "color0.2-cue0.9"])
+def test_colors_that_nobody_sees_cannot_vary(tmp_path, difficulty):
+    task = plain_task(tmp_path, PLAIN)
+    generators = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
+    with pytest.raises(DmcvbError, match="has no materials, so its colors cannot vary"):
+        sample_distractors(task, Distractor("dynamic", difficulty), task.batch(1).physics()[None], generators)
