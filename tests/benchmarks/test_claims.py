@@ -92,6 +92,22 @@ def test_an_encoder_from_other_data_is_compared_with_bc_on_the_same_episodes(ben
     assert "70.0" in found[0].numbers and "40.0" in found[0].numbers
 
 
+def test_goals_are_compared_one_by_one_and_as_their_mean():
+    def of(agent, *means, encoder=""):
+        made = dict(benchmark="b3", encoder=encoder)
+        goals = enumerate(means)
+        return [result(agent, "fixed", near(mean), learns=f"expert goal {goal}", **made) for goal, mean in goals]
+
+    found = judge(of("bc", 40, 42) + of("bc+bc", 70, 41, encoder="expert") + of("id+bc", 50, 43, encoder="expert"))
+    means = {answer.claim: answer for answer in found if "expert, mean of 2 goals (encoder: expert)" in answer.where}
+    assert len(found) == 6 + 3 and set(means) == {"goals", "encoders"}
+    assert means["encoders"].answer == "yes" and "difference +9.0 +- 0.6" in means["encoders"].numbers
+    alone = [answer.answer for answer in found if answer.claim == "encoders" and "mean" not in answer.where]
+    assert alone == ["yes", "no"]
+    [only] = judge(of("bc", 40) + of("bc+bc", 70, encoder="expert"))
+    assert "mean" not in only.where
+
+
 def test_shares_are_compared_in_their_order():
     made = [result("bc", "none", near(mean), benchmark="ablations", learns=label) for mean, label in
             ((80, "expert"), (20, "1% expert"), (81, "25% expert"), (40, "5% expert"))]  # fmt: skip

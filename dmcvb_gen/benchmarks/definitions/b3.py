@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
 from dmcvb_gen.agents.catalog import parse_agent
-from dmcvb_gen.benchmarks.claims import pretrained
+from dmcvb_gen.benchmarks.claims import Answer, Place, Pooled, Scores, above, pretrained
 from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Part, register_benchmark
 from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, is_maze, task_folder
 
@@ -40,5 +46,48 @@ class FixedGoals(Benchmark):
 
     @property
     def claims(self):
-        words = "Does an encoder of hidden random goals help a policy of one goal's episodes (B3)?"
-        return {"goals": (words, pretrained("goals"))}
+        help_ = "Does an encoder of hidden random goals help a policy of one goal's episodes (B3)?"
+        better = "Does BC train a better encoder on hidden random goals than ID (B3)?"
+        return {
+            "goals": (help_, lambda scores: pretrained("goals")(with_means_over_goals(scores))),
+            "encoders": (better, _bc_above_id),
+        }
+
+
+def with_means_over_goals(scores: Scores) -> Scores:
+    """Scores of single goals, and the mean over each maze's goals; its standard error takes these for independent."""
+    groups: dict[Place, list[Pooled]] = {}
+    for place, score in scores.items():
+        level, goal, rest = place.learns_from.partition(" goal ")
+        if goal:
+            encoder = rest[rest.index(" (") :] if " (" in rest else ""
+            groups.setdefault(replace(place, learns_from=f"{level}{encoder}"), []).append(score)
+    found = dict(scores)
+    for place, several in groups.items():
+        level, mark, encoder = place.learns_from.partition(" (")
+        if len(several) > 1:
+            found[replace(place, learns_from=f"{level}, mean of {len(several)} goals{mark}{encoder}")] = _mean(several)
+    return found
+
+
+def _mean(several: list[Pooled]) -> Pooled:
+    count = len(several)
+    return Pooled(
+        mean=sum(score.mean for score in several) / count,
+        stderr=math.sqrt(sum(score.stderr**2 for score in several)) / count,
+        seeds=tuple(np.mean([score.seeds for score in several], axis=0).tolist()) if _same_seeds(several) else (),
+        data=sum(score.data for score in several) / count,
+        like_data=all(score.like_data for score in several),
+    )
+
+
+def _same_seeds(several: list[Pooled]) -> bool:
+    return len({len(score.seeds) for score in several}) == 1
+
+
+def _bc_above_id(scores: Scores) -> Iterator[Answer]:
+    known = with_means_over_goals(scores)
+    for place, score in known.items():
+        if place.agent == "bc+bc" and (other := known.get(replace(place, agent="id+bc"))):
+            where = f"{place.task} {place.learns_from}, {place.setting}"
+            yield above("encoders", where, ("bc+bc", "id+bc"), (score, other))
