@@ -83,7 +83,7 @@ def test_videos_that_are_kept_for_evaluation_are_counted(tmp_path, count):
 def test_returns_of_short_episodes_are_marked(release, tmp_path):
     said = run("info", release)
     assert "walker-walk/random/none *" in said and "their returns cannot be compared" in said
-    assert json.loads(run("info", release, "--json"))["subsets"][0]["shorter"] is True
+    assert json.loads(run("info", release, "--json"))["subsets"][0]["other_length"] is True
     run("rollout", "walker-walk", "--level", "random", "--episodes", 1, "--no-pixels", "--out", tmp_path / "whole")
     assert "*" not in run("info", tmp_path / "whole")
 
