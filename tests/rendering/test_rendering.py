@@ -270,7 +270,7 @@ def test_native_refuses_cameras_that_are_more_than_a_field_of_view(tmp_path):
 
 
 @pytest.mark.parametrize("difficulty", ["color0.2", "camera0.2-cue0.9", "color0.2-cue0.9"])
-def test_colors_that_nobody_sees_cannot_vary(tmp_path, difficulty):
+def test_a_model_without_materials_cannot_vary_its_colors(tmp_path, difficulty):
     task = plain_task(tmp_path, PLAIN)
     generators = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
     with pytest.raises(DmcvbError, match="has no materials, so its colors cannot vary"):
