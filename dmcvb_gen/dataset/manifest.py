@@ -252,9 +252,9 @@ class Manifest(_Model):
         return version, generator
 
     def labels_of(self, subset: str) -> tuple[str, ...]:
-        """Modalities that a repaint stored in a subset, which rollouts do not make."""
-        made = [entry["labels"] for entry in self.lineage if entry.get("labels") and subset in entry["subsets"]]
-        return tuple(dict.fromkeys(label for labels in made for label in labels))
+        """Modalities that the last repaint stored in a subset, which rollouts do not make."""
+        repaints = [entry for entry in self.lineage if entry["kind"] == "repaint" and subset in entry["subsets"]]
+        return tuple(repaints[-1].get("labels", ())) if repaints else ()
 
 
 def subset_path(name: str) -> str:

@@ -368,11 +368,11 @@ def check_makeable(manifest: Manifest, records: Sequence[SubsetRecord]) -> None:
                 f"{record.name} was imported, so there is nothing to make it from; import it again, or choose other "
                 "subsets with --only"
             )
-    for entry in manifest.lineage:
-        if entry.get("labels") and any(record.name in entry["subsets"] for record in records):
+        if labels := manifest.labels_of(record.name):
+            source = next(entry["from"] for entry in manifest.lineage[::-1] if entry["kind"] == "repaint")
             raise StoreError(
-                f"{manifest.name} was repainted with {' and '.join(entry['labels'])} from {entry['from']}; "
-                "repaint that release again instead of regenerating this one"
+                f"{manifest.name} was repainted with {' and '.join(labels)} from {source}; repaint that release again "
+                "instead of regenerating this one"
             )
 
 

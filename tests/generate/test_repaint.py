@@ -162,6 +162,11 @@ def test_a_release_with_labels_does_not_grow_without_them(what, tmp_path):
     result = CliRunner().invoke(main, [*more, "--episodes=2", "--out", str(tmp_path / "labels")])
     assert result.exit_code == 2 and "was repainted with depth, which rollout does not store" in result.output
     assert (tmp_path / "labels/manifest.json").read_bytes() == before
+    repaint(Repainting(tmp_path / "labels", tmp_path / "larger", size=16))
+    result = CliRunner().invoke(
+        main, ["rollout", *more[1:-1], "--size=16", "--episodes=2", "--out", str(tmp_path / "larger")]
+    )
+    assert result.exit_code == 0 and verify(tmp_path / "larger").sound, result.output
 
 
 def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
