@@ -77,6 +77,11 @@ class Answer:
 Scores = Mapping[Place, Pooled]
 
 
+def mean_of(means: Sequence[float], stderrs: Sequence[float]) -> tuple[float, float]:
+    """The mean of several scores, and its standard error; it takes the scores for independent."""
+    return math.fsum(means) / len(means), math.sqrt(math.fsum(error**2 for error in stderrs)) / len(means)
+
+
 def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     """The results of reports (folders that `validate` wrote), each once.
 

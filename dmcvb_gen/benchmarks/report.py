@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import html
-import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
 from dmcvb_gen.benchmarks.checks import Structure, comparable, known_returns
-from dmcvb_gen.benchmarks.claims import claim_words, judge
+from dmcvb_gen.benchmarks.claims import claim_words, judge, mean_of
 from dmcvb_gen.benchmarks.figures import (
     agreement_figures,
     curve_figures,
@@ -340,8 +339,7 @@ def _groups(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     rows = []
     for key, members in groups.items():
         scores = [member["score"] for member in members]
-        mean = sum(score["mean"] for score in scores) / len(scores)
-        error = math.sqrt(sum(score["stderr"] ** 2 for score in scores)) / len(scores)
+        mean, error = mean_of([score["mean"] for score in scores], [score["stderr"] for score in scores])
         success = sum(score["success"] for score in scores) / len(scores)
         rows.append((*key, str(len(scores)), f"{_number(mean)} ± {_number(error)}", f"{100 * success:.0f} %"))
     return rows

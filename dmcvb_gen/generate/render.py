@@ -16,7 +16,7 @@ from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.generate.modalities import Seen, get_modality
+from dmcvb_gen.generate.modalities import Modality, Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import make_renderer, renderer_class
 from dmcvb_gen.rendering.base import Renderer
@@ -296,8 +296,25 @@ def paint_labels(
         size = (renderer.size, renderer.size, *modality.shape)
         out = np.zeros((len(physics), rows, *size), modality.dtype)
         for first in range(0, len(episode), LABEL_FRAMES):
-            e, r = episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES]
-            after = (physics[e, r + 1], exogenous[e, r + 1]) if modality.needs_next else (None, None)
-            [seen] = look(renderer, physics[e, r], exogenous[e, r], [view], hide_goal, *after)
-            out[e, r] = modality.compute(seen)
+            at = (episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES])
+            out[at] = modality_of_frames(renderer, modality, physics, exogenous, at, view, hide_goal)
         yield name, out
+
+
+def modality_of_frames(
+    renderer: Renderer,
+    modality: Modality,
+    physics: np.ndarray,
+    exogenous: DistractorState,
+    at: tuple[np.ndarray, ...],
+    view: str,
+    hide_goal: bool,
+) -> np.ndarray:
+    """(frame, size, size, ...): a modality of some frames.
+
+    Args:
+      at: indices of the frames in `physics` and `exogenous`, those of the rows last.
+    """
+    after = (*at[:-1], at[-1] + 1)
+    following = (physics[after], exogenous[after]) if modality.needs_next else (None, None)
+    return modality.compute(look(renderer, physics[at], exogenous[at], [view], hide_goal, *following)[0])

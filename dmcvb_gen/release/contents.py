@@ -6,7 +6,7 @@ sample of frames painted again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.inputs import video_source
-from dmcvb_gen.generate.render import renderer_for
+from dmcvb_gen.generate.modalities import modality_of, stored_in
+from dmcvb_gen.generate.render import modality_of_frames, renderer_for
 from dmcvb_gen.release.import_tfds import imported_specs
 from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks import get_task
 
 SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
@@ -27,6 +29,8 @@ REWARD_TOLERANCE, STATE_TOLERANCE = 1e-4, 1e-3
 """Largest difference that another CPU or library version may cause in one step; on the same machine it is 0."""
 PIXEL_TOLERANCE = 2.0
 """Mean absolute difference of a repainted frame, grey levels of 255; on the same machine it is 0."""
+LABEL_TOLERANCE, LABEL_SHARE = 1e-3, 0.02
+"""Difference from which on a value of a depth or another modality counts, and the share of such that is too much."""
 
 
 def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
@@ -154,6 +158,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
             steps = _sample(length + 1, SAMPLE_FRAMES)
             names = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in values]
             labels = DistractorState(**{name: values[f"exogenous/{name}"] for name in names})
+            yield from _check_modalities(subset, renderer, episode, values, labels, steps)
             for name in subset.pixel_arrays:
                 stored = values[name][steps]
                 view, hidden = picture_of(name) or (name, False)
@@ -170,3 +175,23 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
                     yield Issue("pixels", subset.name, f"{name} never changes", episode)
     finally:
         renderer.close()
+
+
+def _check_modalities(
+    subset: Subset,
+    renderer: Renderer,
+    episode: int,
+    values: Mapping[str, np.ndarray],
+    labels: DistractorState,
+    steps: np.ndarray,
+) -> Iterator[Issue]:
+    """Depth, segmentation and the like of sampled frames, computed again."""
+    for name in stored_in(subset.arrays):
+        modality, view = modality_of(name), name.partition("/")[2] or subset.record.views[0]
+        at = steps[steps + modality.needs_next <= steps[-1]]  # the last one is the episode's last frame
+        made = modality_of_frames(renderer, modality, values["physics"], labels, (at,), view, subset.record.hidden_goal)
+        differ = ~np.isclose(values[name][at], made, rtol=LABEL_TOLERANCE, atol=LABEL_TOLERANCE)
+        for step, share in zip(at, differ.reshape(len(at), -1).mean(axis=1), strict=True):
+            if share > LABEL_SHARE:
+                message = f"{name} differs from what the states show in {100 * share:.0f} % of its values"
+                yield Issue("labels", subset.name, message, episode, int(step))

@@ -86,23 +86,25 @@ def _subsets(a: Release, b: Release, name: str) -> list[Difference]:
 
 
 def _shards(one: Subset, other: Subset) -> list[Difference]:
-    """Shards of the same episodes that have other bytes, and in which arrays."""
+    """Shards of the same episodes that have other bytes, and arrays that only one has."""
     mine = {commit.episodes: commit for commit in one.commits.values()}
     theirs = {commit.episodes: commit for commit in other.commits.values()}
     found = []
     alone = sorted(mine.keys() ^ theirs.keys())
     if alone and len(one.episodes) == len(other.episodes):  # else their number has been said
         found.append(Difference(one.name, f"only one has shards of the episodes {_spans(alone)}"))
-    arrays: dict[str, list[tuple[int, int]]] = {}
+    arrays: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for episodes in sorted(mine.keys() & theirs.keys()):
         files = [_digests(mine[episodes]), _digests(theirs[episodes])]
         for array in sorted(files[0].keys() | files[1].keys()):
-            if files[0].get(array) != files[1].get(array):
-                arrays.setdefault(array, []).append(episodes)
-    for array, spans in arrays.items():
+            digests = [side.get(array) for side in files]
+            if digests[0] != digests[1]:
+                kind = "has other bytes" if all(digests) else f"is only in the {'first' if digests[0] else 'second'},"
+                arrays.setdefault((array, kind), []).append(episodes)
+    for (array, kind), spans in arrays.items():
         if one.record.pixels != other.record.pixels and picture_of(array):
             continue  # which has images has been said
-        found.append(Difference(one.name, f"{array} has other bytes in the episodes {_spans(spans)}"))
+        found.append(Difference(one.name, f"{array} {kind} in the episodes {_spans(spans)}"))
     return found
 
 

@@ -18,13 +18,14 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import PARTIAL
+from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.policies import simulate
 from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
-from tests.conftest import roll_out, small_recipe
+from tests.conftest import rewrite, roll_out, small_recipe
 from tests.faults.commands import GRACE, session
 
 
@@ -118,6 +119,30 @@ def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, n
     assert verify(tmp_path / "r").sound
     with pytest.raises(StoreError, match="depth and segmentation"):
         Regeneration(tmp_path / "r").check()
+
+
+@pytest.mark.parametrize(
+    "source, only, name",
+    [
+        ("small_release", "*/*/dynamic", "walker-walk/random/dynamic"),
+        ("small_mazes", "*/*/hidden", "ant-maze-tiny/random/hidden"),
+    ],
+)
+def test_wrong_labels_are_found(request, source, only, name, tmp_path):
+    """The digests are right; only the states can give such labels away."""
+    labels = ["depth", "segmentation", "parts", "flow"]
+    repaint(Repainting(request.getfixturevalue(source), tmp_path / "r", [only], size=16, labels=labels))
+    assert verify(tmp_path / "r").sound
+    arrays = [array for array in stored_in(open_release(tmp_path / "r")[name].arrays) if not array.endswith("/top")]
+
+    def change(group):
+        for array in arrays:
+            stored = group[array.replace("/", "_")]
+            stored[...] = stored[...][:, ::-1]
+
+    rewrite(tmp_path / "r", name, change)
+    found = verify(tmp_path / "r").findings
+    assert {(finding.check, finding.message.split()[0]) for finding in found} == {("labels", name) for name in arrays}
 
 
 @pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")

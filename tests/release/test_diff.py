@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.writer import commit_path
+from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.diff import diff
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.import_tfds import import_tfds
@@ -51,6 +52,13 @@ def test_another_seed_changes_arrays_and_missing_episodes_are_counted(maze_relea
     assert str(alone) == f"{MAZE}: only one has shards of the episodes 0:1, 1:2"
     found = [str(difference) for difference in diff(small_release, maze_release)]
     assert f"{NAME}: only in the first" in found and f"{MAZE}: only in the second" in found
+
+
+def test_an_array_that_only_one_has_is_not_called_different(small_release, tmp_path):
+    repaint(Repainting(small_release, tmp_path / "r", size=16, labels=["depth"]))
+    found = {str(difference) for difference in diff(tmp_path / "r", small_release)}
+    assert f"{NAME}: depth is only in the first, in the episodes 0:2, 2:3" in found
+    assert not any("other bytes" in one for one in found)
 
 
 def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tmp_path, monkeypatch):

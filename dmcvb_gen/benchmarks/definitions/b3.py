@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from dmcvb_gen.agents.catalog import parse_agent
-from dmcvb_gen.benchmarks.claims import Answer, Place, Pooled, Scores, above, pretrained
+from dmcvb_gen.benchmarks.claims import Answer, Place, Pooled, Scores, above, mean_of, pretrained
 from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Part, register_benchmark
 from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, is_maze, task_folder
 
@@ -71,12 +70,12 @@ def with_means_over_goals(scores: Scores) -> Scores:
 
 
 def _mean(several: list[Pooled]) -> Pooled:
-    count = len(several)
+    mean, stderr = mean_of([score.mean for score in several], [score.stderr for score in several])
     return Pooled(
-        mean=sum(score.mean for score in several) / count,
-        stderr=math.sqrt(sum(score.stderr**2 for score in several)) / count,
+        mean=mean,
+        stderr=stderr,
         seeds=tuple(np.mean([score.seeds for score in several], axis=0).tolist()) if _same_seeds(several) else (),
-        data=sum(score.data for score in several) / count,
+        data=float(np.mean([score.data for score in several])),
         like_data=all(score.like_data for score in several),
     )
 
