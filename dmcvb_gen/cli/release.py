@@ -59,8 +59,11 @@ def _verified(path, result):
     if result.digest:
         yield f"digest {result.digest}"
     damaged = [found for found in result.findings if found.check == "files" and NOT_PART not in found.message]
-    if any(found.subset != MANIFEST for found in damaged) and not is_url(str(path)):
-        yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
+    if any(found.subset != MANIFEST for found in damaged):
+        if is_url(str(path)):
+            yield f"`dmcvb-gen publish FOLDER {quoted(path)} --check` sends damaged and missing files again."
+        else:
+            yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
 
 
 @command_of(commands.regenerate)
@@ -119,7 +122,8 @@ def repaint(release, out, as_json, **options):
 def publish(release, url, as_json, **options):
     """Upload a complete release: every file is checked, and the manifest comes last.
 
-    A published version never changes. Rerun the command to resume. Credentials come from the environment. An export can
+    A published version never changes. Rerun the command to resume, or with --check to mend what `verify URL` found
+    damaged. Credentials come from the environment. An export can
     be uploaded too; LeRobot's gets its tag on the Hub.
 
     \b
