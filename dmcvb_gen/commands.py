@@ -329,7 +329,7 @@ def publish(
     *,
     storage_options: dict[str, Any] | None = None,
     take_over: bool = False,
-    check: bool = False,
+    repair: bool = False,
     workers: Count = 8,
     pixels: bool = True,
     progress: bool = True,
@@ -341,7 +341,7 @@ def publish(
       url (URL): Where to put it: s3://, gs://, hf:// or any fsspec URL.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
       take_over: Publish even if another upload has claimed the URL.
-      check: Compare published files by their digests, and send those again that differ.
+      repair: Compare published files by their digests, and replace those that differ.
       workers: Parallel transfers.
       pixels: False: Publish without images; `paint` renders them again.
 
@@ -351,7 +351,7 @@ def publish(
     from dmcvb_gen.release.publish import publish_folder
 
     given: dict[str, Any] = dict(
-        pixels=pixels, take_over=take_over, check=check, options=storage_options, workers=workers
+        pixels=pixels, take_over=take_over, repair=repair, options=storage_options, workers=workers
     )
     with progress_bar(progress, " files", scaled=False) as bar:
         return publish_folder(release, url, tick=bar, **given)

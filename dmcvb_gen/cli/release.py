@@ -61,7 +61,7 @@ def _verified(path, result):
     damaged = [found for found in result.findings if found.check == "files" and NOT_PART not in found.message]
     if any(found.subset != MANIFEST for found in damaged):
         if is_url(str(path)):
-            yield f"`dmcvb-gen publish FOLDER {quoted(path)} --check` sends damaged and missing files again."
+            yield f"`dmcvb-gen publish FOLDER {quoted(path)} --repair` replaces damaged and missing files."
         else:
             yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
 
@@ -122,9 +122,9 @@ def repaint(release, out, as_json, **options):
 def publish(release, url, as_json, **options):
     """Upload a complete release: every file is checked, and the manifest comes last.
 
-    A published version never changes. Rerun the command to resume, or with --check to mend what `verify URL` found
-    damaged. Credentials come from the environment. An export can
-    be uploaded too; LeRobot's gets its tag on the Hub.
+    A published version never changes. Rerun the command to resume. Add --repair to replace files that `verify URL` found
+    damaged. Credentials come from the environment. Exports can be uploaded, too. On the Hub, a LeRobot export gets the
+    tag that LeRobot looks for.
 
     \b
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini

@@ -77,7 +77,7 @@ def publish_folder(
     *,
     pixels: bool = True,
     take_over: bool = False,
-    check: bool = False,
+    repair: bool = False,
     options: dict[str, Any] | None = None,
     workers: int = 8,
     tick: ProgressCallback = ignore,
@@ -88,7 +88,7 @@ def publish_folder(
       url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL.
       pixels: False leaves the images out; `paint` renders them again.
       take_over: publish even if another upload has claimed the URL.
-      check: see `publish`.
+      repair: see `publish`.
       options: options of fsspec; credentials belong in the environment.
       workers: parallel transfers.
       tick: called with 1 for each file.
@@ -97,13 +97,13 @@ def publish_folder(
       StoreError: as `publish.publish` does, or an option of releases was given for an export.
     """
     if not (Path(path) / MANIFEST).exists() and export_format(path) is not None:
-        if not pixels or take_over or check:
+        if not pixels or take_over or repair:
             raise StoreError(
-                "--no-pixels, --take-over and --check are for releases, and this is an export: remove them"
+                "--no-pixels, --take-over and --repair are for releases, and this is an export: remove them"
             )
         return publish_export(path, url, options=options, workers=workers, tick=tick)
     with contextlib.nullcontext(path) if pixels else light_copy(path) as sent:
-        return publish(sent, url, options=options, take_over=take_over, check=check, workers=workers, tick=tick)
+        return publish(sent, url, options=options, take_over=take_over, repair=repair, workers=workers, tick=tick)
 
 
 @contextlib.contextmanager
@@ -135,7 +135,7 @@ def publish(
     options: dict[str, Any] | None = None,
     workers: int = 8,
     take_over: bool = False,
-    check: bool = False,
+    repair: bool = False,
     tick: ProgressCallback = ignore,
 ) -> Moved:
     """Put a complete release at a URL; run again after an interruption, it goes on.
@@ -144,7 +144,7 @@ def publish(
       url: s3://bucket/name, gs://, hf://datasets/owner/name, file: or any fsspec URL; it becomes the release's folder.
       options: options of fsspec (endpoint_url, ...); credentials belong in the environment.
       take_over: go on although another publisher's claim is there (it crashed, and its release was another).
-      check: compare published files by their digests, not by their sizes, and send those again that differ. Storages
+      repair: compare published files by their digests, not by their sizes, and replace those that differ. Storages
         that do not know digests are read.
       tick: called with 1 for each file.
 
@@ -163,7 +163,7 @@ def publish(
     storage, tag = open_storage(url, options), (f"v{manifest.version}", f"{manifest.name} {manifest.version}")
     storage.begin()
     before, same = _published(storage, index, manifest)
-    kept = set() if check else _kept(storage, before or ())
+    kept = set() if repair else _kept(storage, before or ())
     if same and set(index.files) <= kept:
         storage.tag(*tag)
         return Moved(len(index.files), total, 0)

@@ -340,7 +340,7 @@ def test_a_plain_folder_is_a_target_too(tiny, tmp_path):
     assert verify(tmp_path / "back").sound
 
 
-def test_files_that_were_damaged_where_they_are_go_up_again_with_check(s3, tiny, tmp_path):
+def test_files_that_were_damaged_where_they_are_are_replaced_with_repair(s3, tiny, tmp_path):
     there, invoke = tmp_path / "there", CliRunner().invoke
     url = f"file://{there}"
     publish(tiny, url)
@@ -348,14 +348,14 @@ def test_files_that_were_damaged_where_they_are_go_up_again_with_check(s3, tiny,
     data = (there / pixels).read_bytes()
     (there / pixels).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     result = invoke(main, ["verify", url, "--all"])
-    assert result.exit_code == 1 and f"`dmcvb-gen publish FOLDER {url} --check`" in result.output, result.output
+    assert result.exit_code == 1 and f"`dmcvb-gen publish FOLDER {url} --repair`" in result.output, result.output
     assert publish(tiny, url).moved == 0, "sizes are right"
-    result = invoke(main, ["publish", str(tiny), url, "--check", "--json"])
+    result = invoke(main, ["publish", str(tiny), url, "--repair", "--json"])
     assert result.exit_code == 0 and json.loads(result.output)["moved"] == 1, result.output
     assert invoke(main, ["verify", url, "--all"]).exit_code == 0 and (there / pixels).read_bytes() == data
     publish(tiny, "s3://bucket/x", options=s3.options)
     s3.direct.pipe_file(f"bucket/x/{pixels}", bytes(len(data)))
-    assert publish(tiny, "s3://bucket/x", options=s3.options, check=True).moved == 1
+    assert publish(tiny, "s3://bucket/x", options=s3.options, repair=True).moved == 1
     s3.direct.invalidate_cache()
     assert s3.direct.cat_file(f"bucket/x/{pixels}") == data
 
