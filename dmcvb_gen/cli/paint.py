@@ -51,10 +51,16 @@ def _whole_shards(out, episodes):
     """A line if shards brought more episodes than were asked for."""
     from dmcvb_gen.dataset import open_release
 
-    here = {name: len(subset.episodes) for name, subset in open_release(out).subsets.items()}
-    name = max(here, key=here.get, default=None)
-    if name and here[name] > (asked := episodes[1] - episodes[0]):
-        yield f"A shard is fetched whole: {name} has {here[name]} episodes now; you asked for {asked}."
+    first, last = episodes
+    for name, subset in open_release(out).subsets.items():
+        spans = [commit.episodes for commit in subset.commits.values()]
+        spans = [span for span in spans if span[0] < last and span[1] > first]
+        if not spans:
+            continue
+        least, most = min(span[0] for span in spans), max(span[1] for span in spans)
+        if least < first or most > last:
+            yield f"Shards are fetched whole: {name} has the episodes {least}:{most}; you asked for {first}:{last}."
+            return
 
 
 def _tell(text):

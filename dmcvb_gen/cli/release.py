@@ -13,6 +13,7 @@ from dmcvb_gen import commands
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, print_table, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
+from dmcvb_gen.dataset.index import is_card, is_video
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.remote import is_url
@@ -46,7 +47,10 @@ def _verified(path, result):
     yield from (f"FAIL {finding}" for finding in result.findings[:50])
     if len(result.findings) > 50:
         yield f"... and {len(result.findings) - 50} more"
-    yield from (f"{name}: {here:,} of {planned:,} episodes" for name, (here, planned) in result.incomplete.items())
+    named = {name: counts for name, counts in result.incomplete.items() if counts[0] or len(result.incomplete) <= 10}
+    yield from (f"{name}: {here:,} of {planned:,} episodes" for name, (here, planned) in named.items())
+    if absent := len(result.incomplete) - len(named):
+        yield f"Of {pluralize(absent, 'subsets')} no episode is here."
     checked = ", ".join(pluralize(count, name) for name, count in result.checked.items())
     verdict = "sound" if result.sound else pluralize(len(result.findings), "findings")
     if result.incomplete:
@@ -57,13 +61,23 @@ def _verified(path, result):
         verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
     yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; values were checked of {checked}"
     if result.digest:
-        yield f"digest {result.digest}"
+        yield f"digest {'of what is here ' if result.incomplete else ''}{result.digest}"
     damaged = [found for found in result.findings if found.check == "files" and NOT_PART not in found.message]
-    if any(found.subset != MANIFEST for found in damaged):
-        if is_url(str(path)):
-            yield f"`dmcvb-gen publish FOLDER {quoted(path)} --repair` replaces damaged and missing files."
-        else:
-            yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
+    yield from _cures(path, {found.subset for found in damaged if found.subset != MANIFEST})
+
+
+def _cures(path, places):
+    """Yield the commands that repair damaged places: subsets, or files of none."""
+    cards, videos = ({place for place in places if test(place)} for test in (is_card, is_video))
+    if places and is_url(str(path)):
+        yield f"`dmcvb-gen publish FOLDER {quoted(path)} --repair` replaces damaged and missing files."
+        return
+    if places - cards - videos:
+        yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
+    if cards:
+        yield f"`dmcvb-gen card {quoted(path)}` writes the card again."
+    if videos:
+        yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` copies the videos from FOLDER again."
 
 
 @command_of(commands.regenerate)
@@ -122,9 +136,9 @@ def repaint(release, out, as_json, **options):
 def publish(release, url, as_json, **options):
     """Upload a complete release: every file is checked, and the manifest comes last.
 
-    A published version never changes. Rerun the command to resume. Add --repair to replace files that `verify URL` found
-    damaged. Credentials come from the environment. Exports can be uploaded, too. On the Hub, a LeRobot export gets the
-    tag that LeRobot looks for.
+    A published version never changes. Rerun the command to resume. Add --repair to replace files that `verify URL`
+    found damaged. Credentials come from the environment. Exports can be uploaded, too. On the Hub, a LeRobot export
+    gets the tag that LeRobot looks for.
 
     \b
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini

@@ -80,6 +80,11 @@ def is_card(path: str) -> bool:
     return path in CARD_FILES or path.startswith(f"{CARD_FOLDER}/")
 
 
+def is_video(path: str) -> bool:
+    """Return True if a file of a release belongs to its copies of videos."""
+    return path.startswith(VIDEOS)
+
+
 def is_replaced(path: str) -> bool:
     """Return True if the next version of a release may replace a file: metadata of growing arrays, and the card."""
     return path.endswith("/zarr.json") or is_card(path)

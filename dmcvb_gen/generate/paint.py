@@ -164,8 +164,13 @@ def paint_release(
         waiting.put(key)
     found = tuple(session.paint(waiting))
     unfinished = todo or session.manifest.digest is None  # or a painter of all of it was stopped before the end
-    manifest = finish_together(root) if unfinished else session.manifest
+    manifest = finish_together(root) if unfinished and not _is_being_made(root, release.manifest) else session.manifest
     return session.report(manifest, found)
+
+
+def _is_being_made(root: Path, manifest: Manifest) -> bool:
+    """Return True if a rollout is not done with a release: it has no digests, and was not made from another one."""
+    return not (manifest.complete or manifest.digest or manifest.lineage or (root / INDEX).exists())
 
 
 @dataclass(frozen=True)

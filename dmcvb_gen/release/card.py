@@ -24,7 +24,7 @@ from dmcvb_gen.distractors import background, camera, color, cue, light, shake
 from dmcvb_gen.distractors.base import KINDS, Distractor
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import remove_partial, replacing, write_text
+from dmcvb_gen.files import folder_in_the_making, remove_partial, replacing, write_text
 from dmcvb_gen.generate.info import describe_release
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
@@ -64,31 +64,52 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
       url: URL at which the release is (or will be) published; by default the one that the existing card names.
 
     Raises:
-      StoreError: there is no release, it has no episodes, or the folder cannot be written.
+      StoreError: there is no release, it has no episodes, or the folder cannot be written or has another README.md.
     """
     target = local_path(out) if out else None
     release = _open(root)
     folder = target or release.path
     told = _told(folder, release.manifest)
     published = Publication(page_of(url) if url else told.url, told.date)
+    own = folder.resolve() == release.path.resolve()
     try:
+        if not own:
+            _refuse_another_readme(folder)
+        (folder / CARD_FOLDER).mkdir(parents=True, exist_ok=True)
         for place in (folder, folder / CARD_FOLDER):
             remove_partial(place, below=False)  # left by a killed writer
-        with replacing(folder / TABLE) as part:
-            write_table(release, part)
-        texts = _texts(release, folder / TABLE, published)
-        texts[CHANGELOG] = _changelog(release.manifest, folder / CHANGELOG)
-        for name, text in texts.items():
-            write_text(folder / name, text)
-        with replacing(folder / PLOT) as part:
-            plot_returns(release, part)
-        with replacing(folder / SHEET) as part:
-            Image.fromarray(_sheet(release)).save(part, "PNG")
+        with folder_in_the_making(folder, CARD_FOLDER) as made:  # so that a failure leaves no half of a card
+            names = _write_files(release, made, folder, published)
+            for name in names:
+                (made / name).replace(folder / name)
     except OSError as error:
         raise StoreError(f"cannot write the card to {folder}: {error.strerror or error}; give --out") from None
-    if folder.resolve() == release.path.resolve():
+    if own:
         take_in_card(folder)
-    return [folder / name for name in (*texts, PLOT, SHEET, TABLE)]
+    return [folder / name for name in names]
+
+
+def _refuse_another_readme(folder: Path) -> None:
+    """Refuse a folder whose README.md is not a card."""
+    readme = folder / README
+    if readme.is_file() and "dmcvb-gen" not in readme.read_text(errors="replace"):
+        raise StoreError(f"{readme} is not a card, and it would be replaced; give another --out")
+
+
+def _write_files(release: Release, made: Path, folder: Path, published: Publication) -> list[str]:
+    """Write a card's files below `made`; the changelog goes on from that in `folder`. Gives the files' names."""
+    (made / CARD_FOLDER).mkdir()
+    with replacing(made / TABLE) as part:
+        write_table(release, part)
+    texts = _texts(release, made / TABLE, published)
+    texts[CHANGELOG] = _changelog(release.manifest, folder / CHANGELOG)
+    for name, text in texts.items():
+        write_text(made / name, text)
+    with replacing(made / PLOT) as part:
+        plot_returns(release, part)
+    with replacing(made / SHEET) as part:
+        Image.fromarray(_sheet(release)).save(part, "PNG")
+    return [*texts, PLOT, SHEET, TABLE]
 
 
 def _changelog(manifest: Manifest, path: Path) -> str:

@@ -196,7 +196,9 @@ class Source:
         """Return the index's entry of a file."""
         if path not in self._by_path:
             cure = "publish the release again"
-            if not self.manifest.complete:
+            if not self.manifest.complete and self.storage.size(path) is not None:  # it came after the index
+                cure = f"list it first: dmcvb-gen rollout --out {self.place} --finish"
+            elif not self.manifest.complete:
                 cure = "finish the rollout there, or fetch what is there with --only and --episodes"
             raise StoreError(f"{self.place}/{INDEX} does not list {path}; {cure}")
         return self._by_path[path]
@@ -452,6 +454,11 @@ def taken_up(out: Path, source: Source) -> Manifest | None:
         if _is_older_version(out, old, source):
             return None
         if not _same_release(old, source):
+            if is_grown_from(source.manifest, _as_published(old, source)):
+                raise StoreError(
+                    f"{out} holds {old.name} {old.version} with images that were rendered here, which do not grow; "
+                    f"choose another --out for {source.manifest.version}"
+                )
             raise StoreError(
                 f"{out} holds {old.name} {old.version} and not the {source.manifest.name} {source.manifest.version} of "
                 "the URL; choose another --out"
@@ -460,6 +467,19 @@ def taken_up(out: Path, source: Source) -> Manifest | None:
     if strange:
         raise StoreError(f"{out} is not empty and holds no release; choose an empty or new folder for --out")
     return None
+
+
+def _as_published(old: Manifest, source: Source) -> Manifest:
+    """A manifest with the images (or none) that the published release has."""
+    there = {record.name: record for record in source.manifest.subsets}
+    fields = ("pixels", "size", "views", "renderer", "backgrounds")
+    subsets = tuple(
+        record.model_copy(update={field: getattr(there[record.name], field) for field in fields})
+        if record.name in there
+        else record
+        for record in old.subsets
+    )
+    return old.model_copy(update={"subsets": subsets})
 
 
 def _is_older_version(out: Path, old: Manifest, source: Source) -> bool:
@@ -484,16 +504,12 @@ def _same_release(old: Manifest, source: Source) -> bool:
 
 def _is_strange(out: Path, manifest: Manifest) -> bool:
     """Return True if a folder holds files that no interrupted fetch leaves."""
-    ours = {record.name.split("/")[0] for record in manifest.subsets} | {
-        "policies",
-        "commits",
-        "backgrounds",
-        CARD_FOLDER,
-        LOCK,
-    }
+    begun = {record.name.split("/")[0] for record in manifest.subsets} | {"commits"}
+    beside = {"policies", "backgrounds", CARD_FOLDER, *CARD_FILES}
     if not out.is_dir():
         return out.exists()
-    return any(path.name not in ours | set(CARD_FILES) and path.suffix != files.PARTIAL for path in out.iterdir())
+    there = {path.name for path in out.iterdir() if path.suffix != files.PARTIAL} - {LOCK}
+    return bool(there - begun - beside) or (bool(there) and not there & begun)
 
 
 def _write_part(out: Path, source: Source, base: Manifest, only, episodes) -> None:

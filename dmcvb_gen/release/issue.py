@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 NOT_PART = "is not part of the release"
 """Message about a file that the index does not list."""
+UNCHECKED = "unchecked"
+"""Check of issues that this machine lacks something to look for; nothing is known to be damaged."""
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,10 @@ def publish(
     kept = set() if repair else _kept(storage, before or ())
     if same and set(index.files) <= kept:
         storage.tag(*tag)
+        _withdraw(storage, index.manifest_sha256)
         return Moved(len(index.files), total, 0)
+    if before is None and not take_over and storage.read(CLAIM) is None:
+        _refuse_others(storage, index)
     fresh = storage.needs_claim and _claim(storage, index.manifest_sha256, manifest, take_over)
     fresh = fresh and before is None and storage.read(INDEX) is None
     todo = [file for file in index.files if file not in kept]
@@ -179,8 +182,7 @@ def publish(
     if not storage.write_last(last, new=before is None):
         _published(storage, index, manifest)  # another one's raises
     storage.tag(*tag)
-    if storage.needs_claim:
-        storage.remove(CLAIM)
+    _withdraw(storage, index.manifest_sha256)
     return Moved(len(index.files), total, moved)
 
 
@@ -193,10 +195,35 @@ def _check_card(root: Path, manifest: Manifest, index: Index) -> None:
                 raise StoreError(
                     f"{root / file.path} does not have its digest; run `dmcvb-gen card {quoted(root)}` first"
                 )
+        unlisted = {file.path for file in card_files(root)} - {file.path for file in index.files}
+        if unlisted:
+            raise StoreError(
+                f"{root / min(unlisted)} is not part of the release yet; run `dmcvb-gen card {quoted(root)}` first, or "
+                "move it elsewhere"
+            )
         known = page.is_file() and manifest.digest  # of version 1 there is none
         old = known and str(manifest.digest) not in page.read_text(errors="replace")
     if old:
         raise StoreError(f"the card of {root} is of another version; run `dmcvb-gen card {quoted(root)}` first")
+
+
+def _refuse_others(storage: Storage, index: Index) -> None:
+    """Refuse a place without a release that has files of something else, which ours would replace or lie among.
+
+    Files of ours may be there, of an interrupted try or of a release whose manifest was deleted. The Hub makes a README
+    of its own.
+    """
+    ours = {file.path: file.bytes for file in index.files}
+    others = sorted(
+        path
+        for path, file in storage.list().items()
+        if path not in (INDEX, CLAIM) and (path not in ours or (is_card(path) and file.bytes not in (None, ours[path])))
+    )
+    if not storage.needs_claim:
+        others = [path for path in others if path not in CARD_FILES]
+    if others:
+        more = f" and {len(others) - 1} more" if others[1:] else ""
+        raise StoreError(f"{storage.place} holds {others[0]}{more}, and no release; give an empty or a new place")
 
 
 def _in_order(todo: Sequence[FileRecord]) -> list[list[FileRecord]]:
@@ -257,7 +284,7 @@ def _claim(storage: Storage, digest: str, manifest: Manifest, take_over: bool) -
     found = None if storage.create(CLAIM, data) else storage.read(CLAIM)
     if found is None or found == data:
         return found is None  # else ours, from an interrupted try: the files that are there already are kept
-    if take_over:
+    if take_over or _claimed_by(found) == files.sha256_bytes(storage.read(MANIFEST) or b""):  # it has ended
         storage.write(CLAIM, data)
         return False
     try:
@@ -269,3 +296,17 @@ def _claim(storage: Storage, digest: str, manifest: Manifest, take_over: bool) -
         f"{what} is being published to {storage.place} by someone else; choose another URL, or --take-over if that "
         "publisher is gone"
     )
+
+
+def _claimed_by(claim: bytes | None) -> str | None:
+    """The digest of the manifest in a claim; None if it is none."""
+    try:
+        return str(json.loads(claim or b"")["manifest_sha256"])
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def _withdraw(storage: Storage, digest: str) -> None:
+    """Remove the claim of a publication that has ended, in this run or in one that was killed right before."""
+    if storage.needs_claim and _claimed_by(storage.read(CLAIM)) == digest:
+        storage.remove(CLAIM)

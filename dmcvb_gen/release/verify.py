@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dmcvb_gen.dataset import Subset, open_release
-from dmcvb_gen.dataset.index import INDEX, Index, read_index, root_digest
+from dmcvb_gen.dataset.index import INDEX, Index, is_card, read_index, root_digest
 from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     CommitRecord,
@@ -27,10 +27,10 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.shards import wrong_bytes
 from dmcvb_gen.dataset.writer import subset_digest
-from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool
-from dmcvb_gen.release.issue import NOT_PART, Issue
+from dmcvb_gen.release.issue import NOT_PART, UNCHECKED, Issue
 from dmcvb_gen.storage.remote import storage_errors
 
 SHARDS = 8
@@ -131,7 +131,8 @@ def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue
             if not ours and name not in listed and path.is_file():
                 place = subset_of(manifest, name)
                 told = NOT_PART if place == name else f"{name} {NOT_PART}"
-                yield Issue("files", place, f"{told}; move it elsewhere")
+                cure = "run `dmcvb-gen card` again" if is_card(name) else "move it elsewhere"
+                yield Issue("files", place, f"{told}; {cure}")
 
 
 def subset_of(manifest: Manifest, path: str) -> str:
@@ -144,7 +145,7 @@ def subset_of(manifest: Manifest, path: str) -> str:
 
 def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Iterator[Issue]:
     if wrong := wrong_bytes(root, file):
-        yield Issue("files", where, f"{file.path}{what} {wrong}")
+        yield Issue("files", where, wrong if where == file.path else f"{file.path}{what} {wrong}")
 
 
 @dataclass(frozen=True)
@@ -262,5 +263,7 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
         return []
     try:
         return list(contents.check_contents(subset, backgrounds))
+    except (RenderingError, BackgroundError, UnknownNameError, ImportError) as error:  # what this machine lacks
+        return [Issue(UNCHECKED, subset.name, f"values, physics or images cannot be checked here: {error}")]
     except DmcvbError as error:
         return [Issue("files", subset.name, str(error))]

@@ -65,7 +65,7 @@ def test_episodes_that_come_with_their_shard_are_counted(release, tmp_path):
     place = f"file:{tmp_path / 'published'}"
     run("publish", release, place)
     said = run("fetch", place, "--episodes", "0:1", "--out", tmp_path / "part")
-    assert "A shard is fetched whole: walker-walk/random/none has 3 episodes now; you asked for 1." in said
+    assert "Shards are fetched whole: walker-walk/random/none has the episodes 0:3; you asked for" in said
     assert "fetched whole" not in run("fetch", place, "--episodes", "0:3", "--out", tmp_path / "all")
 
 

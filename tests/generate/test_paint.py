@@ -81,6 +81,19 @@ def test_painting_a_light_release_gives_the_files_of_a_painted_one(made, tmp_pat
     assert {n: v for n, v in mine.items() if n != ".lock"} == {n: v for n, v in theirs.items() if n != ".lock"}
 
 
+@pytest.mark.parametrize("task", ["walker-walk", "ant-maze-empty7x7"])
+def test_a_rollout_that_goes_on_gets_its_digests_at_its_end_alone(task, tmp_path):
+    asked = ["--level=random", "--episodes=2", "--episodes-per-shard=1", "--max-steps=3", "--size=16", "--workers=1"]
+    where = ["--out", tmp_path / "r"]
+    assert run("rollout", task, *asked, "--part=1/2", *where).exit_code == 0
+    before = files(tmp_path / "r")
+    assert run("paint", tmp_path / "r").exit_code == 0
+    assert files(tmp_path / "r") == before and open_release(tmp_path / "r").manifest.digest is None
+    assert run("rollout", task, *asked, "--part=2/2", *where).exit_code == 0
+    assert run("rollout", "--finish", *where).exit_code == 0
+    assert run("verify", tmp_path / "r").exit_code == 0
+
+
 @pytest.mark.parametrize("moment", [(paint, "write_lock"), (executors, "run_job")], ids=["lock", "shard"])
 def test_two_who_paint_a_release_end_in_what_one_ends_in(made, tmp_path, monkeypatch, moment):
     """Another one paints all of it before the first has the lock, or while the first is about to paint a shard."""

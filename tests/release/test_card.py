@@ -23,6 +23,7 @@ from dmcvb_gen.files import PARTIAL
 from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.verify import verify
 from tests.conftest import roll_out, small_recipe
 
 
@@ -195,6 +196,25 @@ def test_a_card_is_replaced_whole_or_not_at_all(copy, monkeypatch):
     kept = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file() and path.suffix != PARTIAL}
     assert kept == before
     assert [file.path for file in card_files(copy) if PARTIAL in file.path] == [] and check_card(copy) == []
+
+
+def test_a_readme_that_is_no_card_is_not_replaced(carded, tmp_path):
+    (tmp_path / "README.md").write_text("mine")
+    with pytest.raises(StoreError, match="README.md is not a card, and it would be replaced"):
+        write_card(carded, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
+@pytest.mark.parametrize("name", ["plot_returns", "_sheet", "write_table"])
+def test_a_card_that_fails_leaves_the_release_as_it_was(copy, monkeypatch, name):
+    def fail(*_):
+        raise ModuleNotFoundError("matplotlib")
+
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+    monkeypatch.setattr(f"dmcvb_gen.release.card.{name}", fail)
+    with pytest.raises(ModuleNotFoundError):
+        write_card(copy)
+    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before and verify(copy).sound
 
 
 def test_a_card_can_lie_elsewhere(carded, tmp_path):

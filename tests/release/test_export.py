@@ -326,6 +326,19 @@ def test_the_command_exports_goes_on_and_never_writes_over(small_release, tmp_pa
     assert not [path for path in tmp_path.rglob(".*") if path.name != STAMP]
 
 
+def test_of_unfinished_releases_only_the_same_one_counts_as_exported(tmp_path):
+    for name, seed in (("a", 3), ("b", 4)):
+        plan = prepare(make_plan(small_recipe(seed=seed), tmp_path / name, ()))
+        for _ in run_jobs(plan.jobs[:1], 1):
+            pass
+        assert open_release(tmp_path / name).manifest.digest is None
+    subset = next(iter(open_release(tmp_path / "a").subsets))
+    for _ in range(2):  # the second time, everything is there
+        export(tmp_path / "a", "npz", tmp_path / "x", [subset], (0, 2))
+    with pytest.raises(StoreError, match="not of this release and these options"):
+        export(tmp_path / "b", "npz", tmp_path / "x", [subset], (0, 2))
+
+
 def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):
     with pytest.raises(UnknownNameError, match="lerobot"):
         export(small_release, "csv", tmp_path)
@@ -336,7 +349,7 @@ def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):
 
     with pytest.raises(DmcvbError, match="--video is not for hdf5"):
         export(small_release, "hdf5", tmp_path, video=True)
-    with pytest.raises(StoreError, match="s3://bucket/x is a URL.*give a local one"):
+    with pytest.raises(StoreError, match="s3://bucket/x is a URL; give a local folder"):
         export(small_release, "npz", "s3://bucket/x")
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(DmcvbError, match="h5py.*: pip install h5py"):

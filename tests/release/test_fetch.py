@@ -6,13 +6,16 @@ import shutil
 import types
 
 import pytest
+from click.testing import CliRunner
 
+from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import read_index
 from dmcvb_gen.dataset.manifest import commit_path
 from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.paint import RenderConfig
+from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.release import fetch as fetching
 from dmcvb_gen.release.fetch import fetch, fetch_and_paint
 from dmcvb_gen.release.publish import publish, publish_folder
@@ -103,6 +106,42 @@ def test_pictures_that_another_process_rendered_meanwhile_stay(made, tmp_path, m
     commits = [commit for subset in open_release(here).subsets.values() for commit in subset.commits.values()]
     assert len(commits) == 4 and all(commit.painted for commit in commits) and verify(here).sound
     assert open_release(here).manifest.digest == open_release(made).manifest.digest
+
+
+def test_images_that_were_rendered_here_do_not_grow_and_this_is_said(made, tmp_path):
+    shutil.copytree(made, tmp_path / "source")
+    url, recipe = f"file:{tmp_path / 'there'}", open_release(made).manifest.recipe
+    publish_folder(tmp_path / "source", url, pixels=False)
+    fetch_and_paint(url, tmp_path / "here", painter=RenderConfig())
+    grown = make_recipe(recipe | {"subsets": [one | {"episodes": 3} for one in recipe["subsets"]]})
+    roll_out(grown, tmp_path / "source")
+    publish_folder(tmp_path / "source", url, pixels=False)
+    with pytest.raises(StoreError, match="images that were rendered here, which do not grow; choose another --out for"):
+        fetch(url, tmp_path / "here")
+    assert verify(tmp_path / "here").sound
+
+
+def test_what_was_asked_for_is_told_from_what_shards_bring(tmp_path):
+    run, url = CliRunner().invoke, f"file:{tmp_path / 'there'}"
+    roll_out(
+        small_recipe(subsets=[WALKER | {"episodes": 4, "episodes_per_shard": 2, "max_steps": 3}]), tmp_path / "made"
+    )
+    publish(tmp_path / "made", url)
+    for asked, told in (("0:2", ""), ("2:4", ""), ("0:3", "has the episodes 0:4; you asked for 0:3")):
+        result = run(main, ["fetch", url, "--episodes", asked, "--out", str(tmp_path / "here")])
+        assert result.exit_code == 0 and told in result.output, result.output
+        assert bool(told) == ("fetched whole" in result.output)
+
+
+@pytest.mark.parametrize("name", ["README.md", "policies/mine.safetensors"])
+def test_files_of_something_else_are_no_interrupted_fetch(made, tmp_path, name):
+    publish(made, f"file:{tmp_path / 'there'}")
+    mine = tmp_path / "here" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    with pytest.raises(StoreError, match="is not empty and holds no release"):
+        fetch(f"file:{tmp_path / 'there'}", tmp_path / "here")
+    assert mine.read_text() == "mine"
 
 
 def test_files_that_become_links_need_room_once(made, tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ from dmcvb_gen.dataset.manifest import MANIFEST, commit_path
 from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
 from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.generate.recipe import expand, load_recipe
+from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
@@ -33,6 +33,7 @@ from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.storage import base as storage
 from dmcvb_gen.storage.hub import HubStorage
+from dmcvb_gen.storage.local import LocalStorage
 from dmcvb_gen.storage.remote import public, reason
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
@@ -338,6 +339,45 @@ def test_a_plain_folder_is_a_target_too(tiny, tmp_path):
     assert verify(tmp_path / "there").sound
     fetch(url, tmp_path / "back", [NAME])
     assert verify(tmp_path / "back").sound
+
+
+def test_files_of_something_else_are_not_replaced(s3, copy, tmp_path):
+    write_card(copy)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there/README.md").write_text("mine")
+    with pytest.raises(StoreError, match="holds README.md, and no release; give an empty or a new place"):
+        publish(copy, f"file:{tmp_path / 'there'}")
+    assert [path.name for path in (tmp_path / "there").iterdir()] == ["README.md"]
+    s3.direct.pipe_file("bucket/x/data/notes.txt", b"mine")
+    with pytest.raises(StoreError, match="holds data/notes.txt, and no release"):
+        publish(copy, "s3://bucket/x", options=s3.options)
+    s3.direct.invalidate_cache()
+    assert s3.direct.find("bucket/x") == ["bucket/x/data/notes.txt"]
+
+
+def test_a_claim_that_an_ended_publication_left_stops_nobody(tiny, tmp_path, monkeypatch):
+    there, url = tmp_path / "there", f"file:{tmp_path / 'there'}"
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalStorage, "_remove", lambda *_: (_ for _ in ()).throw(OSError(5, "broken")))
+        with pytest.raises(StoreError):
+            publish(tiny, url)
+    assert (there / CLAIM).exists() and (there / "manifest.json").exists()
+    shutil.copytree(there, tmp_path / "other")
+    publish(tiny, url)
+    assert not (there / CLAIM).exists() and verify(there).sound
+    shutil.copytree(tiny, tmp_path / "grown")
+    recipe = open_release(tiny).manifest.recipe
+    roll_out(
+        make_recipe(recipe | {"subsets": [one | {"episodes": 4} for one in recipe["subsets"]]}), tmp_path / "grown"
+    )
+    publish(tmp_path / "grown", f"file:{tmp_path / 'other'}")
+    assert not (tmp_path / "other" / CLAIM).exists() and verify(tmp_path / "other").sound
+
+
+def test_a_card_that_is_not_listed_does_not_stay_behind_silently(copy, tmp_path):
+    (copy / "README.md").write_text("a card that was never finished")
+    with pytest.raises(StoreError, match="README.md is not part of the release yet; run `dmcvb-gen card"):
+        publish(copy, f"file:{tmp_path / 'there'}")
 
 
 def test_files_that_were_damaged_where_they_are_are_replaced_with_repair(s3, tiny, tmp_path):

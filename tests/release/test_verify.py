@@ -14,7 +14,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import is_card
 from dmcvb_gen.dataset.writer import commit_path, finish_release
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import RenderingError, StoreError
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.verify import check_files, verify
 from tests.conftest import rewrite, roll_out, small_recipe
@@ -26,6 +26,26 @@ NAME = "walker-walk/random/dynamic"
 def copy(small_release, tmp_path):
     shutil.copytree(small_release, tmp_path / "copy")
     return tmp_path / "copy"
+
+
+def test_the_cure_is_that_of_what_is_damaged(copy):
+    write_card(copy)
+    card = copy / "README.md"
+    card.write_text(card.read_text() + "more")
+    result = CliRunner().invoke(main, ["verify", str(copy)])
+    assert result.exit_code == 1 and "FAIL files: README.md: has" in result.output, result.output
+    assert "`dmcvb-gen card" in result.output and "regenerate" not in result.output
+    write_card(copy)
+    assert verify(copy).sound
+
+
+def test_what_this_machine_cannot_check_is_not_called_damaged(copy, monkeypatch):
+    def fail(*_, **__):
+        raise RenderingError("no renderer here")
+
+    monkeypatch.setattr("dmcvb_gen.release.contents.renderer_for", fail)
+    result = CliRunner().invoke(main, ["verify", str(copy)])
+    assert result.exit_code == 1 and "FAIL unchecked" in result.output and "regenerate" not in result.output
 
 
 def checks(folder):

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset.manifest import Manifest
+from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
 from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
@@ -96,7 +97,7 @@ def export(
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
     folders = [out] if merge else [out / kind.folder_name(release, name) for name in names]
     works = [
-        _Work(str(path), storage_options, to, options, part, folder, _stamp(release.manifest, to, options, part))
+        _Work(str(path), storage_options, to, options, part, folder, _stamp(release, to, options, part))
         for part, folder in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
     ]
     todo = [work for work in works if not work.done]
@@ -109,11 +110,21 @@ def export(
     return folders
 
 
-def _stamp(manifest: Manifest, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
+def _stamp(release: ReleaseReader, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
     """Return what an export was made from: release (its root digest, if it is finished), format, options, episodes."""
+    manifest = release.manifest
     digests = {record.name: record.digest for record in manifest.subsets}
-    content = [[name, digests[name], list(episodes)] for name, episodes in subsets]
+    content = [
+        [name, digests[name] or _digest_of(release[name], episodes), list(episodes)] for name, episodes in subsets
+    ]
     return dict(release=manifest.name, digest=manifest.digest, format=to, options=options, subsets=content)
+
+
+def _digest_of(subset: Subset, episodes: Sequence[int]) -> str:
+    """The digest of the shards that hold some episodes, of a subset that has none of its own yet."""
+    return subset_digest(
+        {shard: commit for shard, commit in subset.commits.items() if set(range(*commit.episodes)) & set(episodes)}
+    )
 
 
 def _formats_with(option: str) -> list[str]:
