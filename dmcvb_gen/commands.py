@@ -19,6 +19,7 @@ from dmcvb_gen.options import (
     Local,
     Location,
     Names,
+    Part,
     Precision,
     Reward,
     Samples,
@@ -30,7 +31,7 @@ from dmcvb_gen.options import (
 )
 from dmcvb_gen.parallel import Workers, ignore
 from dmcvb_gen.parallel.cores import usable_cores
-from dmcvb_gen.text import as_names
+from dmcvb_gen.text import as_names, quoted
 
 if TYPE_CHECKING:
     from dmcvb_gen.benchmarks.setup import Setup
@@ -81,8 +82,8 @@ def rollout(
     out: Location | None = None,
     storage_options: dict[str, Any] | None = None,
     scratch: Local | None = None,
-    scratch_size: int | None = None,
-    part: Span | None = None,
+    scratch_size: Count | None = None,
+    part: Part | None = None,
     other_versions: bool = False,
     progress: bool = True,
 ) -> "ReleaseReader":
@@ -151,7 +152,7 @@ def rollout(
 
 @checked
 def paint(
-    release: Local,
+    release: Location,
     *,
     only: Names = (),
     episodes: Span | None = None,
@@ -180,10 +181,18 @@ def paint(
     `notify` is called with each difference to the environment that made the release, before rendering.
 
     Raises:
-      DmcvbError: nothing matches, a shard is damaged, or the videos are not those of the manifest.
+      DmcvbError: nothing matches, a shard is damaged, or the videos are not those of the manifest; a URL is given.
     """
     from dmcvb_gen.generate.paint import paint_release
+    from dmcvb_gen.storage.remote import is_url, local_path, public
 
+    if is_url(str(release)):
+        url = public(str(release))
+        raise DmcvbError(
+            f"{url} is a URL; give a local one, or fetch and render it: dmcvb-gen fetch {quoted(url)} --paint --out "
+            "FOLDER"
+        )
+    release = local_path(release)
     with progress_bar(progress, " frames") as bar:
         config = _render_config(size, views, goal, backgrounds, workers, device, bar, notify)
         return paint_release(release, as_names(only), episodes, config)
@@ -274,8 +283,13 @@ def regenerate(
 
     if (release is None) == (manifest is None):
         raise DmcvbError("give a RELEASE, or a manifest with --manifest")
+    add = "add --out FOLDER (in Python, out=FOLDER)"
+    if manifest is not None and check:
+        raise DmcvbError(
+            "remove --check: with --manifest, digests are always compared" + ("" if out else f"; and {add}")
+        )
     if manifest is not None and not out:
-        raise DmcvbError("a manifest alone has no shards to repair: add --out FOLDER (in Python, out=FOLDER)")
+        raise DmcvbError(f"a manifest alone has no shards to repair: {add}")
     if check and out:
         raise DmcvbError("give --check or --out, not both")
     videos = None if backgrounds is None else str(backgrounds)

@@ -11,7 +11,7 @@ EXTRAS = {
     "gpu": ("mujoco_warp", "warp"),
     "s3": ("s3fs",),
     "gs": ("gcsfs",),
-    "hf": ("huggingface_hub",),
+    "hf": ("huggingface_hub", "pyarrow"),
     "hdf5": ("h5py",),
     "minari": ("minari",),
     "lerobot": ("pyarrow",),
@@ -41,9 +41,10 @@ def install_hint(module: str) -> str | None:
     """Say how to install a missing `module` (or its parent); None for a module that no extra brings."""
     top = module.split(".")[0]
     package = _PACKAGES.get(top, top)
-    for extra, modules in EXTRAS.items():
-        if top in modules:
-            return f"this needs {package}, which is not installed: pip install {package} (or the extra [{extra}])"
+    extras = [f"[{extra}]" for extra, modules in EXTRAS.items() if top in modules]
+    if extras:
+        bringing = f"the extra {' or '.join(extras)}"
+        return f"this needs {package}, which is not installed: pip install {package} (or {bringing})"
     if top == "labmaze":
         return "mazes need labmaze, which has wheels for Python 3.11 and 3.12 only: use one of these, or another task"
     if top in SIMULATOR or top in _PACKAGES:

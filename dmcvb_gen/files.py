@@ -163,7 +163,7 @@ def read_yaml(path: Path | Traversable) -> Any:
     """A small YAML file as plain values.
 
     Raises:
-      OSError: it cannot be read. ValueError: not text, too large, or not YAML (in a line).
+      OSError: it cannot be read. ValueError: not text, too large, not YAML, or a key is given twice (in a line).
     """
     import yaml  # reading releases needs none
 
@@ -172,11 +172,39 @@ def read_yaml(path: Path | Traversable) -> Any:
     if len(content) > LARGEST_YAML:
         raise ValueError(f"over {LARGEST_YAML // 1000} kB, which no settings need")
     try:
-        return yaml.safe_load(content.decode())
+        loader = yaml.SafeLoader(content.decode())
+        node = loader.get_single_node()
+        twice = _repeated_key(node)
+        value = None if node is None or twice else loader.construct_document(node)
     except UnicodeDecodeError:
         raise ValueError("not text in UTF-8") from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ValueError(f"not YAML: {' '.join(str(error).split())}") from None
+    if twice:
+        raise ValueError(f"{twice.value} is given twice (line {twice.start_mark.line + 1}); keep one")
+    return value
+
+
+def _repeated_key(root: Any) -> Any:
+    """The node of the first key that a mapping below a YAML node has twice, None if there is none.
+
+    PyYAML would keep the last value and drop the others without a word. Merge keys (`<<`) may repeat: none is lost.
+    """
+    nodes, seen, found = [root], set(), []
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, tuple):  # a key and its value
+            nodes += node
+        elif id(node) not in seen and isinstance(getattr(node, "value", None), list):  # an alias is its anchor's node
+            seen.add(id(node))
+            nodes += node.value
+            known = set()
+            for key in (pair[0] for pair in node.value if isinstance(pair, tuple)):
+                name = (key.tag, str(key.value))
+                if name in known and not key.tag.endswith(":merge"):
+                    found.append(key)
+                known.add(name)
+    return min(found, key=lambda key: key.start_mark.index, default=None)
 
 
 def write_json(path: str | Path, value: Any) -> None:

@@ -50,8 +50,12 @@ Count = Annotated[int, Between(1)]
 Seed = Annotated[int, Between(0)]
 Share = Annotated[float, Between(0, 1, open=True)]
 Samples = Annotated[int, Between(1, 8)]
-Span = tuple[int, int]
-"""(first, last + 1), or (part, parts)."""
+RANGE, PART = "range", "part"
+"""Marks of two whole numbers: (A, B) with 0 <= A < B, and (K, N) with 1 <= K <= N."""
+Span = Annotated[tuple[int, int], RANGE]
+"""(first, last + 1)."""
+Part = Annotated[tuple[int, int], PART]
+"""(part, parts)."""
 Difficulty = Annotated[str, DIFFICULTIES]
 GoalPictures = Annotated[str, GOAL_PICTURES]
 Precision = Annotated[str, ("auto", "float32", "bfloat16")]
@@ -68,7 +72,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     Numbers become Python's own, and iterators tuples, so that they can be read more than once.
 
     Raises:
-      DmcvbError: at a call, a number that is none or out of bounds. UnknownNameError: a word that is no choice.
+      DmcvbError: at a call, a number or range that is none or out of bounds, or None for what has to be given.
+      UnknownNameError: a word that is no choice.
     """
     signature = inspect.signature(function)
 
@@ -76,7 +81,10 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
-            given.arguments[name] = _checked(name, value, signature.parameters[name].annotation)
+            parameter = signature.parameters[name]
+            if value is None and parameter.default is parameter.empty:
+                raise DmcvbError(f"{name} is None; give {_wanted(parameter.annotation)}")
+            given.arguments[name] = _checked(name, value, parameter.annotation)
         return function(*given.args, **given.kwargs)
 
     return call
@@ -88,6 +96,8 @@ def _checked(name: str, value: Any, annotation: Any) -> Any:
         return value
     if any(typing.get_origin(kind) is Sequence for kind in kinds):
         return value if isinstance(value, str | Path) or not hasattr(value, "__iter__") else tuple(value)
+    if RANGE in marks or PART in marks:
+        return _pair(name, value, is_range=RANGE in marks)
     choices = next((mark for mark in marks if isinstance(mark, tuple)), None)
     if choices and value not in choices:
         raise UnknownNameError(name, value, choices)
@@ -96,6 +106,24 @@ def _checked(name: str, value: Any, annotation: Any) -> Any:
         return value
     bounds = next((mark for mark in marks if isinstance(mark, Between)), None)
     return _number(name, value, float not in numeric, bounds)
+
+
+def _wanted(annotation: Any) -> str:
+    """What a parameter takes, for people."""
+    kinds, marks = parts_of(annotation)
+    if Path in kinds:
+        return "a folder" if LOCAL in marks else "a folder or a URL"
+    return "text"
+
+
+def _pair(name: str, value: Any, is_range: bool) -> tuple[int, int]:
+    given = value if isinstance(value, tuple | list) else ()
+    if len(given) == 2 and all(isinstance(n, numbers.Integral) and not isinstance(n, bool) for n in given):
+        first, last = map(int, given)
+        if 0 <= first < last if is_range else 1 <= first <= last:
+            return first, last
+    form = "(A, B), whole numbers with 0 <= A < B" if is_range else "(K, N), whole numbers with 1 <= K <= N"
+    raise DmcvbError(f"{name} is {value!r}; give {form}")
 
 
 def _number(name: str, value: Any, whole: bool, bounds: Between | None) -> int | float:

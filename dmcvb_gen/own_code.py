@@ -60,8 +60,12 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
     """
     own = [name for name in names if is_own(name)]
     if own:
-        before = [name for name in os.environ.get(variable, "").split(",") if name]
-        os.environ[variable] = ",".join(dict.fromkeys([*before, *own]))
+        os.environ[variable] = ",".join(dict.fromkeys([*_allowed(variable), *own]))
+
+
+def _allowed(variable: str) -> list[str]:
+    """The names in an environment variable; people write a space after a comma, or a comma at the end."""
+    return [name for part in os.environ.get(variable, "").split(",") if (name := part.strip())]
 
 
 def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
@@ -74,7 +78,7 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
     Raises:
       DmcvbError: its code may not run, or cannot be found.
     """
-    if name not in os.environ.get(variable, "").split(","):
+    if name not in _allowed(variable):
         raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={name}")
     module, _, function = name.partition(":")
     if os.getcwd() not in sys.path:

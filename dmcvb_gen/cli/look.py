@@ -195,8 +195,8 @@ def status(place, options, as_json):
         click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")
     if found.late:
         click.echo(
-            f"{pluralize(found.late, 'shards')} late (later ones are done): in progress, of a --part that has not run, "
-            "or of a worker that died. The same rollout makes them."
+            f"{pluralize(found.late, 'shards')} late (later ones are done). They are in progress, belong to a --part "
+            "that has not run, or were lost with a worker. Rerun the rollout to make them."
         )
     if found.done == found.total:
         click.echo("complete" if found.complete else "All shards are done; finish the release with --finish.")

@@ -174,9 +174,10 @@ UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 def parse_bytes(flag: str, text: str) -> int:
     """ "20GB" -> 20000000000."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)B?", text.strip().upper())
-    if not found or float(found[1]) <= 0:
+    size = int(float(found[1]) * UNITS[found[2]]) if found else 0
+    if size < 1:
         raise click.UsageError(f"{flag} {text!r} is no size; give bytes, or e.g. 500MB or 20GB.")
-    return int(float(found[1]) * UNITS[found[2]])
+    return size
 
 
 def split_names(flag: str, text: str) -> tuple[str, ...]:

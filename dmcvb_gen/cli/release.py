@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 @command_of(commands.verify)
 def verify(release, as_json, **options):
-    """Check that a release is what it says: digests, shapes, values, physics, pixels, returns.
+    """Check a release: digests, shapes, values, physics, pixels, returns.
 
     At a URL nothing is downloaded: manifest, index and commit records are checked, and a sample of files by digest.
 
-    Exit code 0 when sound and complete, 1 when a check fails, 2 on bad usage, 3 when what is here is sound but is not
-    the whole release (a rollout that is not finished, or a part that was fetched).
+    Exit codes: 0: sound and complete. 1: a check failed. 2: bad usage. 3: sound, but a part is missing (a rollout that
+    is not finished, or a part that was fetched).
 
     \b
     dmcvb-gen verify releases/demo
@@ -159,7 +159,8 @@ def publish(release, url, as_json, **options):
 def card(path, check, out, url, as_json):
     """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, CHANGELOG.md, a table.
 
-    The table, card/episodes.parquet, has a row an episode with its first frame; `datasets.load_dataset` reads it.
+    The table, card/episodes.parquet, has one row for each episode, with its first frame. `datasets.load_dataset` reads
+    it.
 
     With --check, exit code 1 when the card does not fit the data, 3 when it fits the part that was fetched.
 

@@ -9,7 +9,7 @@ import click
 from dmcvb_gen.cli.common import WORDS
 
 SLURM = """#!/bin/bash
-# An array of {count} tasks: sbatch this file. A task that is taken away is put back into the queue and goes on.
+# An array of {count} tasks: sbatch this file. A preempted task is requeued and resumes.
 #SBATCH --job-name={name}
 #SBATCH --array=1-{count}
 #SBATCH --cpus-per-task={workers}

@@ -7,9 +7,11 @@ import concurrent.futures
 import itertools
 import multiprocessing
 import os
+import pickle
 import queue
 import signal
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -17,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from typing import Any
 
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.parallel.base import IN_FLIGHT, KEPT, POLL_SECONDS, Future, Pool, ProgressCallback, ignore, limit_threads
 
 
@@ -143,7 +145,13 @@ def _tell(*facts: Any) -> None:
 
 
 def _work(number: int, function: Callable, arguments: tuple) -> Any:
-    result = function(*arguments, tick=_tell)
+    try:
+        result = function(*arguments, tick=_tell)
+    except Exception as error:
+        told = _sendable(error)
+        if told is error:
+            raise
+        raise told from error
     if not isinstance(result, Future):
         return result
     threading.Thread(target=_wait, args=(number, result), daemon=True).start()
@@ -154,4 +162,28 @@ def _wait(number: int, later: Future) -> None:
     try:
         _messages.put((number, later.wait(), None))
     except BaseException as error:
-        _messages.put((number, None, error))
+        _messages.put((number, None, _sendable(error)))
+
+
+def _sendable(error: BaseException) -> BaseException:
+    """An error that reaches the parent: itself, or one that tells of it if it does not survive pickling.
+
+    The parent would take the first kind of loss for a killed worker, and would wait for ever after the second: a queue
+    pickles in a thread of its own, and drops what it cannot pickle.
+    """
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        told = DmcvbError(f"a worker failed ({_in_a_line(error)})")
+        told.add_note("".join(traceback.format_exception(error)))
+        return told
+    return error
+
+
+def _in_a_line(error: BaseException) -> str:
+    """Name and text of an error; one that was written wrongly may not even have a text."""
+    name = type(error).__name__
+    try:
+        return f"{name}: {' '.join(str(error).split())}"
+    except Exception:
+        return name

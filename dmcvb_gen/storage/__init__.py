@@ -17,7 +17,8 @@ def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) ->
       options: options of fsspec, for a URL, e.g. {"endpoint_url": ...}.
 
     Raises:
-      StoreError: the URL's protocol is unknown or not installed, or it names no bucket; options for a folder.
+      StoreError: the URL's protocol is unknown or not installed, or it names no bucket; options for a folder,
+        which file: URLs name, too.
     """
     from dmcvb_gen.storage.local import LocalStorage
     from dmcvb_gen.storage.object_store import ObjectStorage
@@ -32,7 +33,9 @@ def open_storage(place: str | Path, options: Mapping[str, Any] | None = None) ->
         from dmcvb_gen.storage.hub import HubStorage
 
         return HubStorage(url, pairs)
-    _, base = file_system(url, dict(pairs))
     if protocol in ("file", "local"):
+        _, base = file_system(url)
+        check_no_options(base, options)
         return LocalStorage(Path(base), url)
+    file_system(url, dict(pairs))  # says now what is wrong with it
     return ObjectStorage(url, pairs)

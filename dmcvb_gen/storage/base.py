@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes, sha256_file
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.storage.remote import NO_ROOM, is_refusal, is_url, reason, refused, storage_errors
+from dmcvb_gen.storage.remote import NO_ROOM, is_refusal, is_url, reason, refused, storage_errors, without_parts
 
 ATTEMPTS = 4
 """Tries of a file before giving up."""
@@ -213,7 +213,11 @@ class Storage(abc.ABC):
     def _sha256(self, file: Digested) -> str:
         digest = hashlib.sha256()
         for start in range(0, file.bytes, PIECE):
-            digest.update(self._read(file.path, start, min(start + PIECE, file.bytes)))
+            end = min(start + PIECE, file.bytes)
+            piece = self._read(file.path, start, end)
+            if len(piece) > end - start:  # the whole file; `_fetch` can use that, a digest of pieces cannot
+                raise StoreError(without_parts(self.place))
+            digest.update(piece)
         return digest.hexdigest()
 
     def upload(self, root: Path, file: Digested, fresh: bool = False) -> bool:

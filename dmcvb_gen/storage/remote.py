@@ -76,8 +76,8 @@ def local_path(path: str | Path) -> Path:
     """
     if is_url(str(path)) or (isinstance(path, Path) and _ONE_SLASH.match(str(path))):  # `Path` makes s3:/x of s3://x
         raise StoreError(
-            f"{public(str(path))} is a URL, and this is written to folders; give a local one and copy it there (a "
-            "release: `dmcvb-gen publish FOLDER URL`)"
+            f"{public(str(path))} is a URL; give a local one, a folder or file of this machine (`dmcvb-gen publish "
+            "FOLDER URL` puts a release at a URL)"
         )
     check_place(str(path))
     return Path(path)
@@ -170,8 +170,28 @@ def _explained(error: BaseException, place: str, doing: str) -> str:
     if isinstance(error, OSError):
         return f"cannot {doing} {place}: {error.strerror or reason(error)}"
     _end_quietly()
+    if not _serves_parts(place):
+        return without_parts(place)
     why = reason(error).split(". ")[0]
     return f"{place} is damaged ({why}); repair it with `dmcvb-gen regenerate`, or fetch it again"
+
+
+def without_parts(place: str) -> str:
+    """Say that a web server answers with whole files if it is asked for parts, as `python -m http.server` does."""
+    return (
+        f"the server of {place} does not serve parts of files; fetch the release first: dmcvb-gen fetch URL --out "
+        "FOLDER"
+    )
+
+
+def _serves_parts(place: str) -> bool:
+    """Return False if a web server gives the whole metadata of an array or group at `place` for its first byte."""
+    if not place.startswith(("http://", "https://")):
+        return True
+    with contextlib.suppress(Exception):  # it is asked only to explain an error, without the options of the first one
+        filesystem, base = file_system(place)
+        return len(filesystem.cat_file(f"{base}/zarr.json", start=0, end=1)) <= 1
+    return True
 
 
 @functools.cache

@@ -238,6 +238,9 @@ class EpisodeBatch(abc.ABC):
 
         An episode that terminates at its first control step is frozen for the second: its state stays
         what it was at the end and it earns nothing more (as an action-repeat wrapper that breaks).
+
+        Raises:
+          DmcvbError: the task gave a reward that is not finite.
         """
         actions = np.asarray(actions, np.float64)
         if actions.shape != self._ctrl.shape:
@@ -254,6 +257,9 @@ class EpisodeBatch(abc.ABC):
             ended = self._control_terminated() & moving
             terminated |= ended
             moving &= ~ended
+        if not np.isfinite(reward).all():  # of a task that somebody else wrote
+            wrong = reward[~np.isfinite(reward)][0]
+            raise DmcvbError(f"task {self.task.id} gave the reward {wrong}; its reward must be a finite number")
         return StepResult(self.state(), reward, terminated)
 
     def _advance(self, ids: np.ndarray | None) -> None:

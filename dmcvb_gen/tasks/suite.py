@@ -209,6 +209,12 @@ def _check_actions(id: str, environment: Any) -> None:
             )
 
 
+def _failed(task_id: str, error: Exception) -> DmcvbError:
+    """The error for an exception of a task's own code."""
+    reason = (str(error).splitlines() or [""])[0]
+    return DmcvbError(f"task {task_id} failed ({type(error).__name__}: {reason})")
+
+
 @contextlib.contextmanager
 def _seeded(task: Any, random: np.random.RandomState) -> Iterator[None]:
     """dm_control's own random numbers of a task come from `random`, numpy's global ones from a seed of it."""
@@ -223,7 +229,10 @@ def _seeded(task: Any, random: np.random.RandomState) -> Iterator[None]:
 
 
 class SuiteBatch(EpisodeBatch):
-    """Episodes of a `SuiteTask`: physics steps together, dm_control's task is asked for one episode after the other."""
+    """Episodes of a `SuiteTask`: physics steps together, dm_control's task is asked for one episode after the other.
+
+    An exception of the task's own code becomes a `DmcvbError` of one line that names the task.
+    """
 
     task: SuiteTask
 
@@ -254,7 +263,10 @@ class SuiteBatch(EpisodeBatch):
             task = self._tasks[sim]
             with _seeded(task, np.random.RandomState(np.random.MT19937(int(generator.integers(2**63))))):
                 with self._physics.reset_context():
-                    task.initialize_episode(self._physics)
+                    try:
+                        task.initialize_episode(self._physics)
+                    except Exception as error:  # the code of somebody else
+                        raise _failed(self.task.id, error) from error
             row = np.empty(len(self._physics_columns))
             mujoco.mj_getState(model, self._physics.data.ptr, row, PHYSICS_SPEC)
             self.sims.state[sim, self._physics_columns] = row
@@ -277,8 +289,12 @@ class SuiteBatch(EpisodeBatch):
 
     def state(self):
         for sim in np.flatnonzero(self._stale).tolist():
-            observation = self._tasks[sim].get_observation(self._look_at(sim))
-            self._states[sim] = np.concatenate([np.ravel(part) for part in observation.values()])
+            physics = self._look_at(sim)
+            try:
+                observation = self._tasks[sim].get_observation(physics)
+                self._states[sim] = np.concatenate([np.ravel(part) for part in observation.values()])
+            except Exception as error:  # the code of somebody else
+                raise _failed(self.task.id, error) from error
         self._stale[:] = False
         return self._states.copy()
 
@@ -286,9 +302,12 @@ class SuiteBatch(EpisodeBatch):
         reward, self._ended = np.zeros(self.size), np.zeros(self.size, bool)
         for sim in self._moved.tolist():
             physics, task = self._look_at(sim), self._tasks[sim]
-            task.after_step(physics)
-            reward[sim] = task.get_reward(physics)
-            self._ended[sim] = task.get_termination(physics) is not None
+            try:
+                task.after_step(physics)
+                reward[sim] = float(task.get_reward(physics))  # numpy would make NaN of None
+                self._ended[sim] = task.get_termination(physics) is not None
+            except Exception as error:  # the code of somebody else
+                raise _failed(self.task.id, error) from error
         return reward
 
     def _control_terminated(self):

@@ -16,6 +16,7 @@ import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.manifest import commit_path
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.extras import install_hint
 from dmcvb_gen.generate.recipe import load_recipe
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.release.card import write_card
@@ -67,6 +68,30 @@ def test_a_file_that_holds_no_recipe_says_what_is_wrong_with_it(tmp_path):
     with pytest.raises(DmcvbError, match="open.yaml: not YAML") as caught:
         load_recipe(tmp_path / "open.yaml")
     assert "shipped" not in str(caught.value)
+
+
+TWICE = """name: dup
+base: &base {episodes: 1}
+subsets:
+- {tasks: walker-walk, levels: random, settings: none, <<: *base, episodes: 2}
+- *base
+
+subsets:
+- {tasks: cheetah-run, levels: random, settings: none, episodes: 1}
+"""
+
+
+def test_a_field_that_is_given_twice_is_told_with_its_line(tmp_path):
+    """Line 7 has the second `subsets`; what a merge key brings may be given again."""
+    (tmp_path / "dup.yaml").write_text(TWICE)
+    with pytest.raises(DmcvbError, match=r"dup\.yaml: subsets is given twice \(line 7\); keep one$"):
+        load_recipe(tmp_path / "dup.yaml")
+    (tmp_path / "inner.yaml").write_text("name: mine\nsubsets:\n- tasks: walker-walk\n  tasks: cheetah-run\n")
+    with pytest.raises(DmcvbError, match=r"tasks is given twice \(line 4\)"):
+        load_recipe(tmp_path / "inner.yaml")
+    merged = "- &first {tasks: walker-walk, levels: random, settings: none, episodes: 1}\n- {<<: *first, episodes: 2}\n"
+    (tmp_path / "merged.yaml").write_text(f"name: mine\nsubsets:\n{merged}")
+    assert [pattern.episodes for pattern in load_recipe(tmp_path / "merged.yaml").subsets] == [1, 2]
 
 
 @pytest.mark.parametrize("words, told", [
@@ -171,6 +196,28 @@ def test_late_and_open_shards_are_counted_once(copy):
     (copy / commit_path(NAME, 0)).unlink()
     [row] = [line for line in run("status", copy).splitlines() if line.startswith(NAME)]
     assert row.split()[1:] == ["1", "1", "0"]
+
+
+def test_a_url_where_a_folder_is_needed_says_how_to_get_one(tmp_path):
+    said = run("paint", "s3://bucket/demo?versionId=1", code=2)
+    assert "s3://bucket/demo is a URL; give a local one, or fetch" in said
+    assert "dmcvb-gen fetch s3://bucket/demo --paint --out FOLDER" in said
+    assert "s3://bucket/demo is a URL; give a local one, a folder or file" in run(
+        "fetch", "file:x", "--out", "s3://bucket/demo", code=2
+    )
+    assert "did you mean s3://bucket/demo" in run("paint", "s3:/bucket/demo", code=2)
+
+
+def test_a_manifest_is_always_compared_so_check_is_refused_at_once(small_release, tmp_path):
+    for more in ([], ["--out", tmp_path / "z"]):
+        said = run("regenerate", "--manifest", "quickstart", "--check", *more, code=2)
+        assert "remove --check: with --manifest, digests are always compared" in said
+        assert ("add --out FOLDER" in said) == (not more)
+    assert "give --check or --out, not both" in run("regenerate", small_release, "--check", "--out", "z", code=2)
+
+
+def test_a_missing_pyarrow_names_the_extra_of_cards_first():
+    assert "the extra [hf] or [lerobot]" in install_hint("pyarrow")
 
 
 # -- cards ----------------------------------------------------------------------------------------

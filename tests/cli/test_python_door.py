@@ -165,6 +165,18 @@ def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
         (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), "checks_only trains nothing"),
         (lambda out: dmcvb_gen.validate(out, checks_only=True, profile="paper"), "--profile has no effect"),
         (lambda out: dmcvb_gen.validate(out, agents="bc,state-bc"), "no release"),
+        (lambda out: dmcvb_gen.fetch("file:publ", out, episodes="0:2"), r"^episodes is '0:2'; give \(A, B\), whole"),
+        (lambda out: dmcvb_gen.paint(out, episodes=5), r"^episodes is 5; give \(A, B\)"),
+        (lambda out: dmcvb_gen.regenerate(out, episodes=(0,)), r"^episodes is \(0,\); give"),
+        (lambda out: dmcvb_gen.export(out, "npz", out, episodes=(0.5, 1.5)), r"^episodes is \(0.5, 1.5\); give"),
+        (lambda out: dmcvb_gen.fetch("file:publ", out, episodes=(2, 2)), "with 0 <= A < B"),
+        (lambda out: dmcvb_gen.fetch("file:publ", out, episodes=(-1, 2)), "with 0 <= A < B"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", episode_range="0:1", out=out), "^episode_range is '0:1'; give"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", part=(0, 2), out=out), r"^part is \(0, 2\); give \(K, N\)"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", scratch_size=0, out=out), "^scratch_size is 0; give a whole"),
+        (lambda out: dmcvb_gen.verify(None), "^release is None; give a folder or a URL$"),
+        (lambda out: dmcvb_gen.repaint(out, out=None), "^out is None; give a folder$"),
+        (lambda out: dmcvb_gen.fetch(None, out), "^url is None; give text$"),
     ],
 )
 def test_errors_are_those_of_the_commands(call, message, tmp_path):
@@ -175,6 +187,7 @@ def test_errors_are_those_of_the_commands(call, message, tmp_path):
 
 def test_arguments_may_be_paths_numpys_numbers_and_iterators(tmp_path):
     few = dict(episodes=np.int64(1), max_steps=np.int32(2), size=np.uint8(16), progress=False)
+    few |= dict(episode_range=[np.int64(0), np.uint8(1)], part=(1, 1))
     layout = tmp_path / "ring.txt"
     layout.write_text("*****\n*   *\n* * *\n*   *\n*****\n")
     made = dmcvb_gen.rollout(layouts=layout, levels=iter(["random"]), out=tmp_path / "maze", **few)

@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.parallel import IN_FLIGHT, Future, open_pool, run_all
 from dmcvb_gen.parallel.base import Needs
 from dmcvb_gen.parallel.ray_pool import RayPool
@@ -25,6 +25,28 @@ def square(number, tick):
 
 def fail(number, tick):
     raise UnknownNameError("level", "exprt", ("expert", "medium"))
+
+
+class Two(Exception):
+    """An error that pickles and cannot be made again, as people write them."""
+
+    def __init__(self, a, b):
+        super().__init__(a)
+
+
+class Kept(Exception):
+    """An error that cannot be pickled."""
+
+    def __reduce__(self):
+        raise TypeError("no")
+
+
+def fail_oddly(kind, tick):
+    raise Two("x\ny", "z") if kind == "two" else Kept("x\ny")
+
+
+def fail_oddly_later(kind, tick):
+    return Future(lambda: fail_oddly(kind, tick))
 
 
 def die(number, tick):
@@ -77,6 +99,15 @@ def test_results_may_ask_for_more_work(workers):
 def test_an_error_of_the_work_arrives_as_it_was_raised(workers):
     with pytest.raises(UnknownNameError, match="Did you mean 'expert'"):
         list(run_all(fail, [1, 2], workers))
+
+
+@pytest.mark.parametrize("work", [fail_oddly, fail_oddly_later])
+@pytest.mark.parametrize(("kind", "told"), [("two", "Two: x y"), ("kept", "Kept: x y")])
+def test_an_error_that_does_not_survive_pickling_is_told_with_where_it_was(work, kind, told):
+    with pytest.raises(DmcvbError) as caught:
+        list(run_all(work, [kind, kind], 2))
+    assert str(caught.value) == f"a worker failed ({told})"
+    assert "in fail_oddly" in "".join(caught.value.__notes__)
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -21,7 +21,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate import engine
-from dmcvb_gen.own_code import BEHAVIOURS
+from dmcvb_gen.own_code import BEHAVIOURS, allow, find_function
 from dmcvb_gen.own_code import TASKS as TASKS_VARIABLE
 from dmcvb_gen.policies.convert import convert
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
@@ -117,6 +117,15 @@ def test_data_of_a_function_are_verified_regenerated_and_marked(task, code, tmp_
     monkeypatch.setenv(BEHAVIOURS, "")  # and on somebody else's machine: a manifest lets no code run
     assert BEHAVIOURS in refused("regenerate", tmp_path / "r", "--check")
     assert json.loads(done("verify", tmp_path / "r", "--json"))["sound"]
+
+
+def test_names_that_may_run_are_listed_as_people_list_them(code, monkeypatch):
+    monkeypatch.setenv(BEHAVIOURS, f" other:f, {code}:noisy,, ")
+    assert callable(find_function(f"{code}:noisy", BEHAVIOURS, "behaviour"))
+    allow([f"{code}:narrow"], BEHAVIOURS)
+    assert os.environ[BEHAVIOURS] == f"other:f,{code}:noisy,{code}:narrow"
+    with pytest.raises(DmcvbError, match="code of your own; to let it run"):
+        find_function("", BEHAVIOURS, "behaviour")
 
 
 def test_a_functions_noise_comes_from_each_episodes_own_stream(task, code, tmp_path, monkeypatch):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import functools
+import http.server
 import pickle
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import uuid
 
 import pytest
 
+import dmcvb_gen
 from dmcvb_gen import files
 from dmcvb_gen.dataset.manifest import FileRecord
 from dmcvb_gen.errors import StoreError
@@ -243,3 +246,51 @@ class TestHub(StorageTests):
 def test_urls_that_lead_nowhere_are_refused(url, words):
     with pytest.raises(StoreError, match=words):
         open_storage(url)
+
+
+def test_options_have_no_effect_on_a_folder_however_it_is_named(tmp_path):
+    for place in (tmp_path, f"file:{tmp_path}", f"file://{tmp_path}", f"local://{tmp_path}"):
+        with pytest.raises(StoreError, match=f"--option has no effect: {tmp_path} is a folder, not a URL; remove it"):
+            open_storage(place, {"nonsense": 1})
+
+
+# -- web servers without byte ranges --------------------------------------------------------------
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A folder, and its URL at a server that gives whole files for any part of them."""
+    pytest.importorskip("aiohttp")
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path / "served")
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield tmp_path / "served", f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_server_without_ranges_is_not_taken_for_damage(served, tmp_path, monkeypatch):
+    folder, url = served
+    monkeypatch.setattr(base, "PIECE", 300)
+    monkeypatch.setattr(base, "PAUSE", 0.001)
+    (folder / "a").mkdir(parents=True)
+    (folder / "a/b").write_bytes(data := bytes(range(256)) * 4)
+    storage, file = open_storage(url), record("a/b", data)
+    with pytest.raises(StoreError, match=f"server of {url} does not serve parts of files; fetch the release first"):
+        storage.sha256(file)
+    partial = base.unfinished(tmp_path / "back/a/b")
+    partial.parent.mkdir(parents=True)
+    partial.write_bytes(data[:500])  # of an interrupted download
+    assert storage.download(file, tmp_path / "back") and (tmp_path / "back/a/b").read_bytes() == data
+
+
+def test_a_release_at_a_server_without_ranges_says_to_fetch_it(served, small_release):
+    folder, url = served
+    dmcvb_gen.publish(small_release, f"file:{folder}", progress=False)
+    subset = dmcvb_gen.open(url)["walker-walk/random/dynamic"]
+    with pytest.raises(StoreError, match="does not serve parts of files; fetch the release first") as caught:
+        for episode in subset.episodes:
+            subset.episode(int(episode))
+    assert "damaged" not in str(caught.value)
+    fetched = dmcvb_gen.fetch(url, folder.parent / "fetched", progress=False)
+    assert fetched["walker-walk/random/dynamic"].episode(0)

@@ -220,6 +220,56 @@ def test_a_task_of_ones_own_that_cannot_be_used_is_refused(tmp_path, monkeypatch
         get_task(f"arm_tasks:{name}")
 
 
+FAILING = (
+    "ARM = "
+    + repr(ARM)
+    + """
+from dmcvb_gen.tasks import own
+def made(reward, observe=None):
+    with open("arm.xml", "w") as file:
+        file.write(ARM)
+    return own.mjcf_environment("arm.xml", reward, observe)
+def late(physics):
+    if physics.time() > 0.03:
+        raise ValueError("no", "two")
+    return {"position": physics.data.qpos.copy()}
+def reward_of_a_dictionary(physics):
+    raise KeyError("left")
+def breaks():
+    return made(reward_of_a_dictionary)
+def blinks():
+    return made(lambda physics: 0.0, late)
+def nothing():
+    return made(lambda physics: None)
+def nan():
+    return made(lambda physics: float("nan") if physics.time() > 0.03 else 1.0)
+def infinite():
+    return made(lambda physics: float("inf"))
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("breaks", r"failed \(KeyError: 'left'\)"),
+        ("blinks", r"failed \(ValueError: \('no', 'two'\)\)"),
+        ("nothing", r"failed \(TypeError: .*None.*\)"),
+        ("nan", "gave the reward nan; its reward must be a finite number"),
+        ("infinite", "gave the reward inf; its reward must be a finite number"),
+    ],
+)
+def test_a_task_of_ones_own_that_fails_in_an_episode_is_told_in_one_line(tmp_path, monkeypatch, name, message):
+    ten_lines(tmp_path, monkeypatch, FAILING)
+    monkeypatch.setenv(ALLOWED, f"other:task, arm_tasks:{name} ,")  # as people write lists
+    task = get_task(f"arm_tasks:{name}")
+    batch = task.batch(2)
+    batch.reset([np.random.default_rng(seed) for seed in range(2)])
+    with pytest.raises(DmcvbError, match=f"^task arm_tasks:{name} {message}$"):
+        for _ in range(40):
+            batch.step(np.zeros((2, 1)))
+
+
 def test_a_third_party_registers_a_task():
     register_task("cartpole-mine", lambda: SuiteTask("cartpole-mine", lambda: suite.load("cartpole", "balance")))
     try:
