@@ -216,6 +216,13 @@ def test_a_command_that_resumes_says_so_when_it_is_stopped(monkeypatch, command,
     assert "Aborted" not in result.output
 
 
+@pytest.mark.parametrize("size", ["0", "0.5", "0.0001KB", "much"])
+def test_a_size_is_a_byte_at_least(size, tmp_path):
+    asked = ["rollout", "walker-walk", "--scratch-size", size, "--out", str(tmp_path / "r")]
+    result = CliRunner().invoke(main, asked)
+    assert result.exit_code == 2 and "is no size; give bytes" in result.output and not list(tmp_path.iterdir())
+
+
 HALF_BEGUN = """
 import asyncio, os, signal
 from dmcvb_gen.cli import main
