@@ -169,7 +169,7 @@ def paint(
 
     Args:
       release: Folder of the release.
-      only (PATTERN): Use only these subsets.
+      only (PATTERN): Render only these subsets.
       episodes (RANGE): Use only the shards with episodes A to B - 1.
       size: Width and height in pixels. [default: the manifest's]
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
@@ -221,7 +221,7 @@ def repaint(
 
     Args:
       release (RELEASE): Folder of the release.
-      only (PATTERN): Use only these subsets.
+      only (PATTERN): Render only these subsets.
       distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: the subset's own]
       difficulty: Strength of the distractors. [default: the subset's own; medium with --distractor]
       size: Width and height in pixels. [default: the subset's own]
@@ -267,7 +267,7 @@ def regenerate(
     Args:
       release (RELEASE): Folder of the release.
       manifest (NAME|FILE): A shipped manifest, a manifest's file or the files.tar.xz of a card, instead of a release.
-      only (PATTERN): Use only these subsets.
+      only (PATTERN): Regenerate only these subsets.
       episodes (RANGE): Use only the shards with episodes A to B - 1.
       check: Compare digests and change nothing.
       out (FOLDER): Write the shards to this folder instead.
@@ -311,13 +311,13 @@ def verify(
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> "Verification":
-    """Check that a release is what it says; at a URL manifest, index, commit records and a sample of files.
+    """Check a release: all of a folder; at a URL the manifest, index, commit records and a sample of files.
 
     Args:
       release (RELEASE|URL): Folder or URL of the release.
       everything: At a URL: read every file instead of a sample.
       backgrounds (FOLDER): Folder of the background videos, if it has moved.
-      workers: Worker processes; at a URL: parallel downloads. [default: 1; 8]
+      workers: Worker processes; at a URL: parallel downloads. [default: 1, at a URL 8]
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
     Raises:
@@ -391,7 +391,7 @@ def fetch(
     Args:
       url (URL): Where it was published.
       out (FOLDER): Local folder for the release.
-      only (PATTERN): Use only these subsets.
+      only (PATTERN): Fetch only these subsets.
       episodes (RANGE): Use only the shards with episodes A to B - 1.
       paint: Render the images of each shard as it arrives.
       size: Width and height in pixels. [default: the manifest's]
@@ -452,7 +452,7 @@ def export(
       release (RELEASE|URL): Folder or URL of the release.
       to: Format, for example hdf5, minari, lerobot, rlds or rerun.
       out (FOLDER): Output folder, one folder per subset.
-      only (PATTERN): Use only these subsets.
+      only (PATTERN): Export only these subsets.
       episodes (RANGE): Export only episodes A to B - 1.
       merge: lerobot: write all subsets as the tasks of one data set.
       video: lerobot: store images as mp4 (smaller, lossy) instead of PNG.
