@@ -514,7 +514,7 @@ def validate(
       workers: Cells side by side. [default: 2, on one core 1]
       threads: Threads of each worker. [default: cores / workers]
       device: Device that trains.
-      precision: Precision of networks that see images; auto times both.
+      precision: Precision of networks that see images; auto times both, and takes bfloat16 on GPUs that have it.
       compile: Compile the losses with torch.compile (for CUDA and long runs).
       memory (GB): Memory for images, of all workers together; ray: of each. [default: half of what is free]
       seed: Random seed of the trainings.

@@ -31,7 +31,7 @@ def choose_precision(
     if asked != "auto":
         return asked
     if device.startswith("cuda"):
-        return "bfloat16" if torch.cuda.is_bf16_supported() else "float32"
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     before = torch.get_num_threads()
     torch.set_num_threads(threads or before)
     try:

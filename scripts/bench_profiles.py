@@ -23,6 +23,7 @@ from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.profiles import PROFILES
 from dmcvb_gen.dataset import open_release
+from dmcvb_gen.loaders.painted import Painting, painted_release
 
 WARM, TIMED = 20, 100
 """Adam steps before those that are timed, and these."""
@@ -102,7 +103,8 @@ def main() -> None:
     parser.add_argument("--only", default=",".join(VARIANTS), help=", ".join(VARIANTS))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    agent, subset = parse_agent("bc"), open_release(options.release)[options.subset]
+    agent = parse_agent("bc")
+    subset = painted_release(open_release(options.release), Painting(), missing=True)[options.subset]
     data, quick = load_data([Source(subset)], seed=0), None
     evaluator = Evaluator(subset, normalization=data.normalization, stack=agent.stack)
     print(f"{options.subset}, {subset.returns.mean():.1f} in the data, {options.minutes:g} minutes each")

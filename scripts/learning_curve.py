@@ -23,7 +23,7 @@ import json
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -35,12 +35,18 @@ from dmcvb_gen.agents.data import Normalization, Sizes, Source, TrainingData, lo
 from dmcvb_gen.agents.learners import Policy
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score
-from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, get_profile
+from dmcvb_gen.benchmarks.profiles import PROFILES, Profile, budget, facts_of, get_profile
 from dmcvb_gen.dataset import Subset, open_release
+from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.progress import ProgressBar
 
+READ = (
+    *("pixel_steps", "state_steps", "batch_size", "state_batch_size", "rate", "shift_from", "decay", "muon"),
+    "episode_steps",
+)
+"""Fields of a profile that decide this training, and that --set changes."""
 COLUMNS = ("step", "seconds", "loss", "test_loss", "return", "error")
 
 
@@ -151,13 +157,20 @@ def write_curve(folder: Path, points: list[dict], of_data: float) -> None:
     plt.close(figure)
 
 
-def keep_options(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Write the options into the folder; refuse a folder whose training had others."""
-    asked = {name: str(value) for name, value in vars(options).items() if name != "folder"}
+def keep_options(
+    options: argparse.Namespace, subset: Subset, profile: Profile, parser: argparse.ArgumentParser
+) -> None:
+    """Write the options, the data's digest and the profile's values into the folder; refuse one that has others."""
+    asked: dict = {name: str(value) for name, value in vars(options).items() if name != "folder"}
+    asked |= {"digest": subset_digest(subset.commits), "values": budget(facts_of(profile))}
     path = options.folder / "options.json"
     if path.exists():
-        if json.loads(path.read_text()) != asked:
-            parser.error(f"{options.folder} holds a training with other options, see {path}; choose another --folder")
+        kept = json.loads(path.read_text())
+        kept |= {"values": budget(kept["values"])} if "values" in kept else {}
+        other = [name for name in kept if kept[name] != asked.get(name)]  # an earlier version kept fewer
+        if other:
+            what = "data" if other == ["digest"] else f"options ({', '.join(other)})"
+            parser.error(f"{options.folder} holds a training with other {what}, see {path}; choose another --folder")
         return
     options.folder.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(asked, indent=1) + "\n")
@@ -171,8 +184,7 @@ def change(profile: Profile, pairs: list[str], parser: argparse.ArgumentParser) 
             value = json.loads(text)
         except ValueError:
             value = None
-        kinds = {field.name: type(getattr(profile, field.name)) for field in fields(profile)}
-        kinds = {field: kind for field, kind in kinds.items() if kind in (bool, int, float)}
+        kinds = {field: type(getattr(profile, field)) for field in READ} | {"episode_steps": int}  # None: whole ones
         right = (bool,) if kinds.get(name) is bool else (int, float)
         if name not in kinds or type(value) not in right:
             parser.error(f"--set {pair}: give FIELD=VALUE, e.g. muon=false; fields are {', '.join(kinds)}")
@@ -195,11 +207,19 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="Threads of the training; scores in turn take as many.")
     parser.add_argument("--beside", type=int, default=0, metavar="N", help="Score in N processes beside the training.")
     parser.add_argument("--compile", action="store_true", help="Use torch.compile.")
-    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="A field of the profile.")
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help=f"Of {', '.join(READ)}.")
     options = parser.parse_args()
+    for name, least in {"scores": 1, "threads": 1, "beside": 0, "seed": 0}.items():
+        if getattr(options, name) < least:
+            parser.error(f"--{name} is {getattr(options, name)}; give {least} or more")
+    if not options.scale > 0:
+        parser.error(f"--scale is {options.scale}; give more than 0")
     torch.set_num_threads(options.threads)
-    agent, profile = parse_agent(options.agent), change(get_profile(options.profile), options.set, parser)
-    profile = profile.scaled(options.scale)
+    profile = change(get_profile(options.profile), options.set, parser).scaled(options.scale)
+    try:
+        agent = parse_agent(options.agent)
+    except DmcvbError as error:
+        parser.error(str(error))
     if agent.own or agent.pretrain:
         parser.error("--agent: one that trains its own encoder, or state-bc or state-td3-bc")
     if options.device == "cuda" and not torch.cuda.is_available():
@@ -209,7 +229,7 @@ def main() -> None:
         subset = scene.open()
     except DmcvbError as error:
         parser.error(str(error))
-    keep_options(options, parser)  # after what may refuse them
+    keep_options(options, subset, profile, parser)  # after what may refuse them
     pixels = not agent.sees_state
     chosen = {"pixels": pixels, "seed": options.seed, "stack": agent.stack, "device": options.device}
     with ProgressBar(pixels, total=100, unit=" %", desc="images") as bar:

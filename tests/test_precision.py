@@ -28,6 +28,14 @@ def test_bfloat16_is_chosen_only_if_it_pays(monkeypatch, half, chosen):
         assert precision.choose_precision(asked, lambda dtype: None) == asked
 
 
+def test_a_gpu_that_emulates_bfloat16_computes_in_float32(monkeypatch):
+    def supported(including_emulation=True):
+        return including_emulation
+
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    assert precision.choose_precision("auto", lambda dtype: None, "cuda") == "float32"
+
+
 def test_the_probe_runs_the_product_in_both_precisions():
     seen = []
     seconds = precision.fastest(seen.append, (torch.float32, torch.bfloat16))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -45,6 +46,97 @@ def test_both_precisions_are_timed(monkeypatch):
     assert "auto takes" in run("bench_training.py", "--precisions", "--updates", "3")
 
 
+@pytest.fixture
+def refused(learning_curve, capsys):
+    """What the program says about wrong arguments."""
+
+    def call(*arguments: str) -> str:
+        with pytest.raises(SystemExit) as end:
+            learning_curve(*arguments)
+        assert end.value.code == 2
+        return capsys.readouterr().err
+
+    return call
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        (("--agent", "foo"), "unknown agent 'foo'"),
+        (("--scores", "0"), "--scores is 0; give 1 or more"),
+        (("--beside", "-1"), "--beside is -1"),
+        (("--scale", "0"), "--scale is 0.0"),
+        (("--set", "episodes=2"), "fields are pixel_steps"),
+        (("--set", "frozen_steps=2"), "fields are pixel_steps"),
+        (("--set", "readout_steps=2"), "fields are pixel_steps"),
+    ],
+)
+def test_what_a_learning_curve_cannot_use_is_refused_before_it_begins(
+    arguments, told, small_release, tmp_path, refused
+):
+    command = (str(small_release), "--subset", "walker-walk/random/none", "--folder", str(tmp_path / "curve"))
+    assert told in refused(*command, *arguments) and not (tmp_path / "curve").exists()
+
+
+def begin(*_, **options):
+    raise RuntimeError("it begins")
+
+
+def test_a_learning_curve_does_not_go_on_with_other_data_or_budgets(small_release, tmp_path, monkeypatch, refused):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    program = importlib.import_module("learning_curve")
+    monkeypatch.setattr(program, "load_data", begin)
+    folder = tmp_path / "curve"
+    command = (str(small_release), "--subset", "walker-walk/random/none", "--profile", "smoke", "--folder", str(folder))
+
+    def goes_on():
+        monkeypatch.setattr(sys, "argv", ["learning_curve.py", *command])
+        with pytest.raises(RuntimeError, match="it begins"):
+            program.main()
+
+    goes_on()
+    goes_on()
+    kept = json.loads((folder / "options.json").read_text())
+    for change, told in (
+        ({"digest": "of other data"}, "other data"),
+        ({"values": kept["values"] | {"rate": 9}}, "values"),
+    ):
+        (folder / "options.json").write_text(json.dumps(kept | change))
+        assert told in refused(*command)
+    earlier = {name: value for name, value in kept.items() if name not in ("digest", "values")}
+    (folder / "options.json").write_text(json.dumps(earlier))
+    goes_on()
+    assert "options (seed)" in refused(*command, "--seed", "1")
+
+
+def test_networks_are_set_side_by_side_on_a_release_without_images(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    program, seen = importlib.import_module("bench_profiles"), []
+    for task in ("walker-walk", "ant-maze-empty7x7"):
+        made = {"episodes": 2, "max_steps": 5, "size": 16, "pixels": False, "progress": False}
+        release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)
+        monkeypatch.setattr(program, "steps_in", lambda *arguments: seen.append(arguments[2]) or 1)
+        monkeypatch.setattr(program, "train", lambda *_: None)
+        monkeypatch.setattr(program, "Evaluator", lambda *_, **options: Still())
+        monkeypatch.setattr(
+            sys, "argv", ["bench", str(tmp_path / task), "--subset", next(iter(release)), "--only", "quick"]
+        )
+        program.main()
+    assert [data.sizes.picture for data in seen] == [16, 16]
+
+
+class Still:
+    """An evaluation that costs nothing."""
+
+    mean, stderr, success = 1.0, 0.0, None
+
+    def __call__(self, policy):
+        return self
+
+    def close(self):
+        pass
+
+
 @pytest.mark.slow
 def test_a_learning_curve_paints_the_images_that_a_release_lacks(tmp_path, learning_curve):
     for task in ("walker-walk", "ant-maze-empty7x7"):
@@ -58,13 +150,7 @@ def test_a_learning_curve_paints_the_images_that_a_release_lacks(tmp_path, learn
 
 
 @pytest.mark.slow
-def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path, learning_curve, capsys):
-    def refused(*arguments: str) -> str:
-        with pytest.raises(SystemExit) as end:
-            learning_curve(*arguments)
-        assert end.value.code == 2
-        return capsys.readouterr().err
-
+def test_a_learning_curve_of_each_family_ends_as_a_table_and_a_picture(tmp_path, learning_curve, refused):
     for task in ("walker-walk", "ant-maze-empty7x7"):
         made = {"episodes": 2, "max_steps": 20, "size": 16, "progress": False}
         release = dmcvb_gen.rollout(task, out=tmp_path / task, levels=["random"], **made)

@@ -152,7 +152,9 @@ def parse_agent(name: str) -> Agent:
     try:
         return _with_options(agent, options)
     except DmcvbError as error:
-        raise DmcvbError(f"agent {name!r}: {error}") from None
+        own = OWN.fullmatch(name.strip()) and options not in option_names()
+        hint = f"; if {base}.py is a module of yours, rename it: {base} is an agent of the package" if own else ""
+        raise DmcvbError(f"agent {name!r}: {error}{hint}") from None
 
 
 def _with_options(agent: Agent, text: str) -> Agent:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.benchmarks.profiles import budget
 from dmcvb_gen.benchmarks.suites import BENCHMARKS
 from dmcvb_gen.errors import DmcvbError
 
@@ -87,10 +88,11 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
 
     Raises:
       DmcvbError: there is no report, or two were made with different profiles, or one cell or subset of theirs of
-        different data, or one cell twice of one seed.
+        different data, or one cell was evaluated in two ways, or is there twice of one seed.
     """
     results: dict[str, dict[str, Any]] = {}
-    profiles: dict[str, str | Path] = {}
+    profiles: dict[str, tuple[str | Path, dict[str, Any]]] = {}
+    evaluations: dict[tuple[Place, str], dict[str, str | Path]] = {}
     data: dict[tuple[Place | str, str], set[str]] = {}
     seeds: dict[tuple[Place, int], dict[str, str | Path]] = {}
     for folder in folders:
@@ -99,10 +101,13 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
             facts = json.loads(path.read_text())
             release = "{name} {version}".format(**facts["release"])
             if facts["results"]:
-                profiles[facts["profile"]["name"]] = folder
+                profile = {"name": facts["profile"]["name"]} | budget(facts["profile"])
+                profiles[json.dumps(profile, sort_keys=True)] = folder, profile
             for result in facts["results"]:
                 results[result["fingerprint"]] = result
                 place = _place(result)
+                for fact, value in _evaluation(result).items():
+                    evaluations.setdefault((place, fact), {})[json.dumps(value, sort_keys=True)] = folder
                 data.setdefault((place, "size"), set()).add(f"{release}, {result['episodes']} episodes")
                 if "digests" in result:  # those of earlier versions have none
                     digests = ", ".join(digest[:12] for digest in result["digests"].values())
@@ -116,8 +121,12 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
             why = getattr(error, "strerror", None) or type(error).__name__
             raise DmcvbError(f"cannot read {path} ({why}); dmcvb-gen validate writes it") from None
     if len(profiles) > 1:
-        named = ", ".join(f"{folder} ({profile})" for profile, folder in profiles.items())
+        named = _named_profiles(profiles.values())
         raise DmcvbError(f"scores of different profiles cannot be compared: {named}; ask of each apart")
+    for (place, fact), values in evaluations.items():
+        if len(values) > 1:
+            named = ", ".join(f"{folder} ({fact} {value})" for value, folder in values.items())
+            raise DmcvbError(f"{_words(place)} was evaluated in several ways: {named}; ask of each apart")
     mixed = next((names for names in data.values() if len(names) > 1), None)
     if mixed:
         raise DmcvbError(
@@ -127,9 +136,26 @@ def read_reports(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     if twice:
         ((place, seed), named) = twice
         folders = ", ".join(map(str, dict.fromkeys(named.values())))
-        what = f"{place.agent} on {place.task} {place.learns_from}, {place.setting}"
-        raise DmcvbError(f"{what} twice with seed {seed}, in {folders}; a second seed is --seed 1")
+        raise DmcvbError(f"{_words(place)} twice with seed {seed}, in {folders}; a second seed is --seed 1")
     return list(results.values())
+
+
+def _evaluation(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts of a result's evaluation; results of earlier versions have the number of episodes alone."""
+    return dict(result.get("evaluation", {})) | {"episodes": len(result["score"]["returns"])}
+
+
+def _named_profiles(profiles: Collection[tuple[str | Path, Mapping[str, Any]]]) -> str:
+    """Folders with their profiles: by name, "a (quick), b (paper)", or if names are alike by what differs."""
+    every = [profile for _, profile in profiles]
+    if len({profile["name"] for profile in every}) == len(every):
+        return ", ".join(f"{folder} ({profile['name']})" for folder, profile in profiles)
+    differ = [name for name in every[0] if any(profile.get(name) != every[0][name] for profile in every)]
+    return ", ".join(f"{folder} ({', '.join(f'{n} {profile.get(n)}' for n in differ)})" for folder, profile in profiles)
+
+
+def _words(place: Place) -> str:
+    return f"{place.agent} on {place.task} {place.learns_from}, {place.setting}"
 
 
 def pool(results: Iterable[Mapping[str, Any]]) -> dict[Place, Pooled]:

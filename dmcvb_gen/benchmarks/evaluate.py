@@ -321,6 +321,8 @@ def check_actions(actions: Any, shape: tuple[int, int], step: int) -> np.ndarray
     Raises:
       DmcvbError: they have another shape, are no numbers, or leave [-1, 1].
     """
+    if hasattr(actions, "detach"):  # a torch tensor, which numpy does not read if it has a gradient or is elsewhere
+        actions = actions.detach().cpu().float()
     try:
         values = np.asarray(actions, np.float32)
     except (TypeError, ValueError) as error:

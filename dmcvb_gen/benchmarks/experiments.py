@@ -201,17 +201,21 @@ def encoded(
 def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[str, Any]:
     """Train and evaluate one cell, unless its result is there. Gives the result.
 
+    A ready policy of the user's is scored each time: its score hangs on more than its code, and costs one evaluation.
+    A kept result of an own agent that learns has "kept": True.
+
     Raises:
       DmcvbError: DINO's weights are missing, the renderer cannot start, or training does not stay finite.
     """
     release = data_of_run(setup)
     mark = fingerprint(setup, release, cell)
     path = setup.cells / f"{cell.id}.json"
-    done = read_result(path, mark)
+    own = OwnAgent.load(cell.agent.own) if cell.agent.own else None
+    done = None if own and not own.learns else read_result(path, mark)
     if done:
-        return done
-    if cell.agent.own:
-        return _run_own(setup, cell, release, mark)
+        return done | {"kept": True} if own else done
+    if own:
+        return _run_own(setup, cell, own, release, mark)
     started = time.perf_counter()
     before, pixels = pretraining_of(cell), not cell.agent.sees_state
     pretrained = run_pretraining(setup, before, tick) if before else None
@@ -244,13 +248,13 @@ def run_cell(setup: Setup, cell: Cell, tick: ProgressCallback = ignore) -> dict[
     return result
 
 
-def _run_own(setup: Setup, cell: Cell, release: Release, mark: str) -> dict[str, Any]:
+def _run_own(setup: Setup, cell: Cell, own: OwnAgent, release: Release, mark: str) -> dict[str, Any]:
     """The cell of a user's own agent: its policy is trained by the user's code, if at all, and scored by ours.
 
     Raises:
-      DmcvbError: the agent cannot be loaded, or its policy gives no actions.
+      DmcvbError: its policy gives no actions.
     """
-    started, own, subset = time.perf_counter(), OwnAgent.load(cell.agent.own), release[cell.policy[0].subset]
+    started, subset = time.perf_counter(), release[cell.policy[0].subset]
     data = _cache.get(setup, release, cell.policy, False, own.stack)
     sources = []
     for part in cell.policy:

@@ -25,6 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from dmcvb_gen.benchmarks.suites import slug
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.files import copy_file, sha256_file, write_json, write_text
+from dmcvb_gen.generate.recipe import shipped_recipes
 from dmcvb_gen.text import quoted
 
 ERRORS = 3.0
@@ -164,17 +165,26 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
 
     Args:
       report: the folder that `validate` wrote.
-      data_command: makes the release; by default `rollout` with its recipe's name.
+      data_command: makes the release; by default `rollout` with its recipe's name, if the package has that recipe.
 
     Raises:
-      DmcvbError: there is no report, its scores are noise, the release is not complete, or it has no cell that can be
-        evaluated by its name alone; a policy file is another run's.
+      DmcvbError: there is no report, its scores are noise, the release is not complete, nothing says how it was made,
+        or it has no cell that can be evaluated by its name alone; a policy file is another run's.
     """
     folder = Path(report)
     try:
         facts = json.loads((folder / "report.json").read_text())
+        return _rows_of_facts(facts, folder, data_command)
+    except DmcvbError:
+        raise
     except (OSError, ValueError) as error:
         raise DmcvbError(f"{folder} holds no report of validate ({error})") from None
+    except (AttributeError, LookupError, TypeError) as error:
+        why = f"{type(error).__name__}: {error}"
+        raise DmcvbError(f"{folder} holds no report of this version's validate ({why}); run validate again") from None
+
+
+def _rows_of_facts(facts: dict[str, Any], folder: Path, data_command: str) -> dict[str, tuple[Row, Path | None]]:
     if not facts["profile"]["scores"]:
         raise DmcvbError(f"{folder}: scores of profile {facts['profile']['name']} are noise; use brief, quick or paper")
     release = facts["release"]
@@ -182,9 +192,7 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
         raise DmcvbError(f"{folder}: its release has no root digest; finish the release and run validate again")
     if not facts["complete"] or not facts["structure"]["sound"]:
         raise DmcvbError(f"{folder}: its release was not whole and sound; fetch or repair it and run validate again")
-    command = data_command or shlex.join(
-        ["dmcvb-gen", "rollout", "--recipe", release["name"], *([] if release.get("pixels", True) else ["--no-pixels"])]
-    )
+    command = data_command or _rollout_of(release)
     made_of = Release(**{key: release[key] for key in ("name", "version", "digest")}, command=command)
     entries = [
         (_row_of(result, facts, made_of), _policy_of(result, folder))
@@ -198,6 +206,20 @@ def rows_of_report(report: str | Path, data_command: str = "") -> dict[str, tupl
         if row.name not in rows or (row.paper is not None and rows[row.name][0].paper is None):
             rows[row.name] = (row, path)
     return rows
+
+
+def _rollout_of(release: dict[str, Any]) -> str:
+    """The command that makes a release of a shipped recipe.
+
+    Raises:
+      DmcvbError: the package has no such recipe.
+    """
+    name = release["name"]
+    if name not in shipped_recipes():
+        raise DmcvbError(f"no recipe of the package is called {name}; give the command that made it by --data-command")
+    return shlex.join(
+        ["dmcvb-gen", "rollout", "--recipe", name, *([] if release.get("pixels", True) else ["--no-pixels"])]
+    )
 
 
 def _policy_of(result: dict[str, Any], report: Path) -> Path | None:

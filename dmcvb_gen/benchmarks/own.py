@@ -8,11 +8,18 @@ have defaults: it gets the episodes that a cell learns from (`AgentData`) and ma
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import hashlib
 import importlib
+import importlib.util
 import inspect
 import os
 import sys
+import sysconfig
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.benchmarks.evaluate import Act
@@ -106,3 +113,60 @@ class OwnAgent:
     def digest(self) -> str:
         """SHA-256 of the module's file, so that a changed agent is scored again; "" for code without a file."""
         return source_digest(self.name.partition(":")[0])
+
+    @property
+    def helpers(self) -> dict[str, str]:
+        """Module -> SHA-256 of its file, of the user's own modules that the agent's imports, directly or not.
+
+        They are read from the import statements, also those inside functions: which modules a process has imported
+        so far would depend on what it did before.
+        """
+        module = self.name.partition(":")[0]
+        file = getattr(sys.modules[module], "__file__", None)
+        if not file:
+            return {}
+        depth = module.count(".") + (Path(file).stem == "__init__")
+        root, found, waiting = Path(file).parents[depth], {module: Path(file)}, [module]
+        only = module.partition(".")[0] if root in _installed() else None
+        while waiting:
+            name = waiting.pop()
+            for other in _imports(name, found[name]):
+                top, path = other.partition(".")[0], _file_of(root, other)
+                if path and other not in found and top != "dmcvb_gen" and only in (None, top):
+                    found[other] = path
+                    waiting.append(other)
+        return {name: _digest_of(name, path) for name, path in sorted(found.items()) if name != module}
+
+
+def _installed() -> set[Path]:
+    """Folders of installed packages, which are no modules of the user beside the agent's."""
+    return {Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib", "stdlib")}
+
+
+def _imports(module: str, file: Path) -> Iterator[str]:
+    """Names that a module's import statements may mean, packages above them too; some are no modules."""
+    package = module if file.stem == "__init__" else module.rpartition(".")[0]
+    with contextlib.suppress(SyntaxError, ValueError, ImportError):  # compiled, or only imported by a function
+        for node in ast.walk(ast.parse(file.read_bytes())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+                names = [f"{base}.{alias.name}" for alias in node.names]
+            for name in names:
+                parts = name.split(".")
+                yield from (".".join(parts[:count]) for count in range(1, len(parts) + 1))
+
+
+def _file_of(root: Path, module: str) -> Path | None:
+    """The source file of a module below a folder; None if it has none there."""
+    place = root.joinpath(*module.split("."))
+    return next((path for path in (place / "__init__.py", place.with_suffix(".py")) if path.is_file()), None)
+
+
+def _digest_of(module: str, file: Path) -> str:
+    """`source_digest`, which refuses a file that has changed since its import; of one not imported, of its bytes."""
+    if getattr(sys.modules.get(module), "__file__", None) == str(file):
+        return source_digest(module)
+    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from dmcvb_gen.agents.networks import PAPER, PATCHES, Architecture
 from dmcvb_gen.errors import UnknownNameError
@@ -144,6 +148,23 @@ PROFILES = {
         ),
     )
 }
+
+
+def facts_of(profile: Profile) -> dict[str, Any]:
+    """A profile as JSON has it."""
+    return json.loads(json.dumps(dataclasses.asdict(profile)))
+
+
+def budget(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """The facts of a profile that a result carries, but for its note; equal ones are equal budgets.
+
+    Fields that the results of earlier versions lack have their defaults.
+    """
+    usual = {
+        field.name: field.default for field in dataclasses.fields(Profile) if field.default is not dataclasses.MISSING
+    }
+    known = json.loads(json.dumps(usual | {"network": dataclasses.asdict(PAPER)}))
+    return {name: value for name, value in {**known, **facts}.items() if name != "note"}
 
 
 def get_profile(name: str) -> Profile:

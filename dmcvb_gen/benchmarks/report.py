@@ -29,6 +29,7 @@ from dmcvb_gen.benchmarks.figures import (
     place_of,
     return_figures,
 )
+from dmcvb_gen.benchmarks.kept import recipe_digest
 from dmcvb_gen.benchmarks.paper import paper_score
 from dmcvb_gen.benchmarks.setup import Setup
 from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Missing
@@ -79,16 +80,16 @@ def write_report(
     missing: Sequence[Missing],
     warnings: Sequence[Issue],
     seconds: float,
+    name: str = "report",
 ) -> tuple[Path, Path]:
-    """Write report.html, report.md and report.json into the setup's folder; gives the paths of the page and of the JSON
-    file."""
-    folder = Path(setup.out)
+    """Write <name>.html, .md and .json into the setup's folder; gives the paths of the page and of the JSON file."""
+    page = Path(setup.out) / f"{name}.html"
     facts = report_facts(setup, release, structure, cells, results, missing, warnings, seconds)
-    write_json(folder / "report.json", facts)
+    write_json(page.with_suffix(".json"), facts)
     good = [(cell, result) for cell, result in results if "error" not in result]
-    write_text(folder / "report.md", render_tables(facts))
-    write_text(folder / "report.html", render_page(facts, release, good, setup))
-    return folder / "report.html", folder / "report.json"
+    write_text(page.with_suffix(".md"), render_tables(facts))
+    write_text(page, render_page(facts, release, good, setup))
+    return page, page.with_suffix(".json")
 
 
 def report_facts(setup, release, structure, cells, results, missing, warnings, seconds) -> dict[str, Any]:
@@ -103,6 +104,7 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
             "name": release.manifest.name,
             "version": release.manifest.version,
             "digest": release.manifest.digest,
+            "recipe_digest": recipe_digest(release),
             "pixels": any(record.pixels for record in release.manifest.subsets),
             "path": release.root,
         },

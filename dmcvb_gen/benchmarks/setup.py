@@ -161,7 +161,10 @@ def fingerprint(setup: Setup, release: Release, work: Cell | Pretraining) -> str
         if is_maze(work.task):
             facts["speed"] = "straight"  # results of before measured the data's along the path
         if work.agent.own:
-            facts["own"] = OwnAgent.load(work.agent.own).digest
+            own = OwnAgent.load(work.agent.own)
+            facts["own"] = own.digest
+            if own.learns and (helpers := own.helpers):
+                facts["own_modules"] = helpers
         if work.agent.ready_encoder:
             facts[work.agent.pretrain] = work.agent.ready_encoder.digest(setup.dino_weights)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -18,6 +17,7 @@ from dmcvb_gen.agents.data import training_episodes
 from dmcvb_gen.agents.networks import encoder_product
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
+from dmcvb_gen.benchmarks.kept import kept_scores, other_scores
 from dmcvb_gen.benchmarks.own import OwnAgent
 from dmcvb_gen.benchmarks.profiles import Profile, get_profile
 from dmcvb_gen.benchmarks.report import release_episodes, write_report
@@ -49,6 +49,7 @@ class Validation:
       missing: subsets that the benchmarks would need besides.
       episodes: committed, and asked for by the manifest.
       report: the page. facts: the JSON file beside it.
+      kept: page of an earlier run, whose scores stay as this run has none.
     """
 
     structure: Structure
@@ -58,6 +59,7 @@ class Validation:
     episodes: tuple[int, int]
     report: Path
     facts: Path
+    kept: Path | None = None
 
     @property
     def failed(self) -> tuple[tuple[Cell, str], ...]:
@@ -168,6 +170,9 @@ def validate(
 ) -> Validation:
     """Check a release, run benchmarks on it and write the report.
 
+    Scores of cells that are not asked for stay in the report. If it has scores and this run has none, as a check fails
+    or all cells do, the run's page is "failed.html" beside it.
+
     Args:
       path: the release's folder.
       setup: profile, report folder, device.
@@ -179,7 +184,7 @@ def validate(
 
     Raises:
       DmcvbError: there is no release, or a name is unknown, or the release has no data for a benchmark asked for, or
-        the report's folder cannot be written.
+        the report's folder cannot be written, or holds scores that cannot stand beside those of this run.
     """
     started, progress = time.perf_counter(), progress or Progress()
     release = open_data(replace(setup, root=str(path)))
@@ -189,36 +194,47 @@ def validate(
         missing = [one for one in asked if one.subsets or one.left_out]
     check_writable(setup.out)
     _check_kept_scores(setup, training=bool(cells))
+    kept = kept_scores(setup.out)
+    others = other_scores(setup, release, cells, kept) if kept else []
     structure = check_structure(chosen, setup.backgrounds, progress.checking, workers)
-    results = []
-    if structure.sound or train_unsound:
-        if cells:
-            keep_precision(setup)
-        progress.total(planned_steps(setup.profile, cells))
-        for cell, result in run_cells(setup, cells, workers, progress.training):
-            progress.done(cell, result)
-            results.append((cell, result))
-    order = {cell: index for index, cell in enumerate(cells)}
-    results.sort(key=lambda pair: order[pair[0]])
+    results = _run(setup, cells, workers, progress) if structure.sound or train_unsound else []
+    none = bool(cells or not structure.sound) and all("error" in result for _, result in results)
+    every, shown = (results, cells) if none else ([*results, *others], [*cells, *(cell for cell, _ in others)])
     warnings = (
         *structure.warnings,
-        *_learning_warnings(setup, results),
-        *_few_warnings(setup.profile, results),
-        *_benchmark_warnings(chosen, cells),
-        *_seen_warnings(chosen, cells, setup.backgrounds),
+        *_learning_warnings(setup, every),
+        *_few_warnings(setup.profile, every),
+        *_benchmark_warnings(release, shown),
+        *_seen_warnings(release, shown, setup.backgrounds),
     )
     report, facts = write_report(
         setup=setup,
         release=chosen,
         structure=structure,
-        cells=cells,
-        results=results,
+        cells=shown,
+        results=every,
         missing=missing,
         warnings=warnings,
         seconds=time.perf_counter() - started,
+        name="failed" if kept and none else "report",
     )
     there, asked = (sum(counts.values()) for counts in release_episodes(chosen))
-    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), report, facts)
+    stays = Path(setup.out) / "report.html" if kept and none else None
+    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), report, facts, stays)
+
+
+def _run(
+    setup: Setup, cells: Sequence[Cell], workers: Workers, progress: Progress
+) -> list[tuple[Cell, dict[str, Any]]]:
+    """The results of cells, in their order."""
+    if cells:
+        keep_precision(setup)
+    progress.total(planned_steps(setup.profile, cells))
+    found = {}
+    for cell, result in run_cells(setup, cells, workers, progress.training):
+        progress.done(cell, result)
+        found[cell] = {key: value for key, value in result.items() if key != "kept"}
+    return [(cell, found[cell]) for cell in cells if cell in found]
 
 
 def plan_validation(
@@ -256,9 +272,11 @@ def _plan(
             OwnAgent.load(agent.own)  # a wrong name is told before any work
     idle = [name for name in agents if (agent := parse_agent(name)).pretrain is None and agent not in used]
     if benchmarks and idle:
+        sets = "sets" if len(benchmarks) == 1 else "set"
+        has, it = ("has", "it") if len(idle) == 1 else ("have", "them")
         raise DmcvbError(
-            f"{' and '.join(benchmarks)} set agents with a pre-trained encoder beside bc, and {', '.join(idle)} "
-            "has none; remove it, or add --benchmark b1"
+            f"{' and '.join(benchmarks)} {sets} agents with a pre-trained encoder beside bc, and {' and '.join(idle)} "
+            f"{has} none; remove {it}, or add --benchmark b1"
         )
     return cells, missing
 
@@ -280,15 +298,11 @@ def check_writable(folder: str | Path) -> None:
 
 def _check_kept_scores(setup: Setup, training: bool) -> None:
     """Raises DmcvbError if the report's folder has scores that this run would replace by others."""
-    path = local_path(setup.out) / "report.json"
-    try:
-        facts = json.loads(path.read_text())
-        kept = facts["profile"]["name"], facts["settings"]["seed"]
-        scored = bool(facts["results"]) and facts["profile"]["scores"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return  # no report of ours, or noise
-    if scored and not (training and kept == (setup.profile.name, setup.seed)):
-        name, seed = kept
+    facts = kept_scores(setup.out)
+    if not facts:
+        return
+    name, seed = facts["profile"].get("name"), facts.get("settings", {}).get("seed")
+    if not (training and (name, seed) == (setup.profile.name, setup.seed)):
         raise DmcvbError(f"{setup.out} holds scores of profile {name}, seed {seed}; give another --out")
 
 

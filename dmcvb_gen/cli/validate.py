@@ -33,26 +33,26 @@ def validate(own, strict, as_json, **options):
     context = click.get_current_context()
     if options["checks_only"]:
         refuse(context, (*commands.TRAINING, "own"), "--checks-only trains nothing")
-    options["agents"] = _agents(options["agents"], own)
+    options["agents"] = _agents(options["agents"], own, options["benchmarks"])
     from dmcvb_gen.benchmarks.setup import kept_precision
 
     setup = commands.validation_setup(options)
     if options["precision"] == "auto" and not options["checks_only"]:
         why = "as before" if kept_precision(setup.out, setup.device) else "the faster one here"
         click.echo(f"Networks that see images compute in {setup.precision}, {why}.", err=True)
-    on_score = (lambda *_: None) if as_json else functools.partial(_show_score, setup.profile)
+    on_score = (lambda *_: None) if as_json else functools.partial(_show_score, setup)
     result = commands.run_validation(setup, options, on_score)
     code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1
     answer(as_json, json.loads(result.facts.read_text()), *_validated(result, setup.profile), code=code)
 
 
-def _show_score(profile, cell, facts) -> None:
-    """A cell's score, as soon as it is there."""
+def _show_score(setup, cell, facts) -> None:
+    """A cell's score, as soon as it is there, and whether it is one of an earlier run by a user's own code."""
     from dmcvb_gen.spec import task_folder
 
     if "error" in facts:
         return  # told at the end, where it is not overlooked
-    score, paper = facts["score"], facts["paper"]
+    profile, score, paper = setup.profile, facts["score"], facts["paper"]
     shown = paper and profile.scores  # noise is never set beside the paper's numbers
     beside = f", paper {paper['mean']:.0f} +- {paper['stderr']:.0f}" if shown else ""
     where = f"{task_folder(cell.task)} {cell.policy_label}/{cell.setting}"
@@ -61,16 +61,23 @@ def _show_score(profile, cell, facts) -> None:
     score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{profile.name}]"
     with ProgressBar.external_write_mode():
         click.echo(f"{where} {cell.agent.name}: {score}{goal}{beside}")
+        if facts.get("kept"):
+            path = setup.cells / f"{cell.id}.json"
+            click.echo(
+                f"  This is the score of an earlier run, as the code is the same; to train again, delete {path}."
+            )
 
 
-def _agents(names: tuple[str, ...] | None, own: tuple[str, ...]) -> list[str]:
-    """The agents asked for; one's own alone are set beside BC from states."""
+def _agents(names: tuple[str, ...] | None, own: tuple[str, ...], benchmarks: tuple[str, ...]) -> list[str]:
+    """The agents asked for; one's own alone are set beside BC from states, in benchmarks that take it."""
     from dmcvb_gen.agents.catalog import OWN
+    from dmcvb_gen.benchmarks.suites import BENCHMARKS
 
     for name in own:
         if not OWN.fullmatch(name):
             raise click.UsageError(f"--agent {name} is not MODULE:NAME; the paper's agents are chosen with --agents.")
-    return [*(names or (["state-bc"] if own else [])), *own]
+    beside = own and not names and any(not BENCHMARKS.get(name).compares_encoders for name in benchmarks)
+    return [*(names or ()), *(["state-bc"] if beside else []), *own]
 
 
 def _validated(result, profile) -> Iterator[str]:
@@ -95,6 +102,8 @@ def _validated(result, profile) -> Iterator[str]:
         ]
     note = f"; {profile.note}" if result.results else ""
     yield f"{'; '.join(verdict)} ({checked}){note}"
+    if result.kept:
+        yield f"The scores of an earlier run are kept: {result.kept}"
     yield f"Report: {result.report}"
 
 
@@ -141,4 +150,15 @@ def claims(reports, as_json):
     for one in ranks:
         click.echo(f"  {one.task}: {one}")
     if not answers:
-        click.echo("These reports hold no scores that test any claim: use --profile brief, quick or paper.")
+        click.echo(_no_answer(results))
+
+
+def _no_answer(results) -> str:
+    """Why results test no claim."""
+    if not results:
+        return "These reports hold no results: their checks failed, or nothing was trained; see the reports."
+    if not any(result["profile"]["scores"] for result in results):
+        return "These reports hold no scores that test any claim: use --profile brief, quick or paper."
+    return (
+        "No two scores of these reports answer a claim: add agents, settings or levels, see `dmcvb-gen claims --help`."
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +15,13 @@ import torch
 from click.testing import CliRunner
 
 import dmcvb_gen
+from dmcvb_gen import own_code
+from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.benchmarks.evaluate import Evaluator
+from dmcvb_gen.benchmarks.experiments import run_cell
 from dmcvb_gen.benchmarks.own import OwnAgent
+from dmcvb_gen.benchmarks.suites import plan_benchmark
+from dmcvb_gen.benchmarks.validate import make_setup
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -95,6 +102,15 @@ def test_wrong_actions_are_one_line_with_the_step_and_what_was_expected(actions,
     assert len(str(error.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_torch_policy_need_not_detach_its_actions(dtype):
+    weights = torch.full((2, 6), 0.5, dtype=dtype, requires_grad=True)
+    options = dict(episodes=2, max_steps=2, pixels=False)
+    score = dmcvb_gen.evaluate(lambda observation: weights * 1, "walker-walk/none", **options)
+    same = dmcvb_gen.evaluate(lambda observation: np.full((2, 6), 0.5), "walker-walk/none", **options)
+    assert score.returns == same.returns
+
+
 @pytest.mark.parametrize("where, told", [
     ("walker-walk", "TASK/SETTING"), ("walker-wlk/none", "walker-walk"), ("walker-walk/dynamc", "dynamic"),
     ("ant-maze-empty7x7/fixed", "b3"),
@@ -141,6 +157,102 @@ def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_p
     assert scores["own_agents:still"]["returns"] == list(alone.returns)
     page = (tmp_path / "report" / "report.html").read_text()
     assert "own_agents:still" in page
+
+
+CHANGING = """
+import numpy as np
+from changing_parts.rates import RATE
+
+def ready(observation):
+    return np.full((len(observation["state"]), 6), float(open("weights.txt").read()))
+ready.pixels = False
+
+def learned(data):
+    from changing_late import LATE
+    return lambda observation: np.full((len(observation["state"]), 6), RATE * LATE)
+learned.pixels = False
+"""
+
+
+@pytest.fixture
+def changing(small_release, tmp_path, monkeypatch):
+    """Agents whose policy hangs on other files: (name) -> its cell's result, as in a new process."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    files = {"changing.py": CHANGING, "changing_parts/__init__.py": "", "changing_late.py": "LATE = 0.5\n"}
+    for name, text in files.items() | {("changing_parts/rates.py", "RATE = 0.5\n"), ("weights.txt", "0.0")}:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    release, setup = open_release(small_release), make_setup(small_release, out=tmp_path / "out", training=False)
+
+    def score(name):
+        own_code._digests.clear()
+        for module in ("changing_late", "changing_parts.rates", "changing_parts", "changing"):
+            sys.modules.pop(module, None)
+        importlib.invalidate_caches()
+        cells, _ = plan_benchmark("b1", release, [f"changing:{name}"])
+        return run_cell(setup, next(cell for cell in cells if cell.setting == "none"))
+
+    yield score
+    own_code._digests.clear()
+
+
+def write_later(path, text):
+    """Write a file whose compiled code of before is not taken for its own."""
+    path.write_text(text)
+    os.utime(path, (path.stat().st_mtime + 10,) * 2)
+
+
+def test_a_ready_policy_is_scored_anew_whatever_it_loads(changing, tmp_path):
+    first = changing("ready")
+    again = changing("ready")
+    assert again["score"]["returns"] == first["score"]["returns"] and "kept" not in again
+    (tmp_path / "weights.txt").write_text("0.5")
+    assert changing("ready")["score"]["returns"] != first["score"]["returns"]
+
+
+def test_an_agent_that_learns_is_trained_again_if_a_module_of_its_folder_changed(changing, tmp_path):
+    first = json.loads(json.dumps(changing("learned")))
+    assert changing("learned") == first | {"kept": True}
+    write_later(tmp_path / "changing_parts" / "rates.py", "RATE = -0.5\n")
+    second = changing("learned")
+    assert "kept" not in second and list(second["score"]["returns"]) != first["score"]["returns"]
+    write_later(tmp_path / "changing_late.py", "LATE = -0.5\n")  # imported by a function alone
+    assert list(changing("learned")["score"]["returns"]) == first["score"]["returns"]
+    agent = OwnAgent.load("changing:learned")
+    assert set(agent.helpers) == {"changing_late", "changing_parts", "changing_parts.rates"}
+    write_later(tmp_path / "changing_parts" / "rates.py", "RATE = 0.1\n")
+    with pytest.raises(DmcvbError, match="has changed, but its old code still runs"):
+        _ = agent.helpers
+
+
+def test_installed_packages_and_this_one_are_no_modules_beside_an_agent(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "alone_agent.py").write_text("import json, numpy, dmcvb_gen.spec\n\ndef learned(data):\n    pass\n")
+    assert OwnAgent.load("alone_agent:learned").helpers == {}  # so that its results of earlier versions count
+    assert "click.core" in OwnAgent.load("click:echo").helpers
+    assert all(name.startswith("click.") for name in OwnAgent.load("click:echo").helpers)
+
+
+def test_validate_says_that_a_score_of_an_own_agent_is_an_earlier_ones(changing, small_release, tmp_path):
+    command = [
+        "validate",
+        str(small_release),
+        "--only",
+        "*/none",
+        "--agents",
+        "state-bc",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    command += ["--agent", "changing:learned", "--agent", "changing:ready", "--workers", "1", "--threads", "1"]
+    first, again = (CliRunner().invoke(main, command) for _ in range(2))
+    assert first.exit_code == again.exit_code == 0 and "earlier run" not in first.output, first.output
+    [told] = [line for line in again.output.splitlines() if "earlier run" in line]
+    assert "changing-learned" in told and "delete" in told
+    facts = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert len(facts["results"]) == 3 and not any("kept" in result for result in facts["results"])
 
 
 SEEING = """
@@ -202,6 +314,28 @@ def test_numbers_that_count_nothing_are_refused(option):
             dmcvb_gen.evaluate(lambda observation: None, where, pixels=False, **option)
     with pytest.raises(DmcvbError, match="seed is -1; give a whole number, at least 0"):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/none", seed=-1)
+
+
+def test_a_benchmark_of_encoders_refuses_own_agents_alone_by_their_names(small_mazes, tmp_path, monkeypatch):
+    (tmp_path / "goal_agents.py").write_text(AGENTS)
+    monkeypatch.chdir(tmp_path)
+    command = ["validate", str(small_mazes), "--benchmark", "b3", "--out", str(tmp_path / "out")]
+    one, two = ["--agent", "goal_agents:still"], ["--agent", "goal_agents:learned"]
+    for agents, told in (
+        (one, "b3 sets agents with a pre-trained encoder beside bc, and goal_agents:still has none; remove it"),
+        (one + two, "goal_agents:still and goal_agents:learned have none; remove them"),
+    ):
+        result = CliRunner().invoke(main, command + agents)
+        said = " ".join(result.output.split())
+        assert result.exit_code == 2 and told in said and "state-bc" not in said
+
+
+def test_a_module_that_is_called_as_an_agent_is_told_to_take_another_name():
+    with pytest.raises(DmcvbError, match=r"'policy' is not an option.*; if bc.py is a module of yours, rename it"):
+        parse_agent("bc:policy")
+    with pytest.raises(DmcvbError) as error:
+        parse_agent("bc:k=5")
+    assert "rename" not in str(error.value)
 
 
 @pytest.mark.parametrize("name, told", [("own_agnts:still", "cannot load"), ("bc", "--agents")])

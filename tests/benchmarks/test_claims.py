@@ -108,6 +108,19 @@ def test_goals_are_compared_one_by_one_and_as_their_mean():
     assert "mean" not in only.where
 
 
+def test_means_over_other_goals_are_not_compared():
+    def of(agent, means, encoder=""):
+        made = dict(benchmark="b3", encoder=encoder)
+        return [result(agent, "fixed", near(m), learns=f"expert goal {goal}", **made) for goal, m in means.items()]
+
+    id_bc = of("id+bc", {0: 50, 1: 43}, "expert")
+    found = judge(of("bc", {0: 40, 1: 42, 2: 1}) + of("bc+bc", {1: 41, 2: 90}, "expert") + id_bc)
+    assert len(found) == 2 + 2 + 1 and not [answer for answer in found if "mean" in answer.where]
+    same = judge(of("bc+bc", {0: 41, 1: 90}, "expert") + id_bc + of("bc", {0: 40, 1: 42, 2: 1}))
+    [mean] = [answer for answer in same if "mean" in answer.where]
+    assert mean.claim == "encoders" and "mean of goals 0, 1 (encoder: expert)" in mean.where
+
+
 def test_shares_are_compared_in_their_order():
     made = [result("bc", "none", near(mean), benchmark="ablations", learns=label) for mean, label in
             ((80, "expert"), (20, "1% expert"), (81, "25% expert"), (40, "5% expert"))]  # fmt: skip
@@ -136,10 +149,10 @@ def test_numbers_that_claim_no_score_answer_nothing():
     assert judge([result("state-bc", "none", near(97), scores=False)]) == []
 
 
-def write(folder, profile, *results, release="walkers"):
-    folder.mkdir()
+def write(folder, profile, *results, release="walkers", **values):
+    folder.mkdir(parents=True)
     marked = [one | {"fingerprint": f"{folder}, {index}"} for index, one in enumerate(results)]
-    facts = {"profile": {"name": profile}, "results": marked, "release": {"name": release, "version": "1.0.0"}}
+    facts = {"profile": {"name": profile} | values, "results": marked, "release": {"name": release, "version": "1.0.0"}}
     facts |= {"settings": {"seed": 0}}
     (folder / "report.json").write_text(json.dumps(facts))
     return str(folder)
@@ -166,6 +179,42 @@ def test_command(tmp_path):
         read_reports([*both, again])
     refused = CliRunner().invoke(main, ["questions", *both, other])
     assert refused.exit_code == 2 and "different profiles" in refused.output and refused.output.count("\n") == 1
+
+
+def test_budgets_of_one_name_and_evaluations_that_differ_are_one_line(tmp_path):
+    def refused(name, one, other, told):
+        """Two reports, (returns, the result's facts, the profile's) each."""
+        folders = [
+            write(tmp_path / name / str(seed), "quick", result("bc", "none", returns, seed=seed, **facts), **profile)
+            for seed, (returns, facts, profile) in enumerate((one, other))
+        ]
+        done = CliRunner().invoke(main, ["claims", *folders])
+        assert done.exit_code == 2 and told in done.output.replace("\n", " "), done.output
+        assert "Traceback" not in done.output and done.output.count("\n") <= 2
+
+    plain = (near(50), {}, {"rate": 1.0, "note": "a"})
+    refused("budget", plain, (near(50), {}, {"rate": 2.0}), "0 (rate 1.0), ")
+    refused("count", plain, ([1.0, 2.0], {}, {}), "(episodes 2)")
+    one, other = ({"evaluation": {"steps": steps, "goals": None}} for steps in (500, 100))
+    refused("cut", (near(50), one, {}), (near(50), other, {}), "(steps 100)")
+    fits = [
+        write(tmp_path / "fits" / str(seed), "quick", result("bc", "none", near(9), seed=seed, **facts), **profile)
+        for seed, (facts, profile) in enumerate([({}, {"note": "a", "rate": 1.0}), (one, {"note": "b"})])
+    ]
+    assert len(read_reports(fits)) == 2  # a note decides nothing, and earlier versions said less
+
+
+@pytest.mark.parametrize(
+    "results, told",
+    [
+        ([], "hold no results"),
+        ([result("bc", "none", [1.0, 2.0, 3.0], scores=False)], "use --profile brief"),
+        ([result("bc", "none", [1.0, 2.0, 3.0])], "No two scores of these reports answer a claim"),
+    ],
+)
+def test_reports_that_answer_nothing_are_told_why(tmp_path, results, told):
+    done = CliRunner().invoke(main, ["claims", write(tmp_path / "report", "quick", *results)])
+    assert done.exit_code == 0 and told in done.output and ("--profile" in told or "--profile" not in done.output)
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"profile": {"name": "quick"}}', "\0"])

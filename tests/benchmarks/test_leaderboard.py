@@ -29,6 +29,7 @@ from tests.conftest import TINY_MAZE
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "docs" / "leaderboard"
+MADE = "dmcvb-gen rollout ..."
 
 
 def report_of(release, out, agents, only, benchmark="b1"):
@@ -54,7 +55,7 @@ def mazes(small_mazes, tmp_path_factory):
 @pytest.mark.parametrize("report, count", [("walkers", 7), ("mazes", 3)])
 def test_every_row_of_a_report_holds_when_its_policy_is_scored_again(report, count, request, tmp_path):
     folder = request.getfixturevalue(report)
-    rows = add_rows(tmp_path, rows_of_report(folder, "dmcvb-gen rollout ..."))
+    rows = add_rows(tmp_path, rows_of_report(folder, MADE))
     assert len(rows) == count and sorted(read_rows(tmp_path), key=lambda row: row.name) == sorted(
         rows, key=lambda row: row.name
     )
@@ -67,7 +68,7 @@ def test_every_row_of_a_report_holds_when_its_policy_is_scored_again(report, cou
 
 @pytest.mark.parametrize("report", ["walkers", "mazes"])
 def test_a_check_paints_with_the_samples_of_the_row(report, request, tmp_path):
-    rows = add_rows(tmp_path, rows_of_report(request.getfixturevalue(report)))
+    rows = add_rows(tmp_path, rows_of_report(request.getfixturevalue(report), MADE))
     row = next(row for row in rows if row.evaluation.size)
     shown = []
 
@@ -98,7 +99,7 @@ def test_a_kept_policy_is_the_trained_one(walkers):
 
 
 def test_another_policy_or_score_does_not_hold(walkers, tmp_path):
-    rows = add_rows(tmp_path, rows_of_report(walkers))
+    rows = add_rows(tmp_path, rows_of_report(walkers, MADE))
     row = next(row for row in rows if row.agent == "state-bc")
     better = row.model_copy(update={"returns": tuple(value + 100 for value in row.returns)})
     checked = check_row(tmp_path, better)
@@ -117,7 +118,7 @@ def test_another_policy_or_score_does_not_hold(walkers, tmp_path):
 
 def test_a_rows_command_names_its_cell(walkers, mazes):
     for report in (walkers, mazes):
-        for name, (row, _) in rows_of_report(report).items():
+        for name, (row, _) in rows_of_report(report, MADE).items():
             words = shlex.split(row.command)
             assert (
                 words[:3] == ["dmcvb-gen", "validate", f"releases/{row.release.name}"]
@@ -135,24 +136,42 @@ def test_a_rows_command_asks_for_the_videos_and_weights_that_are_a_users(walkers
     result["evaluation"]["backgrounds"] = "another digest"
     result["cell"]["agent"]["pretrain"] = "dino"
     (tmp_path / "report.json").write_text(json.dumps(facts | {"results": [result]}))
-    [(row, _)] = rows_of_report(tmp_path).values()
+    [(row, _)] = rows_of_report(tmp_path, MADE).values()
     assert row.command.endswith("--backgrounds FOLDER --dino-weights FILE")
-    for other, _ in rows_of_report(walkers).values():
+    for other, _ in rows_of_report(walkers, MADE).values():
         assert "FOLDER" not in other.command and "FILE" not in other.command
 
 
 def test_a_row_says_whether_its_release_has_pictures(walkers, tmp_path):
     facts = facts_of(walkers)
-    for pixels, command in ((True, "--recipe small"), (False, "--recipe small --no-pixels")):
-        (tmp_path / "report.json").write_text(json.dumps(facts | {"release": facts["release"] | {"pixels": pixels}}))
+    for pixels, command in ((True, "--recipe leaderboard"), (False, "--recipe leaderboard --no-pixels")):
+        release = facts["release"] | {"pixels": pixels, "name": "leaderboard"}
+        (tmp_path / "report.json").write_text(json.dumps(facts | {"release": release}))
         [command_of] = {row.release.command for row, _ in rows_of_report(tmp_path).values()}
         assert command_of == f"dmcvb-gen rollout {command}"
+
+
+def test_a_release_of_no_shipped_recipe_needs_the_command_that_made_it(walkers):
+    with pytest.raises(DmcvbError, match="no recipe of the package is called small; .* --data-command"):
+        rows_of_report(walkers)
+    assert {row.release.command for row, _ in rows_of_report(walkers, MADE).values()} == {MADE}
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "null", '{"profile": {"scores": true}}', "3"])
+def test_what_is_no_report_is_one_line(text, tmp_path):
+    (tmp_path / "report.json").write_text(text)
+    with pytest.raises(DmcvbError, match="holds no report of") as error:
+        rows_of_report(tmp_path)
+    assert "\n" not in str(error.value)
 
 
 def test_the_command_adds_shows_and_writes(mazes, tmp_path):
     board, page = tmp_path / "board", tmp_path / "board.md"
     run = CliRunner().invoke
-    done = run(main, ["leaderboard", str(board), "--add", str(mazes), "--cell", "*state-td3-bc*", "--write", str(page)])
+    add = ["leaderboard", str(board), "--add", str(mazes), "--cell", "*state-td3-bc*", "--write", str(page)]
+    refused = run(main, add)
+    assert refused.exit_code == 2 and "--data-command" in refused.output and not page.exists()
+    done = run(main, [*add, "--data-command", MADE])
     assert done.exit_code == 0, done.output
     (row,) = read_rows(board)
     assert row.task == TINY_MAZE and f"{board}: added 1 row of {mazes}." in done.output
@@ -171,7 +190,7 @@ def test_a_cell_of_two_benchmarks_is_one_row_with_the_papers_score(walkers, tmp_
     again = ours | {"cell": ours["cell"] | {"benchmark": "ablations"}, "paper": None}
     for results in ([beside_paper, again], [again, beside_paper]):
         (tmp_path / "report.json").write_text(json.dumps(facts | {"results": results}))
-        ((row, _),) = rows_of_report(tmp_path).values()
+        ((row, _),) = rows_of_report(tmp_path, MADE).values()
         assert row.paper == 38.0 and "--benchmark b1" in row.command
 
 
@@ -205,7 +224,7 @@ def test_noise_and_unfinished_releases_make_no_rows(walkers, tmp_path):
     ):
         (tmp_path / "report.json").write_text(json.dumps(facts | change))
         with pytest.raises(DmcvbError, match=message):
-            rows_of_report(tmp_path)
+            rows_of_report(tmp_path, MADE)
 
 
 def test_a_file_that_is_no_agent_is_refused(walkers, tmp_path):
@@ -246,9 +265,9 @@ def test_a_policy_of_another_run_into_the_same_folder_makes_no_row(walkers, tmp_
     mine, other = cells / "b1_walker-walk_none_bc_random.safetensors", tmp_path / "report" / "report.json"
     mine.write_bytes((cells / "b1_walker-walk_dynamic_bc_random.safetensors").read_bytes())
     with pytest.raises(DmcvbError, match=f"{mine.name} is not the policy that {other} scored"):
-        rows_of_report(tmp_path / "report")
+        rows_of_report(tmp_path / "report", MADE)
     mine.unlink()
-    rows = rows_of_report(tmp_path / "report").values()
+    rows = rows_of_report(tmp_path / "report", MADE).values()
     assert [row.agent for row, policy in rows if policy is None] == ["bc"] and len(rows) == 7
 
 
@@ -256,7 +275,7 @@ def test_a_policy_of_another_run_into_the_same_folder_makes_no_row(walkers, tmp_
     "returns, reason", [([], "at least 1 item"), ([1.0, 2.0], "2 returns of 3 episodes"), ([1, 2, "nan"], "finite")]
 )
 def test_a_row_without_the_returns_of_its_episodes_is_no_row(returns, reason, walkers, tmp_path):
-    (row, *_) = add_rows(tmp_path, rows_of_report(walkers))
+    (row, *_) = add_rows(tmp_path, rows_of_report(walkers, MADE))
     path = tmp_path / f"{row.name}.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"returns": returns}))
     for options in ([], ["--check"]):

@@ -23,6 +23,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from dmcvb_gen.agents.data import training_episodes
+from dmcvb_gen.benchmarks import kept as kept_module
 from dmcvb_gen.benchmarks.checks import check_labels, check_paper_returns, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.figures import CURVE_LINES, curve_figures, return_figures
 from dmcvb_gen.benchmarks.profiles import get_profile
@@ -38,6 +39,7 @@ from dmcvb_gen.benchmarks.validate import (
 )
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
+from dmcvb_gen.cli.validate import _validated
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.dataset.writer import commit_path, finish_release
@@ -240,6 +242,95 @@ def test_scores_are_not_replaced_by_those_of_another_run(small_release, tmp_path
             _check_kept_scores(replace(again, seed=1), training=True)
 
 
+@pytest.fixture(scope="module")
+def scored(small_release, tmp_path_factory):
+    """Run a profile whose scores count into a folder: (agents, out, ...) -> the validation."""
+    profile = replace(get_profile("smoke"), scores=True, readout_steps=0)
+
+    def call(agents, out, release=small_release, only="*/*/none", **changes):
+        setup = replace(make_setup(release, out=out, training=False), profile=replace(profile, **changes))
+        return validate(release, setup, agents=agents, patterns=[only])
+
+    call.first = tmp_path_factory.mktemp("scored") / "report"
+    call(["state-bc"], call.first)
+    return call
+
+
+def agents_of(out):
+    return [one["cell"]["agent_name"] for one in json.loads((out / "report.json").read_text())["results"]]
+
+
+def change_kept(out, place, **values):
+    """Change values of a report, or those of its first result."""
+    facts = json.loads((out / "report.json").read_text())
+    (facts["results"][0] if place == "result" else facts[place]).update(values)
+    (out / "report.json").write_text(json.dumps(facts))
+
+
+def test_scores_of_agents_that_are_not_asked_for_stay_in_the_report(scored, tmp_path):
+    out = Path(shutil.copytree(scored.first, tmp_path / "out"))
+    scored(["state-td3-bc"], out)
+    assert agents_of(out) == ["state-td3-bc", "state-bc"]
+    page = (out / "report.html").read_text()
+    assert "state-bc" in page and "2 of 2 benchmark cells run" in page
+    with pytest.raises(DmcvbError, match=r"1 score that this run leaves out.*b1_walker-walk_none_state-td3-bc_random"):
+        change_kept(out, "result", digests={"walker-walk/random/none": "of other data"})
+        scored(["state-bc"], out)
+    scored(["state-bc", "state-td3-bc"], out)  # asked for, it is trained again if its data have changed
+    assert agents_of(out) == ["state-bc", "state-td3-bc"]
+    with pytest.raises(DmcvbError, match="have changed since"):
+        scored(["state-bc"], out, state_steps=4)
+    assert agents_of(out) == ["state-bc", "state-td3-bc"]
+
+
+@pytest.mark.parametrize(
+    "change", [{"name": "another"}, {"recipe_digest": "another"}, {"recipe_digest": None, "path": "elsewhere"}]
+)
+def test_scores_of_another_release_are_not_replaced(scored, tmp_path, change):
+    out = Path(shutil.copytree(scored.first, tmp_path / "out"))
+    change_kept(out, "release", **change)
+    if "path" in change:  # of a version that does not know the recipe: what tells is the data
+        scored(["state-bc"], out)
+        change_kept(out, "release", **change)
+        change_kept(out, "result", digests={"walker-walk/random/none": "of other data"})
+    before = (out / "report.json").read_text()
+    with pytest.raises(DmcvbError, match="holds scores of another release .*; give another --out"):
+        scored(["state-bc"], out)
+    assert (out / "report.json").read_text() == before
+
+
+def test_a_release_that_has_grown_or_moved_is_the_same(tmp_path):
+    def grown(episodes):
+        pattern = {"tasks": "walker-walk", "levels": "random", "settings": ["none"], "episodes_per_shard": 1}
+        roll_out(small_recipe(subsets=[pattern | {"episodes": episodes}]), tmp_path / "grows")
+        return open_release(tmp_path / "grows")
+
+    before = grown(1)
+    cell = plan_benchmark("b1", before, ["state-bc"])[0][0]
+    [(name, digest)] = [(name, kept_module.subset_digest(s.commits)) for name, s in before.subsets.items()]
+    result = {"id": cell.id, "cell": cell.facts(), "digests": {name: digest}}
+    facts = {"name": "small", "version": "1", "path": "moved", "recipe_digest": kept_module.recipe_digest(before)}
+    kept, setup = {"release": facts, "results": [result]}, make_setup("grows", out=tmp_path / "out", training=False)
+    after = grown(2)
+    assert digest != kept_module.subset_digest(after[name].commits)
+    assert kept_module.other_scores(setup, after, [cell], kept) == []  # its cell is trained again
+    with pytest.raises(DmcvbError, match="have changed since"):
+        kept_module.other_scores(setup, after, [], kept)
+
+
+def test_a_damaged_release_leaves_the_scores_of_before(scored, small_release, tmp_path, monkeypatch):
+    out, damaged = Path(shutil.copytree(scored.first, tmp_path / "out")), tmp_path / "damaged"
+    shutil.copytree(small_release, damaged)
+    rewrite(damaged, "walker-walk/random/none", set_rows("state", 1, (123, 4), np.nan))
+    change_kept(out, "release", path=str(damaged))
+    before = (out / "report.json").read_text()
+    result = scored(["state-bc"], out, damaged)
+    assert (out / "report.json").read_text() == before and result.kept == out / "report.html"
+    assert result.report == out / "failed.html" and "Not sound" in result.report.read_text()
+    assert json.loads(result.facts.read_text())["results"] == []
+    assert f"The scores of an earlier run are kept: {result.kept}" in list(_validated(result, get_profile("smoke")))
+
+
 @pytest.mark.parametrize("steps, held", [(500, 100), (37, 5), (500, 1)])
 def test_the_episodes_that_are_enough_are_enough_and_no_fewer(steps, held):
     profile = get_profile("quick").scaled(8)
@@ -268,6 +359,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--benchmark", "b9"), "ablations"),
         ((release, "--benchmark", "b3"), "--fixed-goals"),
         ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; remove it"),
+        ((release, "--benchmark", "b2", "--agents", "td3-bc,bc"), "b2 sets agents"),
         ((release, "--agents", "bc:k=5"), "'k=5' is an option of id: remove it"),
         ((release, "--checks-only", "--agents", "bc"), "--checks-only trains nothing; remove it"),
         ((release, "--checks-only", "--benchmark", "b2"), "--benchmark has no effect"),

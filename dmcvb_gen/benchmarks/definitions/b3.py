@@ -54,18 +54,26 @@ class FixedGoals(Benchmark):
 
 
 def with_means_over_goals(scores: Scores) -> Scores:
-    """Scores of single goals, and the mean over each maze's goals; its standard error takes these for independent."""
-    groups: dict[Place, list[Pooled]] = {}
+    """Scores of single goals, and the mean over each maze's goals; its standard error takes these for independent.
+
+    A mean that lacks goals which others have is called by its own, so that only means over the same goals are compared.
+    """
+    groups: dict[Place, dict[str, Pooled]] = {}
+    known: dict[tuple[str, str, str], set[str]] = {}
     for place, score in scores.items():
-        level, goal, rest = place.learns_from.partition(" goal ")
-        if goal:
-            encoder = rest[rest.index(" (") :] if " (" in rest else ""
-            groups.setdefault(replace(place, learns_from=f"{level}{encoder}"), []).append(score)
+        level, mark, rest = place.learns_from.partition(" goal ")
+        if mark:
+            goal, of_encoder, encoder = rest.partition(" (")
+            groups.setdefault(replace(place, learns_from=f"{level}{of_encoder}{encoder}"), {})[goal] = score
+            known.setdefault((place.task, place.setting, level), set()).add(goal)
     found = dict(scores)
-    for place, several in groups.items():
+    for place, goals in groups.items():
         level, mark, encoder = place.learns_from.partition(" (")
-        if len(several) > 1:
-            found[replace(place, learns_from=f"{level}, mean of {len(several)} goals{mark}{encoder}")] = _mean(several)
+        every = goals.keys() == known[place.task, place.setting, level]
+        named = f"{len(goals)} goals" if every else f"goals {', '.join(sorted(goals))}"
+        if len(goals) > 1:
+            mean = _mean(list(goals.values()))
+            found[replace(place, learns_from=f"{level}, mean of {named}{mark}{encoder}")] = mean
     return found
 
 
