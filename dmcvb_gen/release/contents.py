@@ -194,4 +194,4 @@ def _check_modalities(
         for step, share in zip(at, differ.reshape(len(at), -1).mean(axis=1), strict=True):
             if share > LABEL_SHARE:
                 message = f"{name} differs from what the states show in {100 * share:.0f} % of its values"
-                yield Issue("labels", subset.name, message, episode, int(step))
+                yield Issue("modalities", subset.name, message, episode, int(step))

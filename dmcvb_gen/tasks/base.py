@@ -257,7 +257,7 @@ class EpisodeBatch(abc.ABC):
             ended = self._control_terminated() & moving
             terminated |= ended
             moving &= ~ended
-        if not np.isfinite(reward).all():  # of a task that somebody else wrote
+        if not np.isfinite(reward).all():  # from a user's own task
             wrong = reward[~np.isfinite(reward)][0]
             raise DmcvbError(f"task {self.task.id} gave the reward {wrong}; its reward must be a finite number")
         return StepResult(self.state(), reward, terminated)

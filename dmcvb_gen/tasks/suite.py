@@ -94,7 +94,7 @@ class SuiteTask(Task):
             _check_environment(id, environment)
         except DmcvbError:
             raise
-        except Exception as error:  # the code of somebody else
+        except Exception as error:  # from a user's own task
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise DmcvbError(
                 f"cannot start task {id} ({reason}); make its environment run in dm_control first"
@@ -265,7 +265,7 @@ class SuiteBatch(EpisodeBatch):
                 with self._physics.reset_context():
                     try:
                         task.initialize_episode(self._physics)
-                    except Exception as error:  # the code of somebody else
+                    except Exception as error:  # from a user's own task
                         raise _failed(self.task.id, error) from error
             row = np.empty(len(self._physics_columns))
             mujoco.mj_getState(model, self._physics.data.ptr, row, PHYSICS_SPEC)
@@ -293,7 +293,7 @@ class SuiteBatch(EpisodeBatch):
             try:
                 observation = self._tasks[sim].get_observation(physics)
                 self._states[sim] = np.concatenate([np.ravel(part) for part in observation.values()])
-            except Exception as error:  # the code of somebody else
+            except Exception as error:  # from a user's own task
                 raise _failed(self.task.id, error) from error
         self._stale[:] = False
         return self._states.copy()
@@ -306,7 +306,7 @@ class SuiteBatch(EpisodeBatch):
                 task.after_step(physics)
                 reward[sim] = float(task.get_reward(physics))  # numpy would make NaN of None
                 self._ended[sim] = task.get_termination(physics) is not None
-            except Exception as error:  # the code of somebody else
+            except Exception as error:  # from a user's own task
                 raise _failed(self.task.id, error) from error
         return reward
 

@@ -142,7 +142,9 @@ def test_wrong_labels_are_found(request, source, only, name, tmp_path):
 
     rewrite(tmp_path / "r", name, change)
     found = verify(tmp_path / "r").findings
-    assert {(finding.check, finding.message.split()[0]) for finding in found} == {("labels", name) for name in arrays}
+    assert {(finding.check, finding.message.split()[0]) for finding in found} == {
+        ("modalities", name) for name in arrays
+    }
 
 
 @pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")
