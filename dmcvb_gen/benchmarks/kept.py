@@ -56,13 +56,10 @@ def _same_data(release: Release, results: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def _digests_so_far(subset: Subset) -> Iterator[str]:
-    """The digest of a subset, and those that it had when it had fewer shards, see `subset_digest`."""
-    yield subset_digest(subset.commits)
-    digest = hashlib.sha256()
-    for shard in sorted(subset.commits):
-        for file in subset.commits[shard].files:
-            digest.update(f"{file.sha256}  {file.path}\n".encode())
-        yield digest.hexdigest()
+    """The digest of a subset, and those that it had when it had fewer shards."""
+    shards = sorted(subset.commits)
+    for count in range(len(shards), 0, -1):
+        yield subset_digest({shard: subset.commits[shard] for shard in shards[:count]})
 
 
 def other_scores(

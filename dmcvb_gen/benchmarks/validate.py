@@ -220,6 +220,9 @@ def validate(
     )
     there, asked = (sum(counts.values()) for counts in release_episodes(chosen))
     stays = Path(setup.out) / "report.html" if kept and none else None
+    if not stays:  # what failed before is mended
+        for suffix in (".html", ".md", ".json"):
+            (Path(setup.out) / f"failed{suffix}").unlink(missing_ok=True)
     return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), report, facts, stays)
 
 

@@ -172,7 +172,7 @@ def _sendable(error: BaseException) -> BaseException:
     pickles in a thread of its own, and drops what it cannot pickle.
     """
     try:
-        pickle.loads(pickle.dumps(error))
+        pickle.loads(pickle.dumps(error))  # of this very process; nothing from elsewhere is loaded
     except Exception:
         told = DmcvbError(f"a worker failed ({_in_a_line(error)})")
         told.add_note("".join(traceback.format_exception(error)))

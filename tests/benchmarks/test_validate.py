@@ -329,6 +329,8 @@ def test_a_damaged_release_leaves_the_scores_of_before(scored, small_release, tm
     assert result.report == out / "failed.html" and "Not sound" in result.report.read_text()
     assert json.loads(result.facts.read_text())["results"] == []
     assert f"The scores of an earlier run are kept: {result.kept}" in list(_validated(result, get_profile("smoke")))
+    scored(["state-bc"], out)  # of the sound one
+    assert not list(out.glob("failed.*")) and agents_of(out) == ["state-bc"]
 
 
 @pytest.mark.parametrize("steps, held", [(500, 100), (37, 5), (500, 1)])

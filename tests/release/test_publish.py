@@ -355,7 +355,7 @@ def test_files_of_something_else_are_not_replaced(s3, copy, tmp_path):
     assert s3.direct.find("bucket/x") == ["bucket/x/data/notes.txt"]
 
 
-def test_a_claim_that_an_ended_publication_left_stops_nobody(tiny, tmp_path, monkeypatch):
+def test_a_leftover_claim_does_not_block_later_publications(tiny, tmp_path, monkeypatch):
     there, url = tmp_path / "there", f"file:{tmp_path / 'there'}"
     with monkeypatch.context() as patch:
         patch.setattr(LocalStorage, "_remove", lambda *_: (_ for _ in ()).throw(OSError(5, "broken")))
