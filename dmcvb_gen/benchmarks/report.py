@@ -58,7 +58,7 @@ CHECKS = {
     "pixels": "sampled frames painted again are the stored ones",
     "pictures": "no black, one-colored or frozen images",
     "labels": "distractor labels fit their setting",
-    "modalities": "stored depth, segmentation and the like are what the states show",
+    "modalities": "depth, segmentation and the like, if stored, are what the states show",
 }
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
 SHOWN = 200
