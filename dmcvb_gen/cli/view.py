@@ -54,7 +54,7 @@ def view(context, path, only, episodes, size, max_mb, open_it, serve, port, out,
         print_json(vars(written))
     else:
         shows = f"{pluralize(written.episodes, 'episodes')} of {pluralize(written.subsets, 'subsets')}"
-        left_out = f", every {written.stride}th image" if written.stride > 1 else ""
+        left_out = f", one image in {written.stride}" if written.stride > 1 else ""
         click.echo(f"{written.path}: {shows}{left_out}, {format_bytes(written.bytes)}")
     if serve:
         _serve(written.path, port)

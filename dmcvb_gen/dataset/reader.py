@@ -38,6 +38,16 @@ MANY_EPISODES = 10**6
 """An array with more episodes than that, and ten times the manifest's, is damaged or hostile."""
 
 
+def without_ellipsis(selection: Any, dimensions: int) -> tuple:
+    """An index of an array of that many dimensions, with its `...` written out."""
+    parts = list(selection) if isinstance(selection, tuple) else [selection]
+    for place, part in enumerate(parts):
+        if part is Ellipsis:
+            parts[place : place + 1] = [slice(None)] * (dimensions - len(parts) + 1)
+            break
+    return tuple(parts) or (slice(None),)
+
+
 class StoredArray:
     """One array of a subset, read as it is indexed; damaged bytes and lost connections are one line with a cure.
 
@@ -60,9 +70,35 @@ class StoredArray:
         return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
 
     def __getitem__(self, selection: Any) -> np.ndarray:
-        self._check_painted(selection[0] if isinstance(selection, tuple) else selection)
+        """Values at an index of each axis: numbers, slices, and along one axis a list or a mask.
+
+        Raises:
+          IndexError: the index does not fit the array.
+        """
+        parts = self._index(selection)
+        self._check_painted(parts[0])
         with storage_errors(self._place, decoding=True):
-            return cast(np.ndarray, self._array[selection])
+            lists = any(isinstance(part, np.ndarray) for part in parts)
+            return cast(np.ndarray, self._array.oindex[parts] if lists else self._array[parts])
+
+    def _index(self, selection: Any) -> tuple:
+        """The index as Zarr takes it, looked at before anything is read: what fails then is damaged."""
+        parts = without_ellipsis(selection, self.ndim)
+        if len(parts) > self.ndim:
+            raise IndexError(f"{len(parts)} indices are too many for {self!r}")
+        found = []
+        for axis, part in enumerate(parts):
+            try:
+                chosen = np.arange(self.shape[axis])[part]
+            except IndexError as error:
+                raise IndexError(f"axis {axis} of {self!r}: {error}") from None
+            if chosen.ndim > 1:
+                raise IndexError(f"axis {axis} of {self!r}: give a number, a slice, or a list of numbers")
+            steps_back = isinstance(part, slice) and (part.step or 1) < 0  # Zarr knows no such slices, nor masks
+            found.append(part if isinstance(part, slice) and not steps_back else chosen)
+        if sum(isinstance(part, np.ndarray) for part in found) > 1:
+            raise IndexError(f"{self!r}: give a list along one axis alone, or see outer()")
+        return tuple(found)
 
     def outer(self, selection: tuple) -> np.ndarray:
         """Values at a selection along each axis for itself: slices, indices or arrays of them."""
@@ -267,7 +303,8 @@ class Subset:
           (episode, step, ...) for arrays with steps, rows past an episode's length are zero; else (episode, ...).
         """
         if isinstance(episodes, slice):
-            episodes = self.episodes[np.isin(self.episodes, np.arange(self.record.episodes)[episodes])]
+            wanted = np.arange(self.record.episodes)[episodes]
+            episodes = wanted[np.isin(wanted, self.episodes)]
         return self._read(array, self.choose(episodes))
 
     def _read(self, array: str, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:

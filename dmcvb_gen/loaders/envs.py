@@ -7,6 +7,7 @@ and one call of the renderer.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, SupportsFloat
@@ -21,9 +22,10 @@ from numpy.typing import ArrayLike
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import Distractor, DistractorSampler, floor_alpha_for, load_backgrounds
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.errors import BackgroundError, DmcvbError, UnknownNameError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look
+from dmcvb_gen.loaders.stream import check_count
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
@@ -38,6 +40,7 @@ from dmcvb_gen.spec import (
 )
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
+from dmcvb_gen.text import as_names
 
 PURPOSE = "evaluation"
 """Names the random streams: no episode here has those of released data."""
@@ -112,7 +115,7 @@ class Scene:
                 f"the data show videos of their own (digest {self.own_videos[:12]}), not the built-in ones: give their "
                 "folder with backgrounds=FOLDER"
             )
-        for modality in self.modalities:
+        for modality in as_names(self.modalities):
             if get_modality(modality).needs_next:
                 raise DmcvbError(
                     f"an environment has no {modality}: the next frame is not known yet; remove {modality}"
@@ -127,13 +130,18 @@ class Scene:
             raise DmcvbError(f"{self.task} has no goal in its images; remove goal")
         counts = {"max_steps": self.max_steps, "threads": self.threads, "fixed_goals": self.fixed_goals}
         for name, number in counts.items():
-            if number is not None and (not isinstance(number, int | np.integer) or number < 1):
-                raise DmcvbError(f"{name} is {number}; give a whole number, at least 1")
+            if number is not None:
+                check_count(name, number)
+        for name, number in {"goal_pair": self.goal_pair, "goal_seed": self.goal_seed}.items():
+            if number is not None:
+                check_count(name, number, least=0)
         spec = self.spec()
         if spec.goal is not GoalMode.FIXED:
             for name in ("fixed_goals", "goal_pair", "goal_seed"):
                 if getattr(self, name) != getattr(Scene, name):
                     raise DmcvbError(f"{name} has no effect without distractor 'fixed' (mazes); remove {name}")
+        elif self.goal_pair is not None and self.goal_pair >= self.fixed_goals != FIXED_GOALS:
+            raise DmcvbError(f"goal_pair is {self.goal_pair}; give 0 to {self.fixed_goals - 1}, as fixed_goals says")
         if spec.distractor.kind == "none":
             # An exported data set names the difficulty that every setting has by default.
             unused = {"difficulty": (None, Distractor("none").difficulty), "backgrounds": (Scene.backgrounds,)}
@@ -141,6 +149,18 @@ class Scene:
                 if getattr(self, name) not in unchanged:
                     shown = f"{self.task} {self.distractor}"
                     raise DmcvbError(f"{name} has no effect: {shown} shows no distractors; remove {name}")
+
+    def check_videos(self) -> None:
+        """Raises DmcvbError for other videos than those of the data, if these are named and can be compared."""
+        found = {}
+        for split in SPLITS if self.own_videos else ():
+            with contextlib.suppress(BackgroundError):  # a folder may hold the videos of evaluation alone
+                found[split] = load_backgrounds(self.backgrounds, split).digest
+        if "train" in found and self.own_videos not in found.values():
+            raise DmcvbError(
+                f"{self.backgrounds} does not hold the videos of the data (digest {str(self.own_videos)[:12]}); give "
+                "their folder with backgrounds=FOLDER"
+            )
 
 
 def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
@@ -163,13 +183,14 @@ class _Stage:
         self.setting = spec.distractor
         hide = scene.goal == HIDDEN if scene.goal else spec.hides_goal
         self.pictures = Pictures(self.task.views, hide).select(scene.views)
-        self.modalities = tuple(scene.modalities)
+        self.modalities = as_names(scene.modalities)
         self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if spec.goal is GoalMode.FIXED else None
         self._first_pair = scene.goal_pair or 0
         check_size(scene.size)
         check_renderer(scene.renderer)
         self.backgrounds = None if self.setting.kind == "none" else load_backgrounds(scene.backgrounds, scene.split)
+        scene.check_videos()
         self.renderer = make_renderer(
             scene.renderer,
             self.task,
@@ -283,8 +304,6 @@ def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, i
     """The (start, goal) cells that "fixed" episodes go round."""
     if scene.goal_pair is None:
         return fixed_pairs(as_maze(task).layout, scene.fixed_goals, scene.goal_seed)
-    if scene.goal_pair < 0:
-        raise DmcvbError(f"goal_pair is {scene.goal_pair}; give 0 for the first pair, 1 for the second, ...")
     return fixed_pairs(as_maze(task).layout, scene.goal_pair + 1, scene.goal_seed)[-1:]
 
 

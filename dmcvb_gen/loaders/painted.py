@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,12 @@ import numpy as np
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
+from dmcvb_gen.dataset.reader import StoredArray, without_ellipsis
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.jobs import stream_names
+from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
@@ -65,40 +67,42 @@ class Painting:
             check_size(self.size)
 
 
-def _without_ellipsis(selection: Any, dimensions: int) -> tuple:
-    """An index of an array of that many dimensions, with its `...` written out."""
-    parts = list(selection) if isinstance(selection, tuple) else [selection]
-    for place, part in enumerate(parts):
-        if part is Ellipsis:
-            parts[place : place + 1] = [slice(None)] * (dimensions - len(parts) + 1)
-            break
-    return tuple(parts) or (slice(None),)
+class ComputedArray:
+    """An array that is computed an episode at a time when it is indexed; see `dataset.reader.StoredArray`.
 
+    Args:
+      compute: gives an episode's values, of `shape[1:]`.
+    """
 
-class PaintedArray:
-    """A picture array that is rendered when it is indexed; see `dataset.reader.StoredArray`."""
-
-    def __init__(self, subset: PaintedSubset, name: str):
-        self._subset, self.name = subset, name
-        record = subset.record
-        self.shape = (record.episodes, record.max_steps + 1, record.size, record.size, 3)
-        self.dtype, self.ndim = np.dtype(np.uint8), 5
-        self.dimensions = ("episode", "step", "height", "width", "channel")
+    def __init__(
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        dtype: np.dtype,
+        dimensions: tuple[str, ...],
+        compute: Callable[[int], np.ndarray],
+    ):
+        self.name, self.shape, self.dtype, self.dimensions = name, shape, dtype, dimensions
+        self.ndim, self._compute = len(shape), compute
 
     def __getitem__(self, selection: Any) -> np.ndarray:
-        first, *rest = _without_ellipsis(selection, self.ndim)
+        first, *rest = without_ellipsis(selection, self.ndim)
         episodes = np.arange(self.shape[0])[first]
         if np.ndim(episodes) == 0:
-            return self._subset.painted(int(episodes), [self.name])[self.name][tuple(rest)]
+            return self._compute(int(episodes))[tuple(rest)]
         return self.rows(np.asarray(episodes))[(slice(None), *rest)]
 
     def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
-        """(episode, row, height, width, 3) uint8, rows past an episode's end zero."""
-        return np.stack([self._subset.painted(int(episode), [self.name])[self.name][:rows] for episode in episodes])
+        """(episode, row, ...) values, rows past an episode's end zero."""
+        values = [self._compute(int(episode))[:rows] for episode in episodes]
+        return np.stack(values) if values else np.zeros((0, *self.shape[1:]), self.dtype)[:, :rows]
 
 
 class PaintedSubset(SubsetReader):
     """A subset whose pictures are rendered when they are read. With fresh distractors, each epoch shows others.
+
+    Labels are those of the pictures. Stored depth, segmentation, parts and flow are of the stored distractors and size,
+    so they are only read with these.
 
     Attributes:
       epoch: epoch of the distractors; 0 at the start.
@@ -117,6 +121,7 @@ class PaintedSubset(SubsetReader):
         shown = {"size": painting.size or record.size, "pixels": True}
         super().__init__(root, record.model_copy(update=shown), commits, storage_options)
         self.painting, self.epoch = painting, 0
+        self._other_frames = self.fresh or self.record.size != record.size
         self._seed = int(manifest.recipe_of(record.name).get("seed", 0))
         self._names = stream_names(manifest, record)
         self._start()
@@ -168,10 +173,40 @@ class PaintedSubset(SubsetReader):
 
     @property
     def arrays(self) -> tuple[str, ...]:
-        return tuple(sorted({*super().arrays, *self.picture_names}))
+        unlike = stored_in(super().arrays) if self._other_frames else ()
+        return tuple(sorted({*super().arrays, *self.picture_names} - set(unlike)))
 
     def array(self, name: str) -> Any:
-        return PaintedArray(self, name) if picture_of(name) is not None else super().array(name)
+        """See `Subset.array`.
+
+        Raises:
+          StoreError: it was computed for other images than these.
+        """
+        if picture_of(name) is not None:
+            record, axes = self.record, ("episode", "step", "height", "width", "channel")
+            shape = (record.episodes, record.max_steps + 1, record.size, record.size, 3)
+            return ComputedArray(name, shape, np.dtype(np.uint8), axes, lambda e: self.painted(e, [name])[name])
+        if self._other_frames and stored_in([name]):
+            raise StoreError(
+                f"the stored {name} of {self.name} belongs to the images as they were made, not to those with "
+                "distractors='resample' or another size; open the release without these to read it"
+            )
+        stored = super().array(name)
+        if not (self.fresh and name.startswith("exogenous/")):
+            return stored
+        label = name.removeprefix("exogenous/")
+        return ComputedArray(
+            name, stored.shape, stored.dtype, stored.dimensions, lambda e: self._shown_label(e, label, stored)
+        )
+
+    def _shown_label(self, episode: int, label: str, stored: StoredArray) -> np.ndarray:
+        """Values of a fresh label, rows past the episode's end zero."""
+        self._check_episode(episode)
+        rows = int(self.read("length", [episode])[0]) + 1
+        values = np.zeros(stored.shape[1:], stored.dtype)
+        with self._lock:
+            values[:rows] = getattr(self._fresh_labels(episode), label)[:rows]
+        return values
 
     def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
         """See `Subset.rows`; all pictures of an episode are painted at once."""
@@ -205,8 +240,7 @@ class PaintedSubset(SubsetReader):
         Raises:
           StoreError: there is no such episode here.
         """
-        if episode not in self.episodes:
-            raise StoreError(f"{self.name} has no episode {episode}; it has {len(self.episodes)} episodes")
+        self._check_episode(episode)
         epoch = self.shown_epoch
         keys = {name: (episode, epoch, name) for name in (self.picture_names if arrays is None else arrays)}
         with self._lock:
@@ -221,6 +255,10 @@ class PaintedSubset(SubsetReader):
             while self._bytes > self.painting.cache_bytes and len(self._kept) > 1:
                 self._bytes -= self._kept.popitem(last=False)[1].nbytes
             return found
+
+    def _check_episode(self, episode: int) -> None:
+        if episode not in self.episodes:
+            raise StoreError(f"{self.name} has no episode {episode}; it has {len(self.episodes)} episodes")
 
     def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
         renderer, _ = self._open_painter()

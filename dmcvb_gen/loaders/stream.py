@@ -21,15 +21,15 @@ Steps = dict[str, np.ndarray]
 """A batch, see `StepTable.gather`."""
 
 
-def check_count(name: str, value: int) -> int:
-    """Return `value` if it is at least 1.
+def check_count(name: str, value: int, least: int = 1) -> int:
+    """Return `value` if it is a whole number, and at least so large.
 
     Raises:
-      DmcvbError: it is below 1.
+      DmcvbError: it is not.
     """
-    if value < 1:
-        raise DmcvbError(f"{name}={value}: give at least 1")
-    return value
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise DmcvbError(f"{name} is {value!r}; give a whole number, at least {least}")
+    return int(value)
 
 
 def share(episodes: np.ndarray, rank: int, world: int, worker: int = 0, workers: int = 1) -> np.ndarray:
@@ -79,10 +79,12 @@ def stream(
       drop_last: leave out a batch that is not full.
 
     Raises:
-      DmcvbError: a number below 1, or fewer episodes than ranks.
+      DmcvbError: a number that is too small or not whole, or fewer episodes than ranks.
     """
     for name, value in (("stack", stack), ("buffer", buffer), ("batch_size", 1 if batch_size is None else batch_size)):
         check_count(name, value)
+    for name, value in (("seed", seed), ("epoch", epoch)):
+        check_count(name, value, least=0)
     chosen, names = subset.choose(episodes), shown(subset, pictures).arrays
     order = np.random.default_rng([seed, epoch, 0]).permutation(chosen) if shuffle else chosen
     own, most = share(order, rank, world, worker, workers), None

@@ -28,6 +28,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
+from dmcvb_gen.loaders.stream import check_count
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.remote import is_url, local_path, public, storage_errors
@@ -86,15 +87,23 @@ def view(
 
     Raises:
       StoreError: the release has no episodes yet, its pictures cannot be painted, or the file cannot be written.
+      DmcvbError: `episodes` or `max_bytes` is no whole number, or below 1.
       UnknownNameError: no such subset.
     """
     if not out and is_url(path):
         raise StoreError(f"{public(path)} is a URL: say with --out where to write the file")
+    for name, value in {"episodes": episodes, "max_bytes": max_bytes}.items():
+        if value is not None:
+            check_count(name, value)
     target = local_path(out) if out else None
-    release = _with_pictures(open_for_reading(path, storage_options), size)
+    release = open_for_reading(path, storage_options)
     names = select(list(release.subsets), list(only)) if release.subsets else []
     if not names:
         raise StoreError(f"{public(path)} has no finished episodes; run the rollout first")
+    imported = [name for name in names if release[name].record.imported]
+    if size and imported:
+        raise StoreError(f"{imported[0]} was imported and has no physics states to paint from; remove --size")
+    release = _with_pictures(release, size)
     target = target or release.path / "preview" / "viewer.html"
     each = episodes or max(1, EPISODES // len(names))
     chosen = [(release[name], int(index)) for name in names for index in release[name].episodes[:each]]

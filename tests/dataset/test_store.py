@@ -259,9 +259,22 @@ def test_reading_any_selection_gives_what_whole_reading_gives(small_release):
     whole = subset.read("state")
     np.testing.assert_array_equal(subset.read("state", [2, 0]), whole[[2, 0]])
     np.testing.assert_array_equal(subset.read("state", slice(1, 3)), whole[1:3])
+    np.testing.assert_array_equal(subset.read("state", slice(None, None, -1)), whole[::-1])
     assert subset.read("state", []).shape == (0, 501, 24)
     with pytest.raises(UnknownNameError, match="state"):
         subset.read("stat")
+
+
+def test_arrays_take_numpys_indices_and_a_wrong_one_is_no_damage(small_release):
+    stored = open_release(small_release)[NAME].array("state")
+    whole = stored[:]
+    mask = np.array([True, False, True])
+    for index in (1, -1, [2, 0], mask, slice(None, None, -1), (), ..., (..., 3), (mask, 0), (0, [1, 5])):
+        np.testing.assert_array_equal(stored[index], whole[index])
+    np.testing.assert_array_equal(stored[[]], whole[:0])
+    for index in (7, [0, 99], [0.5], ["a"], 0.5, "a", None, np.array([True, False]), ([0, 2], [1, 2]), (0, 0, 0, 0)):
+        with pytest.raises(IndexError, match="StoredArray state"):
+            stored[index]
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../b", "a//b", "", "a/./b", "c:\\x", "a/\x00"])

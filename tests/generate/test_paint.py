@@ -16,6 +16,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import write_release
 from dmcvb_gen.dataset.manifest import commit_path
+from dmcvb_gen.dataset.pictures import picture_arrays
 from dmcvb_gen.dataset.writer import finish_release
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import write_json
@@ -223,6 +224,51 @@ def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
     assert (before != after).any() and np.array_equal(state, subset.read("state", [0]))
     subset.set_epoch(0)
     assert np.array_equal(before, subset.read(array, [0]))
+
+
+def test_labels_of_fresh_distractors_are_those_of_their_pictures(made):
+    """What is drawn for an epoch is read as its labels, and the pictures are painted from it."""
+    for name in dmcvb_gen.open(str(made / "light")):
+        subset = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")[name]
+        stored, episode = dmcvb_gen.open(str(made / "light"))[name], int(subset.episodes[-1])
+        labels = [array for array in subset.arrays if array.startswith("exogenous/")]
+        shapes = {array: stored.read(array, [episode]).shape for array in labels}
+        rows, seen = int(stored.read("length", [episode])[0]) + 1, []
+        for epoch in (0, 1):
+            subset.set_epoch(epoch)
+            alone = subset.episode(episode)
+            for array in labels:
+                read = subset.read(array, [episode])
+                assert read.shape == shapes[array] and read.dtype == stored.array(array).dtype
+                assert not read[:, rows:].any()
+                np.testing.assert_array_equal(read[0, :rows], alone[array])
+            renderer, _ = subset._open_painter()
+            shown, views = subset.labels([episode])[:, :rows], subset.record.views
+            physics = stored.read("physics", [episode])[0, :rows]
+            pictures = renderer.render(physics, shown[0], views, False)
+            for place, array in enumerate(picture_arrays(views)):
+                np.testing.assert_array_equal(pictures[:, place], alone[array])
+            seen.append(np.concatenate([np.ravel(alone[array]) for array in labels] or [np.zeros(0)]))
+        assert stored.record.distractor.kind == "none" or (seen[0] != seen[1]).any()
+
+
+def test_stored_modalities_are_read_with_their_own_pictures_alone(made, tmp_path):
+    name = next(reversed(dmcvb_gen.open(str(made / "light")).subsets))
+    dmcvb_gen.repaint(made / "light", only=[name], labels=["depth"], out=tmp_path / "r", progress=False)
+    [same] = dmcvb_gen.open(str(tmp_path / "r"), paint=True).subsets.values()
+    depths = [array for array in same.arrays if array.startswith("depth")]
+    assert depths and set(depths) < set(same.episode(0))
+    for options in ({"size": 24}, {"distractors": "resample"}):
+        [subset] = dmcvb_gen.open(str(tmp_path / "r"), paint=True, **options).subsets.values()
+        assert set(same.arrays) - set(subset.arrays) == set(depths) and not set(depths) & set(subset.episode(0))
+        with pytest.raises(StoreError, match="depth.* of .* belongs to the images as they were made"):
+            subset.array(depths[0])
+
+
+def test_painted_pictures_of_no_episodes_are_an_empty_array(small_release):
+    subset = next(iter(dmcvb_gen.open(str(small_release), paint=True).subsets.values()))
+    assert subset.array("pixels")[0:0].shape == (0, *subset.array("pixels").shape[1:])
+    assert subset.read("pixels", []).shape == subset.array("pixels")[0:0].shape
 
 
 def test_fresh_distractors_are_the_same_alone_and_drawn_together(made, monkeypatch):

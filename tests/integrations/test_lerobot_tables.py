@@ -11,7 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.release.export import export
+from tests.conftest import roll_out
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +97,31 @@ def test_videos_have_a_frame_a_step(stored, tmp_path):
             painted = values["pixels"][:length, view].astype(float)
             assert np.abs(frames[start : start + length] - painted).mean() < 12  # 4:2:0 of 16 pixels
             start += length
+
+
+def lerobots_features(info):
+    """The columns that LeRobot asks `datasets` for: one number is a scalar, several are a sequence."""
+    found = {}
+    for name, feature in info["features"].items():
+        value = datasets.Value(feature["dtype"]) if feature["dtype"] != "image" else datasets.Image()
+        many = feature["dtype"] != "image" and feature["shape"] != [1]
+        found[name] = datasets.Sequence(value, length=feature["shape"][0]) if many else value
+    return datasets.Features(found)
+
+
+@pytest.mark.parametrize("task", ["pendulum-swingup", "swimmer-swimmer6"])
+def test_one_action_and_broken_rates_fit_lerobots_own_checks(task, tmp_path):
+    """A pendulum has one action; a swimmer takes 16.67 steps a second, and LeRobot's rates are whole numbers."""
+    pattern = {"tasks": task, "levels": "random", "settings": "none", "episodes": 2, "max_steps": 30}
+    fields = {"name": "r", "size": 16, "renderer": {"backend": "native"}, "subsets": [pattern]}
+    roll_out(make_recipe(fields), tmp_path / "r")
+    [folder] = export(str(tmp_path / "r"), "lerobot", tmp_path / "out")
+    info = json.loads((folder / "meta/info.json").read_text())
+    path = str(folder / "data/chunk-000/file-000.parquet")
+    table = datasets.Dataset.from_parquet(path, features=lerobots_features(info), cache_dir=str(tmp_path / "cache"))
+    assert np.shape(table["action"][:]) == ((60,) if task.startswith("pendulum") else (60, 5))
+    np.testing.assert_allclose(np.diff(table["timestamp"][:30]), 1 / info["fps"], atol=1e-5)  # LeRobot allows 1e-4
+    assert ("16.67 steps a second" in (folder / "README.md").read_text()) == task.startswith("swimmer")
 
 
 def test_odd_sizes_make_no_videos(stored, tmp_path, monkeypatch):

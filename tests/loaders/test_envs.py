@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import unittest
@@ -12,8 +13,10 @@ import numpy as np
 import pytest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
+from PIL import Image
 
 from dmcvb_gen.dataset import open_release
+from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.dm import DmEnv
 from dmcvb_gen.loaders.envs import FIXED_GOALS, DistractedEnv, DistractedVectorEnv
@@ -182,8 +185,14 @@ def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
         goal = task.layout.grid(state[task.state_slices["target_position"]][None, :2])[0]
         assert tuple(int(x) for x in np.rint(goal)) == pairs[1][1]
     assert DistractedEnv(maze, "fixed", goal_pair=3, views=views, **SMALL).reset(seed=0)[1] == {"goal_pair": 3}
-    with pytest.raises(DmcvbError, match="give 0 for the first"):
-        DistractedEnv(maze, "fixed", goal_pair=-1)
+    for option, words in (
+        (dict(goal_pair=-1), "goal_pair is -1; give a whole number, at least 0"),
+        (dict(goal_pair=1.5), "goal_pair is 1.5; give a whole number"),
+        (dict(goal_seed=-1), "goal_seed is -1"),
+        (dict(goal_pair=7, fixed_goals=3), "goal_pair is 7; give 0 to 2"),
+    ):
+        with pytest.raises(DmcvbError, match=words):
+            DistractedEnv(maze, "fixed", **option)
 
 
 @pytest.mark.parametrize("name", ["walker-walk-dynamic", "ant-maze-empty7x7-hidden"])
@@ -213,6 +222,25 @@ def test_the_data_layout_stacks_frames_as_the_readers_do(name):
 def test_evaluation_shows_videos_that_training_does_not():
     val, train = (DistractedEnv("walker-walk", "static", split=split, **SMALL) for split in ("val", "train"))
     assert val._stage.backgrounds.digest != train._stage.backgrounds.digest
+
+
+def test_videos_of_the_data_are_compared_with_those_that_are_given(tmp_path):
+    for folder, shade in (("own", 10), ("other", 200)):
+        for split in ("train", "val"):
+            (tmp_path / folder / split / "clip").mkdir(parents=True)
+            for frame in range(2):
+                Image.new("RGB", (8, 8), (shade + frame,) * 3).save(tmp_path / folder / split / "clip" / f"{frame}.png")
+    own, other = str(tmp_path / "own"), str(tmp_path / "other")
+    digest = load_backgrounds(own, "train").digest
+    DistractedEnv("walker-walk", "dynamic", own_videos=digest, backgrounds=own, **SMALL)
+    with pytest.raises(DmcvbError, match="other does not hold the videos of the data.*backgrounds=FOLDER"):
+        DistractedEnv("walker-walk", "dynamic", own_videos=digest, backgrounds=other, **SMALL)
+    shutil.rmtree(tmp_path / "other" / "train")  # videos of evaluation alone: nothing to compare
+    DistractedEnv("walker-walk", "dynamic", own_videos=digest, backgrounds=other, **SMALL)
+
+
+def test_one_modality_can_be_named_alone():
+    assert "depth" in DistractedEnv("walker-walk", modalities="depth", **SMALL).observation_space.spaces
 
 
 def test_mistakes_are_answered():

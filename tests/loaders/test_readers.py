@@ -202,14 +202,18 @@ def test_ranks_get_equally_many_episodes_and_share_none(subset):
 
 def test_numbers_below_one_are_refused_by_name(subset):
     for make, words in (
-        (lambda: next(subset.batches(8, stack=0)), "stack=0"),
-        (lambda: next(subset.batches(0)), "batch_size=0"),
-        (lambda: next(subset.batches(8, buffer=0)), "buffer=0"),
-        (lambda: subset.source(stack=-1), "stack=-1"),
-        (lambda: subset.torch("steps", stack=0), "stack=0"),
+        (lambda: next(subset.batches(8, stack=0)), "stack is 0"),
+        (lambda: next(subset.batches(0)), "batch_size is 0"),
+        (lambda: next(subset.batches("8")), "batch_size is '8'"),
+        (lambda: next(subset.batches(8, buffer=0)), "buffer is 0"),
+        (lambda: subset.source(stack=-1), "stack is -1"),
+        (lambda: subset.source(stack=1.5), "stack is 1.5"),
+        (lambda: subset.torch("steps", stack=0), "stack is 0"),
     ):
-        with pytest.raises(DmcvbError, match=f"{words}: give at least 1"):
+        with pytest.raises(DmcvbError, match=f"{words}; give a whole number, at least 1"):
             make()
+    with pytest.raises(DmcvbError, match="seed is -1; give a whole number, at least 0"):
+        next(subset.batches(8, seed=-1))
 
 
 @pytest.mark.parametrize("drop_last", [False, True])

@@ -19,7 +19,7 @@ from PIL import Image
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.release.viewer import view
 from tests.conftest import roll_out, small_recipe
@@ -139,6 +139,9 @@ def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maz
         assert whole.stride == 1 and small.stride > 1 and small.bytes <= whole.bytes * 3 // 4
         with pytest.raises(StoreError, match="do not fit"):
             view(str(folder), tmp_path / "none.html", max_bytes=1000)
+    for option in (dict(max_bytes=0), dict(episodes=0), dict(episodes=-1), dict(episodes=1.5)):
+        with pytest.raises(DmcvbError, match=f"{next(iter(option))} is .*; give a whole number, at least 1"):
+            view(str(small_release), tmp_path / "none.html", **option)
 
 
 def test_the_command_writes_and_refuses(small_release, tmp_path):

@@ -69,7 +69,7 @@ def export(
       path: a release, here or at a URL.
       to: name of a format, see `all_formats`.
       out: folder of the exports; each subset gets `<out>/<task>/<level>/<setting>` (minari has its own tree).
-      only: subset patterns; episodes: (first, last + 1); all by default.
+      only: subset patterns; episodes: (first, last + 1), as far as a subset has so many; all by default.
       merge: lerobot: all subsets as the tasks of one data set, `out` itself.
       video: lerobot: pictures as mp4 (smaller, with losses) and not as PNG.
       workers: processes (or a Ray cluster that sees the same folders), a subset each.

@@ -110,10 +110,13 @@ def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, st
 def _card(layout: _Layout) -> str:
     manifest = layout.sources[0].manifest
     subsets = "\n".join(f"- {source.description}" for source in layout.sources)
+    rate = ""
+    if layout.fps != layout.rate:
+        rate = f"\nThe task takes {layout.rate:.4g} steps a second; timestamps have {layout.fps}, a whole number.\n"
     return (
         f"---\nlicense: {manifest.license.lower()}\ntask_categories:\n- robotics\ntags:\n- LeRobot\nconfigs:\n"
         "- config_name: default\n  data_files: data/*/*.parquet\n---\n\n"
-        f"# {manifest.name} {manifest.version}\n\nA LeRobot data set ({VERSION}) of\n\n{subsets}\n"
+        f"# {manifest.name} {manifest.version}\n\nA LeRobot data set ({VERSION}) of\n\n{subsets}\n{rate}"
     )
 
 
@@ -135,6 +138,7 @@ class _Layout:
 
     Attributes:
       tasks: their texts; `task_index` counts them. robot: what they have in common.
+      rate, fps: steps a second, and the whole number that LeRobot takes for them; timestamps are made of that.
       keys: view -> feature of its pictures.
       modalities: array of depth, segmentation or flow -> feature of its pictures.
       features: features as in info.json.
@@ -211,7 +215,7 @@ class _Layout:
             "next.reward": episode.reward,
             "next.done": steps == length - 1,
             "next.success": (steps == length - 1) & episode.terminated,
-            "timestamp": (steps / self.rate).astype(np.float32),
+            "timestamp": (steps / self.fps).astype(np.float32),
             "frame_index": steps,
             "episode_index": np.full(length, number),
             "index": index + steps,
@@ -233,7 +237,7 @@ class _Layout:
             else:
                 kind = {"float32": pa.float32(), "bool": pa.bool_(), "int64": pa.int64()}[feature["dtype"]]
                 told = {"dtype": feature["dtype"], "_type": "Value"}
-                if feature["names"]:
+                if feature["shape"][0] > 1:  # LeRobot takes a single number for a scalar
                     kind = pa.list_(kind, feature["shape"][0])
                     told = {"feature": told, "length": feature["shape"][0], "_type": "List"}
             fields.append(pa.field(name, kind))
@@ -283,11 +287,10 @@ class _Files:
             if field.name in pictures:
                 values = [{"bytes": png(frame), "path": None} for frame in pictures[field.name]]
                 arrays.append(pa.array(values, field.type))
-            elif columns[field.name].ndim == 2:
-                flat = pa.array(columns[field.name].ravel())
-                arrays.append(pa.FixedSizeListArray.from_arrays(flat, columns[field.name].shape[1]))
-            else:
-                arrays.append(pa.array(columns[field.name], field.type))
+                continue
+            many = pa.types.is_fixed_size_list(field.type)
+            flat = pa.array(columns[field.name].ravel(), field.type.value_type if many else field.type)
+            arrays.append(pa.FixedSizeListArray.from_arrays(flat, field.type.list_size) if many else flat)
         return pa.table(arrays, schema=self._schema)
 
     def _open(self, chunk: int, file: int) -> None:
