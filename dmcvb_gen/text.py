@@ -17,8 +17,10 @@ def quoted(place: str | Path) -> str:
     return shlex.quote(str(place))
 
 
-def as_names(value: str | Path | Iterable) -> tuple[str, ...]:
-    """One name or several, as several."""
+def as_names(value: str | Path | Iterable | None) -> tuple[str, ...]:
+    """No name, one or several, as several."""
+    if value is None:
+        return ()
     return (str(value),) if isinstance(value, str | Path) else tuple(map(str, value))
 
 

@@ -14,6 +14,7 @@ import click
 from dmcvb_gen.cli.common import INTERRUPTED, OutPath, answer, json_option, print_json, print_table
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
+from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import quoted
@@ -55,11 +56,18 @@ def train_behaviour(as_json, list_settings, **options):
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
     click.echo(f"{run.folder}: trained to {run.steps:,} agent steps; its curve is {run.curve}.")
     if not picked:
-        return click.echo(f"Next: dmcvb-gen select-checkpoints {quoted(run.folder)}")
+        return click.echo(f"Next: {_leave(options['task'])}dmcvb-gen select-checkpoints {quoted(run.folder)}")
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
         options = f"--layout {quoted(layout)} --level expert --behaviour {quoted(run.folder)} --goal visible"
         click.echo(f"Next: dmcvb-gen rollout {options}")
+
+
+def _leave(task):
+    """What lets a task of one's own run in a command that does not name it, to write before that command."""
+    from dmcvb_gen.own_code import TASKS, is_own
+
+    return f"{TASKS}={task} " if task and is_own(task) else ""
 
 
 def _list_settings(as_json, *, task, layout, algo, settings, config, **others):
@@ -170,9 +178,12 @@ def convert_policy(source, task, out, level, hidden, activation, distribution, s
     dmcvb-gen rollout walker-run --level expert --behaviour walker-run.safetensors --episodes 20
     """
     from dmcvb_gen.own_code import allow
+    from dmcvb_gen.policies.bundled import CONVERTED
     from dmcvb_gen.policies.convert import convert_file
 
     allow([task])  # a person typed its name, so its code may run
+    if out.suffix in CONVERTED:
+        raise PolicyFileError(f"--behaviour would take {out} for another program's file; end its name in .safetensors")
     try:
         widths = [int(width) for width in hidden.split(",")] if hidden else None
     except ValueError:
@@ -211,7 +222,8 @@ def evaluate_behaviour(as_json, progress, **options):
 
 def _show_returns(rows, episodes, seed):
     """Print returns, the paper's under each."""
-    mazes, mode = any("success" in row for row in rows), rows[0]["mode"]
+    mazes = any("success" in row for row in rows)
+    mode = next((row["mode"] for row in rows if row["level"] != "random"), "random")  # random actions have no mean
     statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
     scores = ("success", "to goal m/s", "rms m/s") if mazes else ()
     lines = []

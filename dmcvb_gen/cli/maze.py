@@ -13,7 +13,7 @@ def _cell(context, parameter, value):
     if value is None:
         return None
     parts = value.split(",")
-    if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
         raise click.BadParameter(f"{value!r} is not ROW,COLUMN, e.g. 1,5")
     return int(parts[0]), int(parts[1])
 

@@ -156,6 +156,8 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
             for level in pattern.levels:
                 for setting in pattern.settings:
                     spec = SubsetSpec.parse(task_id, level, setting)
+                    if spec.name in requests and requests[spec.name].task != task_id:
+                        raise RecipeError(f"two mazes are called {spec.name.split('/')[0]}; rename the layout of one")
                     if spec.name in requests:
                         raise RecipeError(f"recipe {recipe.name!r} asks for {spec.name} twice; keep one of the entries")
                     requests[spec.name] = _request(pattern, task, spec)

@@ -90,8 +90,10 @@ def behaviour_source(given: str | Path | None) -> str | None:
     Raises:
       RecipeError: it names a Python file.
     """
-    if not given:
+    if given is None:
         return None
+    if not str(given):
+        raise RecipeError("behaviour is empty; leave it out to use the bundled policies")
     module, _, function = str(given).partition(":")
     if module.endswith(".py"):
         name = f"{Path(module).stem}:{function or 'FUNCTION'}"

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Between, Local, Location, Names, Seed, checked
 from dmcvb_gen.spec import Level, is_maze, task_folder
+from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.text import as_names
 
 
@@ -55,7 +56,8 @@ def evaluate_behaviour(
     _check_levels(as_names(levels), behaviour, sample)
     chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
     chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
-    if pictures and not any(map(is_maze, chosen)):
+    folder = None if pictures is None else local_path(pictures)
+    if folder and not any(map(is_maze, chosen)):
         raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(chosen)} is not a maze; remove it")
     rows = []
     for task_id in chosen:
@@ -65,15 +67,15 @@ def evaluate_behaviour(
             out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
             own = is_own(behaviour or "") and level != "random"
-            mode = "own" if own else "sampled" if sample else "mean"
+            mode = "own" if own else "sampled" if sample or level == "random" else "mean"  # random actions are drawn
             row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
             if success is not None:
                 row |= dict(success=success, speed=speed, running_speed=running_speed(task, out))
                 panels[f"{level}, {success:.0%} at the goal"] = walked_paths(task, out)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
-        if pictures and panels:
-            save_paths_picture(task.layout, panels, Path(pictures) / f"{task_folder(task_id)}.png")  # type: ignore[attr-defined]
+        if folder and panels:
+            save_paths_picture(task.layout, panels, folder / f"{task_folder(task_id)}.png")  # type: ignore[attr-defined]
     return rows
 
 

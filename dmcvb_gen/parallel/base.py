@@ -8,7 +8,9 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from dmcvb_gen.options import Between
 
 ProgressCallback = Callable[..., None]
 """Told by the functions at work how far they are; called in the process that asked for the work. One that can `expect`
@@ -130,7 +132,7 @@ class Ray:
     address: str | None = None
 
 
-Workers = int | Ray
+Workers = Annotated[int, Between(1)] | Ray
 """Executor of the work: so many processes (1: this one), or a Ray cluster."""
 
 

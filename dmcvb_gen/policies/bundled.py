@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
@@ -14,12 +15,17 @@ from dmcvb_gen.text import quoted
 
 CONVERTED = (".zip", ".pt", ".pth")
 """Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
+_MIXED = re.compile(r"mixed_([0-9]+)\.safetensors")
 
 
 def level_files(folder: Path, level: str) -> list[Path]:
-    """The policy files of a level in a folder, in order; empty if there are none."""
+    """The policy files of a level in a folder, in order; empty if there are none.
+
+    Those of mixed are numbered; a file of another name (mixed_final) is somebody's own and left out.
+    """
     if level == "mixed":
-        return sorted(folder.glob("mixed_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
+        named = ((_MIXED.fullmatch(path.name), path) for path in folder.glob("mixed_*.safetensors"))
+        return [path for _, _, path in sorted((int(found[1]), path.name, path) for found, path in named if found)]
     path = folder / f"{level}.safetensors"
     return [path] if path.exists() else []
 
@@ -120,6 +126,11 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
             return files
     if why := _reasons(path).get(level):
         raise PolicyFileError(f"{behaviour} has no {level} policy selected: {why}")
+    if level == "mixed" and (strange := sorted(path.glob("mixed_*.safetensors"))):
+        raise PolicyFileError(
+            f"{behaviour} has no numbered mixed policy, only {strange[0].name}; name its files mixed_0.safetensors, "
+            "mixed_1.safetensors, ..."
+        )
     raise PolicyFileError(
         f"{behaviour} has no {level} policy selected; run `dmcvb-gen select-checkpoints {quoted(behaviour)}` first"
     )

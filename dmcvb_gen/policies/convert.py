@@ -31,11 +31,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pydantic
 
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.files import parse_json, sha256_file
-from dmcvb_gen.policies.header import PolicyHeader
+from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.storage.remote import storage_errors
 from dmcvb_gen.tasks import get_task
 
 UNCLIPPED = 1e30
@@ -77,6 +79,9 @@ LAYOUTS = (
     Layout("torch", "", None, None, None, None),
 )
 
+PROGRAMS = {"sb3": "Stable-Baselines3", "cleanrl": "CleanRL"}
+"""Algorithm of a layout -> the name of its program, for messages."""
+
 
 def converted(path: Path, task_id: str, level: str) -> Path:
     """A policy file with another program's policy as it is now, in a folder that goes when the process ends."""
@@ -88,7 +93,8 @@ def _converted(path: Path, task_id: str, level: str, digest: str) -> Path:
     header, weights = convert(path, task_id, level)
     place = hashlib.sha256(f"{path} {task_id} {digest}".encode()).hexdigest()[:16]
     target = Path(_folder().name) / place / f"{level}.safetensors"
-    save_policy(target, header, weights)
+    with storage_errors(target, "write to"):
+        save_policy(target, header, weights)
     return target
 
 
@@ -116,11 +122,17 @@ def convert(
       statistics: .npz file with "mean" and "std" of the observations that it was trained on, if it normalized them.
 
     Raises:
-      PolicyFileError: it is not readable without running code, has other sizes, or parts that we do not have.
+      PolicyFileError: it is not readable without running code, has other sizes, parts that we do not have, or values
+        that are not finite; or an option has no effect.
     """
     path, task = Path(path), get_task(task_id)
     state, facts = _read(path)
     layout, layers = _layout(path, state)
+    if distribution is not None and layout.distribution is not None:
+        raise PolicyFileError(
+            f"--actions has no effect: {path} has an actor of {PROGRAMS[layout.algorithm]}, whose actions are known; "
+            "remove it"
+        )
     noted, steps = _noted(path, facts)
     activation = activation or noted or layout.activation
     distribution = distribution if layout.distribution is None else layout.distribution
@@ -138,7 +150,8 @@ def convert(
             f"{' x '.join(map(str, asked))} (observation, hidden, action); train it on this task"
         )
     weights |= _normalization(statistics, task.behaviour_size)
-    header = PolicyHeader(
+    header = _header(
+        path,
         task=task_id,
         observation=task.observation,
         observation_size=sizes[0],
@@ -147,18 +160,25 @@ def convert(
         agent_step=steps,
         level=level,
         hidden=widths,
-        activation=activation,  # type: ignore[arg-type]  # pydantic checks it
-        distribution=distribution,  # type: ignore[arg-type]
+        activation=activation,
+        distribution=distribution,
         clip_observation=UNCLIPPED if statistics is None else 10.0,
         training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
     )
+    _check_weights(path, header, weights)
     return header, weights
 
 
 def convert_file(path: str | Path, task_id: str, out: str | Path, **options: Any) -> PolicyHeader:
-    """Write another program's policy as a policy file, and load it once; see `convert`."""
+    """Write another program's policy as a policy file, and load it once; see `convert`.
+
+    Raises:
+      PolicyFileError: it cannot be converted; a file that is at `out` stays as it was.
+      StoreError: the file cannot be written.
+    """
     header, weights = convert(path, task_id, **options)
-    save_policy(out, header, weights)
+    with storage_errors(out, "write to"):
+        save_policy(out, header, weights)
     return load_policy(out).header
 
 
@@ -229,20 +249,18 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
         numbers = sorted(int(found[1]) for found in map(pattern.fullmatch, state) if found)
         if numbers and (layout.mean is None or f"{layout.mean}.weight" in state):
             strange = [name for name in state if name.startswith(("features_extractor.", "pi_features_extractor."))]
-            strange += [f"{layout.body}{number}" for number in numbers if _weight(state, layout, number).ndim != 2]
+            layers = [f"{layout.body}{number}" for number in numbers]
+            dense = [*layers, layout.mean] if layout.mean else layers
+            strange += [name for name in dense if state[f"{name}.weight"].ndim != 2]
             if strange:
                 raise PolicyFileError(
                     f"{path} has {strange[0]!r}, which is no dense layer; only plain MLPs can be converted"
                 )
-            return layout, [f"{layout.body}{number}" for number in numbers]
+            return layout, layers
     raise PolicyFileError(
         f"{path} has none of the actors that are known (it has {', '.join(list(state)[:3]) or 'nothing'}, ...); save "
         "the actor as a torch.nn.Sequential's state dict"
     )
-
-
-def _weight(state: Mapping[str, np.ndarray], layout: Layout, number: int) -> np.ndarray:
-    return state[f"{layout.body}{number}.weight"]
 
 
 def _weights(
@@ -259,7 +277,7 @@ def _weights(
         if distribution == "gaussian":
             size = len(weights["mean.bias"])
             weights["log_std_vector"] = state[log_std].reshape(size) if log_std else np.full(size, -80.0, np.float32)
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, TypeError) as error:
         raise PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict") from None
     scale, bias = state.get("action_scale"), state.get("action_bias")
     if (scale is not None and (scale != 1).any()) or (bias is not None and (bias != 0).any()):
@@ -267,16 +285,56 @@ def _weights(
     return weights
 
 
-def _normalization(statistics: str | Path | None, size: int) -> dict[str, np.ndarray]:
-    values = {"mean": np.zeros(size, np.float32), "std": np.ones(size, np.float32)}
-    if statistics is not None:
-        try:
-            with np.load(statistics, allow_pickle=False) as file:
-                values = {name: np.asarray(file[name], np.float32).reshape(size) for name in values}
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            reason = str(error).splitlines()[0]
+def _header(path: Path, **fields: Any) -> PolicyHeader:
+    try:
+        return PolicyHeader(**fields)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        raise PolicyFileError(
+            f"{path} makes no policy file ({field}: {first['msg']}); give other values, or a smaller MLP"
+        ) from None
+
+
+def _check_weights(path: Path, header: PolicyHeader, weights: Mapping[str, np.ndarray]) -> None:
+    """Refuse what `load_policy` would refuse, before anything is written."""
+    for name, shape in weight_shapes(header).items():
+        if weights[name].shape != shape:
             raise PolicyFileError(
-                f'{statistics} has no "mean" and "std" of {size} observations ({reason}); write it with '
-                "numpy.savez(file, mean=..., std=...)"
-            ) from None
-    return {"observation_mean": values["mean"], "observation_std": values["std"]}
+                f"{path}: {name} has shape {weights[name].shape}, the layers beside it ask for {shape}; save its whole "
+                "state dict again"
+            )
+        if not np.isfinite(weights[name]).all():
+            raise PolicyFileError(
+                f"{path}: {name} holds values that are not finite; its training diverged, take an earlier checkpoint"
+            )
+
+
+def _normalization(statistics: str | Path | None, size: int) -> dict[str, np.ndarray]:
+    mean, std = np.zeros(size, np.float32), np.ones(size, np.float32)
+    if statistics is not None:
+        mean, std = _statistics(statistics, size)
+        wrong = np.flatnonzero(~(np.isfinite(mean) & np.isfinite(std) & (std > 0)))
+        if len(wrong):
+            first = wrong[0]
+            raise PolicyFileError(
+                f"{statistics} has mean {mean[first]:g} and std {std[first]:g} of observation {first}; write finite "
+                "numbers and a std above 0 (1 for an observation that never changes)"
+            )
+    return {"observation_mean": mean, "observation_std": std}
+
+
+def _statistics(path: str | Path, size: int) -> list[np.ndarray]:
+    """The mean and std that a file holds, as float32."""
+    try:
+        file = np.load(path, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError("it is a single array")
+        with file, np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+            return [np.asarray(file[name], np.float32).reshape(size) for name in ("mean", "std")]
+    except Exception as error:  # numpy's, zip's and zlib's own kinds
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise PolicyFileError(
+            f'{path} has no "mean" and "std" of {size} observations ({reason}); write it with '
+            "numpy.savez(file, mean=..., std=...)"
+        ) from None

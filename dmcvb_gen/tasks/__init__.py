@@ -55,6 +55,12 @@ def _entry_points() -> dict[str, metadata.EntryPoint]:
     return {point.name: point for point in metadata.entry_points(group=ENTRY_POINTS)}
 
 
+def _checked(task_id: str, task: object) -> Task:
+    if not isinstance(task, Task):
+        raise DmcvbError(f"task {task_id} is a {type(task).__name__}; register a function that returns a Task")
+    return task
+
+
 @functools.cache
 def get_task(task_id: str) -> Task:
     """The task named `task_id`.
@@ -64,13 +70,13 @@ def get_task(task_id: str) -> Task:
       DmcvbError: a task of your own, or of the suite, that cannot be used.
     """
     if task_id in REGISTRY:
-        return REGISTRY[task_id]()
+        return _checked(task_id, REGISTRY[task_id]())
     if is_maze(task_id):
         return ant_maze_task(task_id)
     if is_own(task_id):
         return own_task(task_id)
     if task_id in _entry_points():
-        return _entry_points()[task_id].load()()
+        return _checked(task_id, _entry_points()[task_id].load()())
     if task_id in suite_ids():
         return suite_task(task_id)
     if task_id in REFUSED:

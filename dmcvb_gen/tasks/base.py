@@ -85,6 +85,8 @@ class Task(abc.ABC):
 
     unstored_fields: tuple[str, ...] = ()
     """Fields of the state that a physics state alone does not give."""
+    unstored_reward: bool = False
+    """True if the reward needs more than physics states and actions."""
 
     floor_alpha: float = 0.3
     """Opacity of the ground plane under distractors (Distracting Control Suite)."""

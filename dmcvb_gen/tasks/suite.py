@@ -116,7 +116,9 @@ class SuiteTask(Task):
         self.state_fields = {
             name: int(np.size(part)) for name, part in environment.task.get_observation(physics).items()
         }
-        self.unstored_fields = self._fields_of_accelerations()
+        drawn, self.unstored_reward = self._kept_in_python()
+        unstored = {*drawn, *self._fields_of_accelerations()}
+        self.unstored_fields = tuple(name for name in self.state_fields if name in unstored)
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -145,6 +147,19 @@ class SuiteTask(Task):
         for name in set(changed) - set(MODEL_FIELDS):
             raise DmcvbError(f"{self.id} changes {name} of the model in every episode, which cannot be stored; fix it")
         return {name: np.flatnonzero(mask) for name, mask in sorted(changed.items())}
+
+    def _kept_in_python(self) -> tuple[tuple[str, ...], bool]:
+        """Fields of the observation that need what the task drew for an episode and keeps in Python; so does reward."""
+        physics = self._environment.physics
+        tasks = [copy.deepcopy(self._environment.task) for _ in range(2)]
+        for seed, task in enumerate(tasks):
+            with _seeded(task, np.random.RandomState(seed)), physics.reset_context():
+                task.initialize_episode(physics)
+        first, second = (task.get_observation(physics) for task in tasks)  # both look at the second episode
+        fields = tuple(name for name in first if not np.array_equal(first[name], second[name], equal_nan=True))
+        with contextlib.suppress(Exception):  # of a user's own code, which may need a step first
+            return fields, bool(fields) or bool(tasks[0].get_reward(physics) != tasks[1].get_reward(physics))
+        return fields, bool(fields)
 
     def _fields_of_accelerations(self) -> tuple[str, ...]:
         """Fields of the observation that need accelerations or contact forces of the step before."""

@@ -104,8 +104,9 @@ def train_behaviour(
 
     task = task_of(task, layout)
     max_steps = get_task(task).max_steps
-    maze = MazeName.parse(task) if layout else None
-    folder = Path(out or Path("runs") / (maze.layout if maze else task))
+    named = MazeName.parse(task)
+    maze = named if layout else None
+    folder = Path(out or Path("runs") / (named.layout if named and (layout or named.rows) else task))
     found = read_config(folder) if resume else None
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")

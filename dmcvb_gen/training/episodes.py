@@ -52,6 +52,12 @@ def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndar
     return rows
 
 
+def _stands(task: Task) -> bool:
+    """Return True if a model's pose is a place and a posture, and the model stays the same in all episodes."""
+    free = task.model.njnt > 0 and task.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
+    return bool(free and not task.model_entries)
+
+
 def useless_setting(task: Task, settings: Any) -> str | None:
     """Say which setting has no meaning for a task, and the cure; None if all have one."""
     maze = is_maze(task.id)
@@ -59,7 +65,7 @@ def useless_setting(task: Task, settings: Any) -> str | None:
         "progress": (maze, "only for ant mazes"),
         "sunken_starts": (maze, "only for ant mazes"),
         "shaping": (maze or task.id == HINTED, f"only for {HINTED} and ant mazes"),
-        "standing_starts": (not maze, "not for ant mazes, which start at their own places"),
+        "standing_starts": (not maze and _stands(task), "only for bodies that move freely, such as humanoid's"),
     }
     for name, (fit, what) in fits.items():
         if getattr(settings, name, 0) and not fit:

@@ -13,16 +13,17 @@ import functools
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import copy_file
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import resolve_policies
-from dmcvb_gen.policies.header import WAY_SIZE
+from dmcvb_gen.policies.header import MAX_LAYERS, WAY_SIZE, Width
 from dmcvb_gen.policies.open_maze import places
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import is_maze
@@ -31,6 +32,7 @@ from dmcvb_gen.tasks.ant_maze.task import GOAL_NOISE
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 from dmcvb_gen.training.episodes import Episodes
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays, as_tensors
+from dmcvb_gen.training.row_files import check_rows
 from dmcvb_gen.training.runs import ProgressCallback, Report, Run
 from dmcvb_gen.training.sac import RowBuffer
 from dmcvb_gen.training.settings import Count, Natural, NonNegative, Positive, Share
@@ -80,8 +82,8 @@ class GuidedSettings:
     learning_rate: Positive = 1e-3
     ramp: Natural = 12_000
     half_life: Positive = 12_500
-    layers: Count = 3
-    width: Count = 256
+    layers: Annotated[Count, Field(le=MAX_LAYERS)] = 3
+    width: Width = 256
     updates_per_step: Positive = 0.06
     buffer_size: Count = 400_000
     ahead: NonNegative = AHEAD
@@ -253,6 +255,7 @@ class Student:
             raise DmcvbError(
                 f"{self.run.folder} was begun with another walking policy than the one here; choose another --out"
             )
+        check_rows(self.run.folder, self.buffer.found, **state["buffer"])
         self.way.load_state_dict(state["way"])
         self.optimizer.load_state_dict(state["optimizer"])
         for rng, saved in zip((self.rng, *self.noise), json.loads(state["rng"]), strict=True):

@@ -106,7 +106,7 @@ class Mpo(ReplayLearner):
             network.requires_grad_(False)
         # Softplus of these: they stay positive whatever the optimizer does.
         starts = (settings.initial_temperature, settings.initial_multiplier_mean, settings.initial_multiplier_std)
-        self.duals = nn.Parameter(torch.tensor([math.log(math.expm1(value)) for value in starts]))
+        self.duals = nn.Parameter(torch.tensor([value + math.log(-math.expm1(-value)) for value in starts]))
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=settings.learning_rate, fused=True)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.learning_rate, fused=True)
         self.dual_optimizer = torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 
@@ -31,11 +32,12 @@ def prunable_checkpoints(
 
     Args:
       curve: agent step -> return of the checkpoints that are there.
-      return_range: lowest and highest return an episode can have.
+      return_range: lowest and highest return an episode can have; if they are not known, those of the curve count.
     """
     if len(curve) <= limit:
         return []
-    low, high = return_range
+    low, high = return_range if all(map(math.isfinite, return_range)) else (min(curve.values()), max(curve.values()))
+    width = (high - low) or 1.0
     steps, best, level = sorted(curve), float("-inf"), defaultdict(int)
     keep, teeth = set(steps[-RECENT:]), set()
     for step in steps:
@@ -47,7 +49,7 @@ def prunable_checkpoints(
         if tooth not in teeth:
             teeth.add(tooth)
             keep.add(step)
-        place = int(BINS * (value - low) / (high - low))
+        place = int(BINS * (value - low) / width)
         if level[place] < PER_BIN:
             level[place] += 1
             keep.add(step)

@@ -7,10 +7,30 @@ from pathlib import Path
 
 import numpy as np
 
+from dmcvb_gen.errors import DmcvbError
+
 
 def rows_in(path: Path, shape: tuple[int, ...]) -> int:
     """Whole rows of `shape` that a file holds; 0 if there is none."""
     return path.stat().st_size // (4 * int(np.prod(shape))) if path.exists() else 0
+
+
+def check_rows(folder: Path, found: int, position: int, full: bool, rows: int) -> None:
+    """Refuse to resume a run whose replay buffer is gone: it would learn from zeros.
+
+    Args:
+      folder: the run's folder.
+      found: rows that the buffer's files held before they were opened.
+      position, full, rows: the buffer as it was saved.
+
+    Raises:
+      DmcvbError: the files hold fewer rows than were saved.
+    """
+    if found < (rows if full else position):
+        raise DmcvbError(
+            f"{folder} cannot be resumed: its replay buffer (resume/*.f32) is gone or cut; start again with another "
+            "--out"
+        )
 
 
 def map_rows(path: Path, rows: int, shape: tuple[int, ...]) -> np.memmap:

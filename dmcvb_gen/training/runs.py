@@ -41,7 +41,7 @@ from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.policies.policy_file import save_policy
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, MazeName
 from dmcvb_gen.state_file import STATE, pack_state, read_state
 from dmcvb_gen.tasks import get_task
@@ -125,6 +125,26 @@ def command_of(config: RunConfig) -> str:
     pairs = (f"{name}={json.dumps(value)}" for name, value in sorted(config.settings.items()))
     parts += [f"--set {shlex.quote(pair)}" for pair in pairs]
     return " ".join(parts)
+
+
+def policy_to_start_from(source: str | Path, header: PolicyHeader) -> Policy:
+    """The policy file that a run starts from.
+
+    Args:
+      header: of the run's own policies.
+
+    Raises:
+      DmcvbError: its network computes something else than the run's, though its weights may fit.
+    """
+    policy = load_policy(source)
+    for field in ("activation", "layer_norm", "way"):
+        theirs, ours = getattr(policy.header, field), getattr(header, field)
+        if theirs != ours:
+            raise DmcvbError(
+                f"--init-from {source}: its network has {field} {theirs} and that of {header.algorithm} {ours}, so it "
+                "would act otherwise; start from a policy of the same kind"
+            )
+    return policy
 
 
 def read_config(folder: str | Path) -> RunConfig | None:
@@ -369,7 +389,8 @@ class Run(abc.ABC):
     def resume_command(self) -> str:
         """The command line that resumes this run."""
         what = [self.config.task]
-        if (maze := MazeName.parse(self.config.task)) and maze.rows:  # its name is short, its rows are not
+        maze = MazeName.parse(self.config.task)
+        if maze and maze.rows and not maze.reward:  # the layout's name is short, its rows are not
             path = self.folder / f"{maze.layout}.txt"
             path.write_text(maze.rows.replace("/", "\n").replace(".", " ") + "\n")
             what = ["--layout", str(path)]

@@ -23,11 +23,11 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.policies.header import LOG_STD_RANGE
 from dmcvb_gen.state_file import STATE
 from dmcvb_gen.training.networks import Actor, as_tensors
-from dmcvb_gen.training.row_files import map_rows, rows_in
-from dmcvb_gen.training.runs import ProgressCallback, Report, Run, read_config
+from dmcvb_gen.training.row_files import check_rows, map_rows, rows_in
+from dmcvb_gen.training.runs import ProgressCallback, Report, Run, policy_to_start_from, read_config
 from dmcvb_gen.training.settings import OffPolicySettings
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
@@ -110,7 +110,7 @@ class Sb3Run(Run):
     def _train(self, saved: dict[str, Any] | None, report: Report, tick: ProgressCallback) -> None:
         config, settings = self.config, self.settings
         env, normalize, model = self._begin(saved is not None)
-        buffer = self._map_buffer(model) if isinstance(settings, OffPolicySettings) else None
+        buffer = self._map_buffer(model, saved) if isinstance(settings, OffPolicySettings) else None
         next_evaluation = config.evaluate_every
         if saved:
             self._restore(saved, model, env, normalize, buffer)
@@ -195,12 +195,15 @@ class Sb3Run(Run):
 
     # -- resuming ---------------------------------------------------------------------------
 
-    def _map_buffer(self, model: BaseAlgorithm) -> ReplayBuffer:
+    def _map_buffer(self, model: BaseAlgorithm, saved: dict[str, Any] | None) -> ReplayBuffer:
         """Put SB3's replay buffer into files, (rows, simulations, ...) float32 each."""
         buffer, folder = model.replay_buffer, self.folder / "resume"
         paths = {name: folder / f"{name}.f32" for name in BUFFER_ARRAYS}
         shapes = {name: getattr(buffer, name).shape[1:] for name in BUFFER_ARRAYS}
-        rows = max(buffer.buffer_size, min(rows_in(paths[name], shapes[name]) for name in BUFFER_ARRAYS))
+        found = min(rows_in(paths[name], shapes[name]) for name in BUFFER_ARRAYS)
+        if saved:
+            check_rows(self.folder, found, **saved["buffer"])
+        rows = max(buffer.buffer_size, found)
         for name in BUFFER_ARRAYS:
             setattr(buffer, name, map_rows(paths[name], rows, shapes[name])[:rows])
         buffer.buffer_size = rows
@@ -297,8 +300,11 @@ class Sb3Run(Run):
             elif statistics:
                 raise DmcvbError(unnormalized)
             return
-        weights = as_tensors(load_policy(source).weights)
-        fit(lambda: model.policy.load_state_dict({name: weights[ours] for ours, name in self._names().items()}, False))
+        weights = as_tensors(policy_to_start_from(source, self.header).weights)
+        names = self._names()
+        if "log_std_vector" in weights and weights["log_std_vector"].min() < LOG_STD_RANGE[0]:
+            names.pop("log_std_vector", None)  # it acts without noise, which PPO cannot learn from: SB3's own stays
+        fit(lambda: model.policy.load_state_dict({name: weights[ours] for ours, name in names.items()}, False))
         if hasattr(model, "actor_target"):  # TD3's targets ask it for actions
             model.actor_target.load_state_dict(model.actor.state_dict())
         if normalize and normalize.norm_obs:

@@ -4,13 +4,15 @@ Paper, section 3.1: expert is the first checkpoint with 95 % of the return at co
 mixed eight checkpoints evenly spaced, in training steps, from the start to medium. Mean actions are judged, as the data
 are made of them. Returns of mazes are negative, so an expert costs at most 1 / 0.95 of what the return at convergence
 does, and medium is the checkpoint whose mean return is nearest to the paper's row of its group (half of the way in a
-maze of one's own, which has no row); the paper has no mixed data of mazes.
+maze of one's own, which has no row); the paper has no mixed data of mazes. The way begins at 0, or, if returns may be
+negative, at the return of random actions.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,7 +29,9 @@ from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze, task_folder
+from dmcvb_gen.storage.remote import storage_errors
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.text import pluralize
 from dmcvb_gen.training.run_log import read_rows
 from dmcvb_gen.training.runs import read_config
@@ -45,7 +49,7 @@ CANDIDATES = 8
 MAZE_CHECKPOINTS = 2 * CANDIDATES
 """Checkpoints of a maze that are measured, about: near its expert's return and near its medium's."""
 BASE_EPISODES = 20
-"""Episodes of random actions in a maze, of which none finds its goal but by chance."""
+"""Episodes of random actions, which tell where returns start that may be negative."""
 COST_SLACK = 0.3
 """How much more (as a share) than an expert a maze's checkpoint may have cost on the way to be measured afresh: one
 stuck ant of twenty doubles what they cost."""
@@ -191,8 +195,7 @@ def pick_checkpoints(
     way, check = convergence.value - base, functools.cache(measure)
     curve = [point for point in curve if point[2] is not None]
     if not curve or not way > 0:
-        reason = convergence.reason or "the run has no evaluated checkpoint yet"
-        return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
+        return Selection(task, base, convergence, {}, dict.fromkeys(levels, _nothing(curve, base, convergence)))
     found: dict[str, tuple[Pick, ...] | str] = {}
     if costs and convergence.value < 0:  # 95 % of the way from a random policy's return costs half again as much
         goal = convergence.value / EXPERT_SHARE
@@ -213,6 +216,16 @@ def pick_checkpoints(
             found["mixed"] = _mixed(before, found["medium"][0].step, check)
     picks = {level: picked for level, picked in found.items() if not isinstance(picked, str)}
     return Selection(task, base, convergence, picks, {level: why for level, why in found.items() if level not in picks})
+
+
+def _nothing(curve: Sequence[Point], base: float, convergence: Convergence) -> str:
+    """Why no level at all can be picked."""
+    if not curve:
+        return "the run has no evaluated checkpoint yet"
+    return convergence.reason or (
+        f"--converged {convergence.value:g} is not above where the return started ({base:.1f}); give the return of the "
+        "longer run"
+    )
 
 
 def _expert(curve: Sequence[Point], goal: float, slack: float, check: Callable) -> tuple[Pick, ...] | str:
@@ -277,6 +290,7 @@ def select_checkpoints(
 
     Raises:
       DmcvbError: the folder holds no run.
+      StoreError: it cannot be written to.
     """
     folder = Path(folder)
     curve = read_curve(folder)
@@ -285,7 +299,8 @@ def select_checkpoints(
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(files[0]).task)
     mazes = is_maze(task.id)
-    base = evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed)[0].mean if mazes else 0.0
+    _make_place(folder)
+    base = _base(task, episodes, seed)
     measured: dict[Path, tuple[Policy, Evaluation]] = {}
 
     def measure(path: Path) -> Evaluation:
@@ -314,19 +329,35 @@ def select_checkpoints(
             if attempt == 4 or set(before) <= set(files):
                 raise
     expect(progress, len(measured))
-    _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})
+    with storage_errors(folder, "write to"):
+        _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})
+    plot_selection(curve, selection, folder / "curve.png")
     return selection
 
 
+def _make_place(folder: Path) -> None:
+    """Make the folder of the picks, and refuse one that cannot be written to before hours are spent on measuring."""
+    place = folder / "selected"
+    with storage_errors(place, "write to"):
+        place.mkdir(exist_ok=True)
+        tempfile.TemporaryFile(dir=place).close()
+
+
+def _base(task: Task, episodes: int, seed: int) -> float:
+    """Return at 0 % of the way: that of random actions where returns may be negative, else 0."""
+    if task.return_range[0] >= 0:
+        return 0.0
+    return evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed)[0].mean
+
+
 def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:
-    """Write the picks, selection.json and curve.png into a run's folder."""
+    """Write the picks and selection.json into a run's folder."""
     for level, picks in selection.picks.items():
         for pick in picks:
             policy = policies[pick.path]
             header = selected_header(policy.header, level, pick, selection.convergence, curve)
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
     write_json_atomically(folder / "selection.json", selection_json(selection))
-    plot_selection(curve, selection, folder / "curve.png")
 
 
 def selected_header(
@@ -417,4 +448,5 @@ def _curve_figure(curve: Sequence[Point], task: str, path: Path) -> Iterator[Axe
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    with storage_errors(path, "write to"):
+        figure.savefig(path, dpi=110)

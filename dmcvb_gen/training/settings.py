@@ -13,6 +13,7 @@ import pydantic
 from pydantic import Field
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.policies.header import MAX_LAYERS, Width
 
 Count = Annotated[int, Field(gt=0)]
 Natural = Annotated[int, Field(ge=0)]
@@ -20,6 +21,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
+Hidden = Annotated[tuple[Width, ...], Field(max_length=MAX_LAYERS)]
+"""Widths of hidden layers, as many and as large as a policy file may have."""
 
 ALGORITHMS = {
     "sac": "dmcvb_gen.training.sac:SacSettings",
@@ -66,8 +69,8 @@ class ReplaySettings:
     warmup_steps: Natural = 5000
     buffer_size: Count = 1_000_000
     batch_size: Count = 256
-    actor_hidden: tuple[Count, ...] = (256, 256)
-    critic_hidden: tuple[Count, ...] = (256, 256)
+    actor_hidden: Hidden = (256, 256)
+    critic_hidden: Annotated[Hidden, Field(min_length=1)] = (256, 256)
     critics: Count = 2
     learning_rate: Positive = 1e-3
     discount: Decay = 0.99
@@ -95,7 +98,7 @@ class Sb3Settings:
     """
 
     simulations: Count = 8
-    hidden: tuple[Count, ...] = (256, 256)
+    hidden: Hidden = (256, 256)
     learning_rate: Positive = 1e-3
     gamma: Decay = 0.99
     batch_size: Count = 256
@@ -181,7 +184,7 @@ class PpoSettings(Sb3Settings):
     """
 
     simulations: Count = 64
-    hidden: tuple[Count, ...] = (256, 256)
+    hidden: Hidden = (256, 256)
     learning_rate: Positive = 3e-4
     batch_size: Count = 512
     normalize_observation: bool = True

@@ -18,12 +18,12 @@ import numpy as np
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.state_file import STATE, read_state
 from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import Episodes, shaping_of, useless_setting
 from dmcvb_gen.training.networks import as_tensors
+from dmcvb_gen.training.row_files import check_rows
 from dmcvb_gen.training.runs import (
     Progress,
     ProgressCallback,
@@ -32,6 +32,7 @@ from dmcvb_gen.training.runs import (
     RunConfig,
     check_same,
     command_of,
+    policy_to_start_from,
     read_config,
 )
 from dmcvb_gen.training.sac import ReplayBuffer, ReplayLearner, Sac
@@ -116,14 +117,15 @@ class ReplayLoop:
         if saved:
             place = saved["buffer"]
             kept = {"owed", "episodes", "rng", "next_evaluation"} <= saved.keys() and "size" in place
-            if not kept or self.buffer.found < min(place["size"], rows):
+            if not kept:
                 raise DmcvbError(f"{run.folder} was trained by an earlier version; start again in another --out")
+            check_rows(run.folder, self.buffer.found, place["position"], place["full"], min(place["size"], rows))
             _fit(f"{run.folder} cannot be resumed", self.learner.load_state, saved["learner"])
             self.buffer.restore(place["position"], place["full"], place["size"])
             self.rng.bit_generator.state = json.loads(saved["rng"])
             self._owed = saved["owed"]
         elif config.init_from:
-            _start_from(self.learner, config.algorithm, config.init_from)
+            _start_from(self.learner, run, config.init_from)
         self.episodes = Episodes(run, self.rng)
         self._shaping = shaping_of(task) if settings.shaping else None
         if saved:
@@ -199,9 +201,9 @@ def _fit(what: str, load: Callable[[Any], None], state: Any) -> None:
         raise DmcvbError(f"{what}: its networks do not fit these settings and task ({reason})") from None
 
 
-def _start_from(learner: ReplayLearner, algorithm: str, source: str) -> None:
+def _start_from(learner: ReplayLearner, run: ReplayRun, source: str) -> None:
     """Take networks and normalization from another run, or the actor alone from a policy file."""
-    path = Path(source)
+    path, algorithm = Path(source), run.config.algorithm
     if path.is_dir():
         config = read_config(path)
         saved = read_state(path) if config and config.algorithm == algorithm else None
@@ -211,7 +213,7 @@ def _start_from(learner: ReplayLearner, algorithm: str, source: str) -> None:
             )
         _fit(f"--init-from {source}", learner.load_networks, saved["learner"])
         return
-    _fit(f"--init-from {source}", learner.load_actor, as_tensors(load_policy(path).weights))
+    _fit(f"--init-from {source}", learner.load_actor, as_tensors(policy_to_start_from(source, run.header).weights))
     learner.norm.mean = learner.actor.observation_mean.numpy().astype(float)
     learner.norm.count = 1e5
     learner.norm.m2 = learner.actor.observation_std.numpy().astype(float) ** 2 * learner.norm.count
@@ -255,7 +257,10 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
     begun = found is not None and (folder / "resume" / STATE).exists()  # never reads again what it started from
     if config.init_from and not begun and not Path(config.init_from).is_file() and not read_config(config.init_from):
         raise DmcvbError(f"--init-from {config.init_from} is neither a run folder nor a policy file")
-    config = dataclasses.replace(config, init_sha256=found.init_sha256 if found else _digest(config.init_from))
+    digest = _digest(config.init_from)
+    if found and not begun and digest and found.init_sha256 not in (None, digest):
+        raise DmcvbError(f"{config.init_from} is no longer the file that {folder} began with; choose another --out")
+    config = dataclasses.replace(config, init_sha256=found.init_sha256 if found else digest)
     run = run_class(config.algorithm)(folder, config)
     if problem := useless_setting(run.task, run.settings):
         raise DmcvbError(problem)
@@ -267,7 +272,7 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
     if problem := run.problem():
         raise DmcvbError(problem)
     if config.init_from and not begun and isinstance(run, ReplayRun):
-        _start_from(run.learner(), config.algorithm, config.init_from)  # refused before anything is written
+        _start_from(run.learner(), run, config.init_from)  # refused before anything is written
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(folder).free < 1e9:

@@ -139,6 +139,14 @@ def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
     assert str(tmp_path / "other") in begun[0]
 
 
+def two_rings(folder):
+    """Two layouts of one name."""
+    for name, row in (("a", "*   *"), ("b", "* * *")):
+        (folder / name).mkdir()
+        (folder / name / "ring.txt").write_text(f"*****\n*   *\n{row}\n*   *\n*****\n")
+    return [folder / "a/ring.txt", folder / "b/ring.txt"]
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -174,6 +182,21 @@ def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
         (lambda out: dmcvb_gen.rollout("walker-walk", episode_range="0:1", out=out), "^episode_range is '0:1'; give"),
         (lambda out: dmcvb_gen.rollout("walker-walk", part=(0, 2), out=out), r"^part is \(0, 2\); give \(K, N\)"),
         (lambda out: dmcvb_gen.rollout("walker-walk", scratch_size=0, out=out), "^scratch_size is 0; give a whole"),
+        (
+            lambda out: dmcvb_gen.rollout("walker-walk", workers=-3, out=out),
+            "^workers is -3; give a whole number of at",
+        ),
+        (lambda out: dmcvb_gen.rollout("walker-walk", workers=0, out=out), "^workers is 0; give a whole number of at"),
+        (lambda out: dmcvb_gen.rollout(None, out=out), "recipe"),
+        (lambda out: dmcvb_gen.rollout("walker-walk", behaviour="", out=out), "behaviour is empty; leave it out"),
+        (
+            lambda out: dmcvb_gen.rollout(layouts=two_rings(out.parent), out=out),
+            "two mazes are called ant-maze-ring; re",
+        ),
+        (
+            lambda out: dmcvb_gen.evaluate_behaviour("ant-maze-empty7x7", levels="random", pictures="s3://bucket/x"),
+            "is a URL; give a local one",
+        ),
         (lambda out: dmcvb_gen.verify(None), "^release is None; give a folder or a URL$"),
         (lambda out: dmcvb_gen.repaint(out, out=None), "^out is None; give a folder$"),
         (lambda out: dmcvb_gen.fetch(None, out), "^url is None; give text$"),

@@ -18,11 +18,14 @@ from stable_baselines3 import PPO, SAC, TD3
 from torch import nn
 
 from dmcvb_gen.cli import main
+from dmcvb_gen.cli.behaviours import _show_returns
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate import engine
+from dmcvb_gen.generate.returns import evaluate_behaviour
 from dmcvb_gen.own_code import BEHAVIOURS, allow, find_function
 from dmcvb_gen.own_code import TASKS as TASKS_VARIABLE
+from dmcvb_gen.policies.bundled import bundled_policies, level_files, resolve_policies
 from dmcvb_gen.policies.convert import convert
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.release.card import write_card
@@ -310,3 +313,124 @@ def test_policies_that_do_not_fit_are_refused_in_one_line(tmp_path):
     (tmp_path / "text.zip").write_text("no zip")
     assert "without running code" in refused("convert-policy", tmp_path / "text.zip", WALKER, "--out", out)
     assert "cannot read" in refused("convert-policy", tmp_path / "no.pt", WALKER, "--out", out)
+
+
+# -- what is refused leaves the files as they are -------------------------------------------------
+
+
+@pytest.fixture
+def plain(tmp_path):
+    """A state dict of a plain network for walker-walk, and the arguments that convert it."""
+    task = get_task(WALKER)
+    torch.manual_seed(0)
+    torch.save(mlp(task.behaviour_size, 8, task.action_size).state_dict(), tmp_path / "plain.pt")
+    return ["convert-policy", tmp_path / "plain.pt", WALKER, "--activation", "tanh", "--actions", "tanh"]
+
+
+def statistics(folder, **changes):
+    """A file of statistics for walker-walk, some of its arrays changed."""
+    size = get_task(WALKER).behaviour_size
+    np.savez(folder / "seen.npz", **({"mean": np.zeros(size), "std": np.ones(size)} | changes))
+    return folder / "seen.npz"
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, 1e-60, 1e60])
+def test_statistics_that_no_policy_could_use_are_refused_before_anything_is_written(plain, value, tmp_path):
+    out = tmp_path / "p.safetensors"
+    done(*plain, "--out", out)
+    good, std = out.read_bytes(), np.ones(get_task(WALKER).behaviour_size)
+    std[3] = value
+    line = refused(*plain, "--statistics", statistics(tmp_path, std=std), "--out", out)
+    assert f"{tmp_path / 'seen.npz'} has mean 0 and std" in line and "of observation 3; write finite numbers" in line
+    assert out.read_bytes() == good
+
+
+@pytest.mark.parametrize("name, value", [("2.bias", float("nan")), ("0.weight", float("inf"))])
+def test_weights_that_are_not_finite_are_refused_before_anything_is_written(plain, name, value, tmp_path):
+    out = tmp_path / "p.safetensors"
+    done(*plain, "--out", out)
+    good, state = out.read_bytes(), torch.load(tmp_path / "plain.pt")
+    state[name].view(-1)[0] = value
+    torch.save(state, tmp_path / "plain.pt")
+    line = refused(*plain, "--out", out)
+    assert f"{tmp_path / 'plain.pt'}: " in line and "not finite; its training diverged" in line
+    state[name] = torch.zeros(3, 3)
+    torch.save(state, tmp_path / "plain.pt")
+    refused(*plain, "--out", out)
+    assert out.read_bytes() == good
+
+
+def test_layers_that_do_not_fit_each_other_are_refused_before_anything_is_written(plain, tmp_path):
+    task, out = get_task(WALKER), tmp_path / "p.safetensors"
+    done(*plain, "--out", out)
+    good = out.read_bytes()
+    first, second = nn.Linear(task.behaviour_size, 8), nn.Linear(9, task.action_size)
+    torch.save(nn.Sequential(first, nn.Tanh(), second).state_dict(), tmp_path / "plain.pt")
+    assert "mean.weight has shape (6, 9), the layers beside it ask for (6, 8)" in refused(*plain, "--out", out)
+    torch.save(mlp(task.behaviour_size, *[2] * 17, task.action_size).state_dict(), tmp_path / "plain.pt")
+    assert "hidden: Tuple should have at most 16 items" in refused(*plain, "--out", out)
+    assert out.read_bytes() == good
+
+
+def test_files_that_are_no_statistics_are_told_in_one_line(plain, tmp_path):
+    out, whole = tmp_path / "p.safetensors", statistics(tmp_path)
+    np.save(tmp_path / "mean.npy", np.zeros(get_task(WALKER).behaviour_size))
+    (tmp_path / "cut.npz").write_bytes(whole.read_bytes()[:200])
+    (tmp_path / "empty.npz").write_bytes(b"")
+    damaged = bytearray(whole.read_bytes())
+    damaged[150] ^= 255
+    (tmp_path / "damaged.npz").write_bytes(damaged)
+    for name in ("mean.npy", "cut.npz", "empty.npz", "damaged.npz", "none.npz"):
+        line = refused(*plain, "--statistics", tmp_path / name, "--out", out)
+        assert f'{tmp_path / name} has no "mean" and "std" of 24 observations' in line
+    assert not out.exists()
+
+
+def test_a_place_that_cannot_be_written_to_is_told_in_one_line(plain, tmp_path):
+    line = refused(*plain, "--out", tmp_path / "plain.pt" / "x.safetensors")
+    assert "cannot write to" in line and "choose a place that you may write to" in line
+    (tmp_path / "folder.safetensors").mkdir()
+    assert "cannot write to" in refused(*plain, "--out", tmp_path / "folder.safetensors")
+
+
+@pytest.mark.parametrize("ending", [".pt", ".pth", ".zip"])
+def test_a_policy_file_never_ends_as_other_programs_files_do(plain, ending, tmp_path):
+    before = (tmp_path / "plain.pt").read_bytes()
+    line = refused(*plain, "--out", tmp_path / f"plain{ending}")
+    assert f"plain{ending} for another program's file; end its name in .safetensors" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["plain.pt"] and (tmp_path / "plain.pt").read_bytes() == before
+
+
+def test_actions_of_a_program_that_is_known_are_not_asked_for(tmp_path):
+    task, out = get_task(WALKER), tmp_path / "p.safetensors"
+    torch.save(CleanRlPpo(task.behaviour_size, task.action_size).state_dict(), tmp_path / "actor.pt")
+    line = refused("convert-policy", tmp_path / "actor.pt", WALKER, "--actions", "tanh", "--out", out)
+    assert "--actions has no effect" in line and "an actor of CleanRL" in line and not out.exists()
+
+
+# -- files of levels ------------------------------------------------------------------------------
+
+
+def test_mixed_policies_are_the_numbered_files_alone(tmp_path):
+    for name in ("mixed_10", "mixed_2", "mixed_final", "mixed_2b", "mixed_"):
+        (tmp_path / f"{name}.safetensors").write_bytes(b"")
+    assert [path.stem for path in level_files(tmp_path, "mixed")] == ["mixed_2", "mixed_10"]
+    for name in ("mixed_10", "mixed_2"):
+        (tmp_path / f"{name}.safetensors").unlink()
+    with pytest.raises(DmcvbError, match=r"no numbered mixed policy, only mixed_.*; name its files mixed_0.safet"):
+        resolve_policies(WALKER, "mixed", tmp_path)
+    line = refused("evaluate-behaviour", WALKER, "--level", "mixed", "--behaviour", tmp_path)
+    assert "no numbered mixed policy" in line
+
+
+# -- returns --------------------------------------------------------------------------------------
+
+
+def test_random_actions_are_drawn_and_their_rows_say_so(capsys):
+    (file,) = bundled_policies(WALKER, "medium")
+    rows = evaluate_behaviour(behaviour=file, levels=["random", "medium"], episodes=2)
+    assert [(row["level"], row["mode"]) for row in rows] == [("random", "sampled"), ("medium", "mean")]
+    _show_returns(rows, 2, 1)
+    assert "2 episodes each, seed 1, mean actions" in capsys.readouterr().out
+    _show_returns(rows[:1], 2, 1)
+    assert "2 episodes each, seed 1, random actions" in capsys.readouterr().out

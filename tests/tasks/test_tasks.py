@@ -12,11 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.own_code import TASKS as ALLOWED
 from dmcvb_gen.own_code import allow
+from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, REGISTRY, get_task, register_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
 from dmcvb_gen.tasks.suite import REFUSED, SuiteTask
+from tests.conftest import roll_out
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
 """Largest difference of an observation; physics states are always equal. Humanoid's limb positions are one matrix
@@ -270,12 +273,46 @@ def test_a_task_of_ones_own_that_fails_in_an_episode_is_told_in_one_line(tmp_pat
             batch.step(np.zeros((2, 1)))
 
 
+GOAL = (
+    "ARM = "
+    + repr(ARM.replace('pos="0 -2 1"', 'pos="0 -2 1" xyaxes="1 0 0 0 .4 1"'))
+    + """
+from dm_control.rl import control
+from dm_control.suite import base
+from dm_control import mujoco
+class Reach(base.Task):
+    def initialize_episode(self, physics):
+        self._goal = self.random.uniform(-1, 1)
+    def get_observation(self, physics):
+        return {"position": physics.data.qpos.copy(), "goal": [self._goal]}
+    def get_reward(self, physics):
+        return -abs(physics.data.qpos[0] - self._goal)
+def reach():
+    return control.Environment(mujoco.Physics.from_xml_string(ARM), Reach(), time_limit=0.4)
+"""
+)
+
+
+def test_what_a_task_keeps_in_python_alone_is_not_taken_for_damage(tmp_path, monkeypatch):
+    ten_lines(tmp_path, monkeypatch, GOAL)
+    monkeypatch.setenv(ALLOWED, "arm_tasks:reach")
+    assert get_task("arm_tasks:reach").unstored_fields == ("goal",)
+    assert get_task("reacher-easy").unstored_fields == ()  # its target lies in the model
+    pattern = {"tasks": "arm_tasks:reach", "levels": "random", "settings": "none", "episodes": 2}
+    roll_out(make_recipe({"name": "r", "size": 16, "subsets": [pattern]}), tmp_path / "r")
+    assert verify(tmp_path / "r").sound
+
+
 def test_a_third_party_registers_a_task():
     register_task("cartpole-mine", lambda: SuiteTask("cartpole-mine", lambda: suite.load("cartpole", "balance")))
     try:
         assert get_task("cartpole-mine").state_size == 5
         with pytest.raises(DmcvbError, match="there is a task 'cartpole-mine' already"):
             register_task("cartpole-mine", lambda: None)
+        get_task.cache_clear()
+        REGISTRY["cartpole-mine"] = lambda: 3
+        with pytest.raises(DmcvbError, match="task cartpole-mine is a int; register a function that returns a Task"):
+            get_task("cartpole-mine")
     finally:
         REGISTRY.pop("cartpole-mine")
         get_task.cache_clear()

@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
@@ -29,7 +30,7 @@ from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.training.run_log import COLUMNS, read_rows
 from dmcvb_gen.training.runs import RunConfig, Stopped
 from dmcvb_gen.training.sac import ReplayBuffer
-from dmcvb_gen.training.training import open_run
+from dmcvb_gen.training.training import SacRun, open_run
 
 torch.set_num_threads(1)
 TINY = {
@@ -360,6 +361,28 @@ def test_a_run_that_is_made_shorter_says_so(tmp_path):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"steps": 400}))
     train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=200, progress=False, notify=said.append)
     assert said == ["The run ends at step 200 now, not at 400."]
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "guided", "td3"])
+def test_a_run_whose_replay_buffer_is_gone_or_cut_does_not_learn_from_zeros(tmp_path, algorithm):
+    train(tmp_path / "run", algorithm=algorithm)
+    paths = sorted((tmp_path / "run" / "resume").glob("*.f32"))
+    kept = paths[0].read_bytes()
+    for content in (kept[:64], None):
+        paths[0].unlink() if content is None else paths[0].write_bytes(content)
+        with pytest.raises(DmcvbError, match="its replay buffer .* is gone or cut; start again with another --out"):
+            train(tmp_path / "run", resume=True, algorithm=algorithm, steps=200)
+    paths[0].write_bytes(kept)
+    assert train(tmp_path / "run", resume=True, algorithm=algorithm, steps=200).step >= 200
+
+
+def test_the_command_of_a_maze_with_a_reward_of_its_own_names_all_of_it(tmp_path):
+    """A layout's file says nothing of the reward."""
+    task = "ant-maze-hall:****/*..*/****"
+    for name, words in ((task, "--layout"), (f"{task}@geodesic", f"'{task}@geodesic'")):
+        (tmp_path / "run").mkdir(exist_ok=True)
+        command = SacRun(tmp_path / "run", config(task=name)).resume_command()
+        assert words in command and shlex.split(command)[2] in ("--layout", name)
 
 
 def test_a_run_of_which_nothing_is_saved_yet_begins_at_step_0_and_says_so(tmp_path):

@@ -70,6 +70,20 @@ def test_an_exported_policy_acts_as_the_model_it_comes_from(tmp_path, models, al
     assert policy.header.algorithm == algorithm and policy.header.evaluation.episodes >= 1
 
 
+def test_ppo_starts_from_a_network_that_acts_without_noise_with_a_noise_of_its_own(tmp_path, models):
+    """Converted plain networks have a log standard deviation of -80, from which PPO would get NaN."""
+    first = train(tmp_path / "first", "ppo")
+    policy = load_policy(first.folder / "checkpoints" / "0000000080.safetensors")
+    arrays = dict(policy.weights) | {"log_std_vector": np.full(6, -80, np.float32)}
+    save_policy(tmp_path / "plain.safetensors", policy.header, arrays)
+    train(tmp_path / "second", "ppo", init_from=str(tmp_path / "plain.safetensors"))
+    assert (models[-1].policy.log_std.detach() > -5).all()
+    other = policy.header.model_copy(update={"activation": "relu"})
+    save_policy(tmp_path / "relu.safetensors", other, dict(policy.weights))
+    with pytest.raises(DmcvbError, match="activation relu and that of ppo tanh"):
+        train(tmp_path / "third", "ppo", init_from=str(tmp_path / "relu.safetensors"))
+
+
 @pytest.mark.parametrize("algorithm", ["tqc", "ppo"])
 def test_a_warm_start_takes_the_networks_of_a_run_or_a_policy(tmp_path, models, monkeypatch, algorithm):
     first = train(tmp_path / "first", algorithm)

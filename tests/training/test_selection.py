@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +13,20 @@ import torch
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.own_code import TASKS, allow
 from dmcvb_gen.policies.bundled import level_files
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import read_header, save_policy
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS as MAZE_LEVELS
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.pruning import LIMIT, prunable_checkpoints
 from dmcvb_gen.training.run_log import COLUMNS
 from dmcvb_gen.training.selection import (
     MIXED_COUNT,
+    Convergence,
     converge,
     pick_checkpoints,
     read_curve,
@@ -312,3 +317,92 @@ def test_mazes_have_no_mixed_level():
     # A maze of one's own has no row in the paper: its expert is a maze's all the same, its medium at half of the way.
     assert found.picks["expert"][0].target == f"return {convergence.value / 0.95:.1f}"
     assert found.picks["medium"][0].target == f"return {(convergence.value - 450) / 2:.1f}"
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_anything_is_measured(run_folder):
+    (run_folder / "selected").write_text("in the way")
+    measured = []
+    with pytest.raises(StoreError, match=r"cannot write to .*selected: .*; choose a place that you may write to"):
+        select_checkpoints(run_folder, episodes=2, progress=measured.append)
+    assert measured == []
+    (run_folder / "selected").unlink()
+    (run_folder / "curve.png").mkdir()  # what comes up at the end is one line, too
+    with pytest.raises(StoreError, match=r"cannot write to .*curve\.png: "):
+        select_checkpoints(run_folder, episodes=2, converged=-1.0)  # nothing is above that, so nothing is measured
+
+
+def test_a_run_without_checkpoints_is_told_from_a_return_that_is_too_low(run_folder):
+    found = select_checkpoints(run_folder, episodes=2, converged=-1.0)
+    assert not found.picks
+    assert "--converged -1 is not above where the return started (0.0)" in found.reasons["expert"]
+    none = pick_checkpoints([], 0.0, Convergence(6.0, 0.1, True), pytest.fail)
+    assert "no evaluated checkpoint yet" in none.reasons["expert"]
+
+
+COSTS = """
+from dmcvb_gen.tasks.own import mjcf_environment
+
+XML = '''<mujoco><worldbody><light pos="0 0 3"/><camera name="side" pos="0 -2 1"/>
+<body pos="0 0 .8"><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body>
+</worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>'''
+
+def push():
+    with open("arm.xml", "w") as file:
+        file.write(XML)
+    return mjcf_environment("arm.xml", cost, time_limit=0.2, control_timestep=0.02)
+
+def cost(physics):
+    return -(1 - physics.data.ctrl[0]) ** 2
+"""
+"""A task whose every one of ten control steps costs up to 4: the less, the nearer the action is to 1."""
+
+
+@pytest.fixture
+def cost_task(tmp_path, monkeypatch):
+    """Name of a task of one's own with costs, which nobody has let run yet."""
+    name = f"costs_{hashlib.sha256(str(tmp_path).encode()).hexdigest()[:8]}"
+    (tmp_path / f"{name}.py").write_text(COSTS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(TASKS, "")
+    return f"{name}:push"
+
+
+def test_costs_of_an_own_task_count_from_random_actions(cost_task, tmp_path):
+    allow([cost_task])
+    size = get_task(cost_task).behaviour_size
+    header = PolicyHeader(
+        task=cost_task, observation_size=size, action_size=1, algorithm="sac", agent_step=0, hidden=(),
+        distribution="deterministic",
+    )  # fmt: skip
+    for step, value in zip(STEPS, rising(top=-0.01, base=-36.0), strict=True):
+        bias = np.arctanh(1 - np.sqrt(-value / 10))
+        evaluation = Evaluation(mean=float(value), std=0.0, episodes=20, mode="mean", seed=0)
+        save_policy(
+            tmp_path / "checkpoints" / f"{step:010d}.safetensors",
+            header.model_copy(update=dict(agent_step=int(step), evaluation=evaluation)),
+            {
+                "mean.weight": np.zeros((1, size)),
+                "mean.bias": np.array([bias]),
+                "observation_mean": np.zeros(size),
+                "observation_std": np.ones(size),
+            },
+        )
+    found = select_checkpoints(tmp_path, episodes=4)
+    assert not found.reasons and -30 < found.base < -5
+    assert found.picks["expert"][0].evaluation.mean >= 0.05 * found.base - 0.1
+    assert found.picks["medium"][0].evaluation.mean == pytest.approx(found.base / 2, rel=0.2)
+
+
+def test_the_command_after_the_training_of_an_own_task_can_be_run_as_it_is(cost_task, monkeypatch):
+    cut = {"warmup_steps": 10, "simulations": 2, "batch_size": 4, "compile": False, "bfloat16": False}
+    words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]
+    trained = CliRunner().invoke(main, ["train-behaviour", cost_task, "--steps", "12", "--out", "run", *words])
+    assert trained.exit_code == 0, trained.output
+    [line] = [line for line in trained.output.splitlines() if line.startswith("Next: ")]
+    leave, program, *arguments = shlex.split(line.removeprefix("Next: "))
+    assert (leave, program) == (f"{TASKS}={cost_task}", "dmcvb-gen")
+    get_task.cache_clear()  # as in a new process
+    monkeypatch.setenv(TASKS, leave.removeprefix(f"{TASKS}="))
+    selected = CliRunner().invoke(main, [*arguments, "--episodes", "2"])
+    assert selected.exit_code == 1 and "at least 8 are needed" in selected.output, selected.output

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, LayoutError
 from dmcvb_gen.spec import REWARDS
 from dmcvb_gen.tasks.ant_maze.arena import GOAL_RADIUS
 from dmcvb_gen.tasks.ant_maze.distance import center_pixel, descend, floor_pixels, geodesic_field, make_field
@@ -23,6 +23,28 @@ def farthest_cells(layout: Layout) -> tuple[tuple[int, int], tuple[int, int]]:
             if value > best:
                 best, pair = value, (start, goal)
     return pair
+
+
+def farthest_from(layout: Layout, cell: tuple[int, int]) -> tuple[int, int]:
+    """The floor cell with the longest shortest path from a floor cell, which is as long the other way."""
+    field = geodesic_field(layout, layout.world(cell))
+    return max(layout.free, key=lambda other: field.values[center_pixel(other)])
+
+
+def _start_and_goal(
+    layout: Layout, start: tuple[int, int] | None, goal: tuple[int, int] | None
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The cells that are given, and for one that is not the farthest from the other."""
+    for cell, what in ((start, "start"), (goal, "goal")):
+        if cell is not None:
+            layout.check_cell(cell, what)
+    if start is not None and start == goal:
+        raise LayoutError(f"start and goal are both {start}; give two floor cells, or one for the farthest from it")
+    if start is not None:
+        return start, goal or farthest_from(layout, start)
+    if goal is not None:
+        return farthest_from(layout, goal), goal
+    return farthest_cells(layout)
 
 
 def save_paths_picture(layout: Layout, panels: dict[str, list[tuple[np.ndarray, np.ndarray]]], out: str | Path) -> None:
@@ -70,21 +92,18 @@ def save_maze_picture(
     """Write a PNG of a layout with the distance field of each reward to a goal, and the path down it.
 
     Args:
-      start, goal: (row, column) cells; the farthest pair by default.
+      start, goal: (row, column) cells; the farthest from the other by default, without both the farthest pair.
 
     Returns:
       start, goal, length of the shortest path (m) and largest distance (m).
 
     Raises:
-      LayoutError: a start or a goal in a wall.
+      LayoutError: a start or a goal in a wall, or both the same.
       DmcvbError: the file cannot be written.
     """
     from matplotlib.figure import Figure
 
-    far_start, far_goal = farthest_cells(layout)
-    start, goal = start or far_start, goal or far_goal
-    layout.check_cell(start, "start")
-    layout.check_cell(goal, "goal")
+    start, goal = _start_and_goal(layout, start, goal)
     rows, columns = layout.shape
     extent = (-columns * CELL / 2, columns * CELL / 2, -rows * CELL / 2, rows * CELL / 2)
     floor, _ = floor_pixels(layout)
