@@ -84,8 +84,8 @@ def _cures(path, places):
 def regenerate(release, out, as_json, **options):
     """Make a release's shards again from its manifest alone, bit for bit.
 
-    Without --check and --out it repairs damaged and missing shards in place. If only a part was fetched, it repairs
-    that part. Exit code 1 if a shard comes out different: the command then says what differs in the environment, and
+    Without --check and --out it repairs damaged and missing shards in place. If only a part is here, it repairs that
+    part. Exit code 1 if a shard comes out different: the command then says what differs in the environment, and
     how far the values are apart. With --check, exit code 3 if all shards here match, but some shards are missing.
 
     \b

@@ -64,6 +64,8 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     request, workers = request_of(options), options["workers"]
     if slurm_script:
         check_place(options["out"] or "")
+        if not request and target_for(options, request).manifest() is None:
+            raise click.UsageError(f"{options['out']} holds no release to go on with; give TASKs or --recipe.")
         if request:
             describe(request, pixels=options["pixels"])  # or says why each task would be refused; this needs no GPU
         return click.echo(script_for_slurm(slurm_script, workers), nl=False)
@@ -79,6 +81,7 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     if request:
         _tell_what_is_asked(request, options)
     _tell_what_is_there(plan, shared=dry_run or init or bool(options["part"]))
+    _tell_what_stays(plan, options)
     if dry_run:
         return _show_plan(plan, workers, as_json)
     plan = prepare_rollout(plan, options, init, lambda line: click.echo(line, err=True))
@@ -113,10 +116,22 @@ def _tell_what_is_there(plan, shared):
         click.echo(f"{plan.target.place} holds {there.name} {there.version} already; this adds {added}.", err=True)
     if not shared and (others := rollouts_at_work(plan.target)):
         click.echo(
-            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both make the same shards. "
-            "To share the work, stop one and give --part 1/2 and --part 2/2.",
+            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both may make the same "
+            "shards. To share work, stop one and give --part 1/2 and --part 2/2.",
             err=True,
         )
+
+
+def _tell_what_stays(plan, options):
+    """Notes on how new episodes of subsets that are there are stored, if it is not as the options say."""
+    there, asked = plan.target.manifest() if plan.jobs else None, {record.name for record in plan.manifest.subsets}
+    records = [record for record in there.subsets if record.name in asked] if there else []
+    if records and not options["pixels"] and any(record.pixels for record in records):
+        click.echo(f"{plan.target.place} has images, so its new episodes get images, too.", err=True)
+    given = options["episodes_per_shard"]
+    for record in [record for record in records if given and given > record.episodes_per_shard][:1]:
+        kept = pluralize(record.episodes_per_shard, "episodes")
+        click.echo(f"{record.name} keeps its shards of {kept}.", err=True)
 
 
 def _tell_begun(plan, as_json):
@@ -151,13 +166,13 @@ def _run(plan, workers, as_json, whole=True):
     facts = dict(out=place, complete=manifest.complete, steps=steps, seconds=round(made.seconds, 2))
     facts |= dict(seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()})
     facts |= dict(already_done=plan.done, digests={subset.name: subset.digest for subset in manifest.subsets})
-    state = "complete" if manifest.complete else "not complete yet (only a part was asked for)"
+    named = shlex.quote(str(place))
+    state = "complete" if manifest.complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
     if not whole:
         state = "finished with --finish when all parts are there"
     kept = f", {pluralize(plan.done, 'shards')} there already" if plan.done else ""
     rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
     done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}."
-    named = shlex.quote(str(place))
     painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
     look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else "")
     answer(as_json, facts, done, look)

@@ -35,7 +35,7 @@ from dmcvb_gen.text import format_bytes
 SAMPLE_EPISODES = {LOCOMOTION: 2, ANT_MAZE: 6}
 """Whole episodes simulated of each locomotion task and level, and of each level of all mazes together: theirs vary in
 length."""
-TIMED_STEPS = 16
+TIMED_STEPS = 64
 """Steps of a job's whole batch that are timed: a batch's cost a step is not that of a few episodes."""
 SAMPLE_CHUNKS = 5
 """Runs of frames, a chunk of the pictures each, painted and compressed for a sample; spread over the episodes."""
@@ -127,6 +127,8 @@ def _simulate(job: Job, count: int, threads: int) -> tuple[Episodes, float]:
 def _paint(job: Job, record: SubsetRecord, sample: Episodes) -> tuple[float, float, float]:
     """Seconds, bytes and shared bytes a step of painting and storing one setting."""
     task, chunk = get_task(record.task), min(PIXEL_CHUNK_STEPS, record.max_steps + 1)
+    if not record.pixels:  # what an array costs besides its rows would be all of the time of a few of them
+        chunk = max(chunk, int(sample.length.min()) + 1)
     _, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
     labels = distractor_state_of(
         record, job.seed, job.names, sample.index, sample.physics, sample.length, videos, sample.arrays["action"]

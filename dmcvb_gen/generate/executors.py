@@ -103,7 +103,9 @@ class _Expected:
         kind, planned, episodes = self._kind(job), self._planned(job), len(job.episodes) * len(job.subsets)
         self._open[kind] -= planned
         self._ended[kind] += planned
-        self._painted[kind] += round(planned * (result.steps + episodes) / (job.frames + episodes))
+        known = job.stored is not None  # stored episodes were counted as long as they are
+        share = 1.0 if known else (result.steps + episodes) / (job.frames + episodes)
+        self._painted[kind] += round(planned * share)
 
     @property
     def frames(self) -> int:

@@ -211,10 +211,11 @@ def write_preview(
             cure = f"add them: dmcvb-gen paint {quoted(path)}, or see it without: dmcvb-gen view {quoted(path)}"
         raise StoreError(f"{path} has no finished episodes with images; {cure}")
     folder = target or release.path / "preview"
+    picture = Image.fromarray(contact_sheet(subsets, episodes, scale=scale or SHEET_SCALE))
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         sheet = folder / "contact_sheet.png"
-        Image.fromarray(contact_sheet(subsets, episodes, scale=scale or SHEET_SCALE)).save(sheet)
+        picture.save(sheet)
         moving = folder / f"preview.{kind}"
         (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames, episode))
     return [sheet, moving]

@@ -212,8 +212,8 @@ class Regeneration:
         """Make damaged and missing shards again, in place; the others are not touched.
 
         A shard is replaced only by one that has the bytes that its commit record (or the subset's digest) promises. If
-        the manifest promises nothing yet, because the release was never finished, the new shard is taken. Of a part
-        that was fetched, what was fetched is repaired, unless other shards are asked for.
+        the manifest promises nothing yet, because the release was never finished, the new shard is taken. Of a part,
+        what is here or was fetched is repaired, unless other shards are asked for.
 
         Raises: see `check`.
         """
@@ -264,12 +264,12 @@ class Regeneration:
     def _wanted(self, manifest: Manifest) -> dict[tuple[str, int], SubsetRecord]:
         """The shards that should be here."""
         chosen = chosen_shards(manifest, self.only, self.episodes)
-        fetched = [entry for entry in manifest.lineage if entry["kind"] == "fetch"]
-        if self.only or self.episodes or manifest.complete or not fetched:
+        if self.only or self.episodes or manifest.complete:
             return chosen
         root, _ = load_manifest(self.root)
-        wanted = {key: record for key, record in chosen.items() if (root / commit_path(*key)).is_file()}
-        for entry in fetched:
+        begun = {name: _shards_with_files(root, name) for name, _ in chosen}
+        wanted = {key: record for key, record in chosen.items() if key[1] in begun[key[0]]}
+        for entry in (entry for entry in manifest.lineage if entry["kind"] == "fetch"):
             span = entry.get("episodes")
             with contextlib.suppress(UnknownNameError, StoreError):  # a repaint has not all, and names some otherwise
                 wanted |= chosen_shards(manifest, entry.get("only", ()), tuple(span) if span else None)
@@ -390,6 +390,12 @@ def _check_out(out: Path, manifest: Manifest) -> None:
             f"{out} holds {there.name} {there.version}, which was not made from {manifest.name} {manifest.version}; "
             "give another --out"
         )
+
+
+def _shards_with_files(root: Path, subset: str) -> set[int]:
+    """The shards of a subset of which there is a commit record or any file."""
+    paths = [*(root / "commits" / subset).glob("*.json"), *(root / subset_path(subset)).glob("**/c/*")]
+    return {int(path.stem) for path in paths if path.stem.isdecimal()}
 
 
 def _same_arrays(one: SubsetRecord, other: SubsetRecord) -> bool:

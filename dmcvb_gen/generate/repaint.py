@@ -127,7 +127,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
         raise StoreError(f"{request.root} was imported and has no physics states to paint from")
     _check_options_used(request, [pair.record for pair in pairs.values()])
     new = _new_manifest(release, pairs, request)
-    _check_out(out, new)
+    _check_out(out, new, request.name)
     manifest = start_release(out, new)
     todo: dict[tuple[str, int], SubsetRecord] = {}
     for pair in pairs.values():
@@ -163,13 +163,15 @@ def _check_options_used(request: Repainting, records: Sequence[SubsetRecord]) ->
         )
 
 
-def _check_out(out: Path, new: Manifest) -> None:
+def _check_out(out: Path, new: Manifest, name: str | None) -> None:
     """Refuse a folder that holds any release but this very repaint, begun before."""
     if not (out / MANIFEST).exists():
         return
     _, there = load_manifest(out)
     if list(there.lineage) != json.loads(new.model_dump_json())["lineage"]:
         raise StoreError(f"{out} holds {there.name} {there.version}, which is not this repaint; give another --out")
+    if name and there.name != name:
+        raise StoreError(f"{out} holds this repaint by the name {there.name}; remove --name, or give another --out")
 
 
 def _source(request: Repainting) -> Release:

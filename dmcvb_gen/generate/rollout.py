@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.manifest import Manifest
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.generate.engine import JobResult
 from dmcvb_gen.generate.estimate import room_needed
@@ -73,7 +74,21 @@ def rollout_plan(options: Options, request: Recipe | None, target: Target) -> Pl
     """
     device = options["device"] or ("cpu" if request else None)  # else where it was begun
     only, part = as_names(options["only"]), options["part"] or (1, 1)
-    return make_plan(request, target, only, device, options["episode_range"], part, options["pixels"])
+    plan = make_plan(request, target, only, device, options["episode_range"], part, options["pixels"])
+    _check_shards(options["episodes_per_shard"], plan)
+    return plan
+
+
+def _check_shards(given: int | None, plan: Plan) -> None:
+    """Raises StoreError if subsets that are there have larger shards than asked for, which they keep."""
+    there = plan.target.manifest() if given else None
+    asked = {record.name for record in plan.manifest.subsets}
+    for record in there.subsets if there else ():
+        if given and record.name in asked and given < record.episodes_per_shard:
+            raise StoreError(
+                f"{plan.target.place} holds {record.name} with {record.episodes_per_shard} episodes a shard and keeps "
+                "them; remove --episodes-per-shard, or choose another --out"
+            )
 
 
 def prepare_rollout(plan: Plan, options: Options, begin: bool = False, notify: Callable[[str], None] = ignore) -> Plan:

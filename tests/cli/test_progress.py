@@ -17,6 +17,7 @@ from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.paint import without_pictures
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import single_recipe
+from dmcvb_gen.generate.repaint import Repainting, repaint
 
 LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
 TASKS = ("walker-walk", "ant-maze-empty7x7")
@@ -129,6 +130,10 @@ def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
     assert frames == expected[-1] == views * (subset.steps + 3) < expected[0] == views * 3 * 601
     first = subset.read("length", [0])[0] + 1
     assert expected[1] == pytest.approx(3 * views * first, abs=3)
+    told.clear()  # a repaint knows how long they are
+    repaint(Repainting(tmp_path / "early", tmp_path / "again", size=24), 1, Told())
+    assert {count for what, count in told if what == "expected"} == {frames}
+    assert sum(count for what, count in told if what == "frames") == frames
 
 
 def test_a_terminal_gets_a_bar(small_release):

@@ -548,6 +548,7 @@ def test_no_slurm_script_is_printed_for_what_each_task_would_refuse(tmp_path):
         ["walker-wlak"],
         ["walker-walk", "--distractor", "static", "--backgrounds", str(tmp_path / "no")],
         ["walker-walk", "--out", "s3:/bucket/x"],
+        ["--out", str(tmp_path / "nothing")],
     ):
         result = CliRunner().invoke(main, ["rollout", "--out", "s3://bucket/x", *arguments, "--slurm-script", "3"])
         assert result.exit_code == 2 and "#SBATCH" not in result.output

@@ -80,6 +80,19 @@ def test_nothing_but_the_manifest_is_needed(request, name, shards, tmp_path):
             assert (tmp_path / "bare" / path.relative_to(small_release)).read_bytes() == data
 
 
+@pytest.mark.parametrize("lost", ["a file", "a record too"])
+def test_a_part_is_repaired_and_does_not_become_the_whole(small_release, tmp_path, lost):
+    Regeneration(small_release, ["*/*/dynamic"], (2, 3)).remake(tmp_path / "part")
+    [commit] = open_release(tmp_path / "part")[NAME].commits.values()
+    before = files_of(tmp_path / "part")
+    (tmp_path / "part" / commit.files[0].path).unlink()
+    if lost == "a record too":
+        (tmp_path / "part" / commit_path(NAME, 1)).unlink()
+    [shard] = Regeneration(tmp_path / "part").repair().shards
+    assert shard.repaired and (shard.subset, shard.shard) == (NAME, 1)
+    assert files_of(tmp_path / "part").keys() == before.keys() and verify(tmp_path / "part").sound
+
+
 def test_damaged_and_missing_shards_are_repaired_and_sound_ones_not_touched(copy, small_release):
     pixels = next(file for file in open_release(copy)[NAME].commits[1].files if "/pixels/" in file.path).path
     data = bytearray((copy / pixels).read_bytes())

@@ -227,6 +227,11 @@ def test_a_folder_with_another_release_is_left_alone(small_release, small_mazes,
         assert (tmp_path / folder / "manifest.json").read_bytes() == before and verify(tmp_path / folder).sound
 
 
+def test_a_repaint_that_is_there_keeps_its_name(small_release, dynamic):
+    with pytest.raises(StoreError, match="holds this repaint by the name .*; remove --name"):
+        repaint(Repainting(small_release, dynamic, ["*/*/none"], distractor="dynamic", name="other"))
+
+
 def test_mistakes_are_refused_before_any_painting(small_release, small_mazes, tmp_path):
     for options in (dict(difficulty="hard"), dict(backgrounds="builtin"), dict(split="val")):
         with pytest.raises(RecipeError, match="these subsets (have no distractors|show no videos)"):

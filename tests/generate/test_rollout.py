@@ -435,6 +435,28 @@ def test_a_dry_run_for_a_bucket_knows_policies_and_videos_that_are_not_there_yet
     assert json.loads(result.stdout)["steps"] > 0 and not (tmp_path / "bucket").exists()
 
 
+@pytest.mark.parametrize("task", ["walker-walk", "ant-maze-empty7x7"])
+def test_what_a_growing_subset_keeps_is_said_or_refused(tmp_path, task):
+    command = ["rollout", task, "--level", "random", "--max-steps", "5", "--size", "16", "--out", str(tmp_path / "r")]
+
+    def run(*options):
+        return CliRunner().invoke(main, [*command, *options])
+
+    first = run("--episodes", "2", "--episodes-per-shard", "2")
+    assert first.exit_code == 0 and "keeps" not in first.output and "get images" not in first.output
+    small = run("--episodes", "4", "--episodes-per-shard", "1")
+    assert (
+        small.exit_code == 2 and "with 2 episodes a shard and keeps them; remove --episodes-per-shard" in small.output
+    )
+    large = run("--episodes", "4", "--episodes-per-shard", "4", "--no-pixels")
+    assert large.exit_code == 0 and "keeps its shards of 2 episodes" in large.output
+    assert "has images, so its new episodes get images, too" in large.output
+    [subset] = open_release(tmp_path / "r").subsets.values()
+    assert len(subset.commits) == 2 and not subset.unpainted.any()
+    part = run("--episodes", "8", "--range", "4:5")
+    assert part.exit_code == 0 and "says what is missing" in part.output
+
+
 @pytest.mark.parametrize("recipe", [small_recipe, maze_recipe])
 def test_going_on_from_a_manifest_paints_where_it_was_begun(tmp_path, recipe):
     folder = tmp_path / "r"
