@@ -80,7 +80,10 @@ class DistractorPart(abc.ABC):
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
-        """The task's own labels, which are shown if the setting leaves this distractor out; see `labels`."""
+        """The task's own labels, which are shown if the setting leaves this distractor out; see `labels`.
+
+        Only distractors whose labels every subset stores (`BUILT_IN`) need it; the others are never left out.
+        """
         raise NotImplementedError
 
 

@@ -212,8 +212,8 @@ class Regeneration:
         """Make damaged and missing shards again, in place; the others are not touched.
 
         A shard is replaced only by one that has the bytes that its commit record (or the subset's digest) promises. If
-        the manifest promises nothing yet, because the release was never finished, the new shard is taken. Of a part,
-        what is here or was fetched is repaired, unless other shards are asked for.
+        the release was never finished, the manifest promises nothing, and the new shard is taken. If only a part of the
+        release is here, only that part and what was fetched are repaired, unless other shards are asked for.
 
         Raises: see `check`.
         """

@@ -21,7 +21,7 @@ _MIXED = re.compile(r"mixed_([0-9]+)\.safetensors")
 def level_files(folder: Path, level: str) -> list[Path]:
     """The policy files of a level in a folder, in order; empty if there are none.
 
-    Those of mixed are numbered; a file of another name (mixed_final) is somebody's own and left out.
+    The files of mixed are numbered. A file of another name, such as mixed_final, is left out.
     """
     if level == "mixed":
         named = ((_MIXED.fullmatch(path.name), path) for path in folder.glob("mixed_*.safetensors"))

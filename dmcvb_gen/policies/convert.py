@@ -173,7 +173,7 @@ def convert_file(path: str | Path, task_id: str, out: str | Path, **options: Any
     """Write another program's policy as a policy file, and load it once; see `convert`.
 
     Raises:
-      PolicyFileError: it cannot be converted; a file that is at `out` stays as it was.
+      PolicyFileError: it cannot be converted. An existing file at `out` is not changed.
       StoreError: the file cannot be written.
     """
     header, weights = convert(path, task_id, **options)

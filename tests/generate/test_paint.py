@@ -227,7 +227,7 @@ def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
 
 
 def test_labels_of_fresh_distractors_are_those_of_their_pictures(made):
-    """What is drawn for an epoch is read as its labels, and the pictures are painted from it."""
+    """The labels of an epoch are the ones that its pictures are painted from."""
     for name in dmcvb_gen.open(str(made / "light")):
         subset = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")[name]
         stored, episode = dmcvb_gen.open(str(made / "light"))[name], int(subset.episodes[-1])

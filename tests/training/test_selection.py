@@ -359,7 +359,7 @@ def cost(physics):
 
 @pytest.fixture
 def cost_task(tmp_path, monkeypatch):
-    """Name of a task of one's own with costs, which nobody has let run yet."""
+    """Name of an own task with negative returns. Its code is not allowed to run yet."""
     name = f"costs_{hashlib.sha256(str(tmp_path).encode()).hexdigest()[:8]}"
     (tmp_path / f"{name}.py").write_text(COSTS)
     monkeypatch.chdir(tmp_path)
