@@ -43,7 +43,6 @@ GROUPS = {
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
         "validate": ("validate:validate", "Train the paper's agents on a release and report their scores."),
         "claims": ("validate:claims", "Test the paper's claims, and its ranking, on reports of validate."),
-        "leaderboard": ("leaderboard:leaderboard", "Show, extend and recompute a leaderboard of trained agents."),
         "diff": ("release:diff_command", "Compare two releases: subsets, episodes and digests."),
     },
     "Share": {
