@@ -39,7 +39,6 @@ GROUPS = {
         "info": ("look:info", "Show what a release holds, beside the paper's returns."),
         "preview": ("look:preview", "Write a contact sheet and a video of a release."),
         "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
-        "show-maze": ("maze:show_maze", "Draw a maze, its distances to a goal and the path there."),
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
         "validate": ("validate:validate", "Train the paper's agents on a release and report their scores."),
         "claims": ("validate:claims", "Test the paper's claims, and its ranking, on reports of validate."),

@@ -8,16 +8,10 @@ import shlex
 import click
 
 from dmcvb_gen import commands
-from dmcvb_gen.cli.common import (
-    answer,
-    format_duration,
-    print_json,
-    print_table,
-)
+from dmcvb_gen.cli.common import answer, print_json, print_table
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.cli.unused_options import check_exclusive_options
-from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.storage.remote import check_place, is_url
 from dmcvb_gen.text import format_bytes, pluralize
 
@@ -41,7 +35,7 @@ OPTION_GROUPS = {
 @click.option(
     "--slurm-script", type=click.IntRange(1), metavar="N", help="Print a Slurm script for an array of N tasks."
 )
-@click.option("--dry-run", is_flag=True, help="Show jobs, steps, bytes and time for --workers, and write nothing.")
+@click.option("--dry-run", is_flag=True, help="Show what is there and what would be made, and write nothing.")
 def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options):
     """Roll out behaviour policies into a release of episodes.
 
@@ -83,8 +77,8 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     _tell_what_is_there(plan, shared=dry_run or init or bool(options["part"]))
     _tell_what_stays(plan, options)
     if dry_run:
-        return _show_plan(plan, workers, as_json)
-    plan = prepare_rollout(plan, options, init, lambda line: click.echo(line, err=True))
+        return _show_plan(plan, as_json)
+    plan = prepare_rollout(plan, options, init)
     if init:
         return _tell_begun(plan, as_json)
     _run(plan, workers, as_json, whole=not options["part"])
@@ -178,39 +172,21 @@ def _run(plan, workers, as_json, whole=True):
     answer(as_json, facts, done, look)
 
 
-def _show_plan(plan, workers, as_json):
-    from dmcvb_gen.generate.estimate import estimate, measurements
-    from dmcvb_gen.parallel.cores import usable_cores
+def _show_plan(plan, as_json):
+    from dmcvb_gen.generate.counts import count
 
-    cores, workers = usable_cores(), workers if isinstance(workers, int) else 1
-    with ProgressBar(not as_json, total=measurements(plan), unit=" measurements", leave=False) as bar:
-        cost = estimate(plan, workers, bar.update)
-    disk = cost.disk_bytes if plan.target.folder else cost.bytes  # buckets have no links
+    counts = count(plan)
+    left, frames, raw = (sum(getattr(subset, name) for subset in counts) for name in ("left", "frames", "raw_bytes"))
+    facts = dict(out=plan.target.place, jobs=len(plan.jobs), shards_done=plan.done, episodes=left, frames=frames)
     if as_json:
-        facts = dict(jobs=cost.jobs, shards_done=cost.done, subsets=len(plan.manifest.subsets), episodes=cost.episodes)
-        facts |= dict(
-            steps=cost.steps, bytes=round(cost.bytes), disk_bytes=round(disk), core_hours=cost.core_seconds / 3600
-        )
-        facts |= dict(hours=cost.seconds(min(workers, cores)) / 3600, workers=workers)
-        rates = {name: dataclasses.asdict(rate) for name, rate in cost.rates.items()}
-        for rate in rates.values():
-            rate["steps_per_second"] = 1 / rate.pop("seconds_per_step")
-        return print_json(facts | {"rates": rates})
+        return print_json(facts | dict(raw_bytes=raw, subsets=[dataclasses.asdict(subset) for subset in counts]))
     print_table(
-        ("subset", "episodes", "steps", "bytes", "core time"),
-        [
-            (name, f"{episodes:,}", f"{steps:,.0f}", format_bytes(size), format_duration(seconds))
-            for name, (episodes, steps, size, seconds) in cost.of_subsets(plan).items()
-        ],
+        ("subset", "done", "to make", plan.unit, "uncompressed"),
+        [(c.name, f"{c.done:,}", f"{c.left:,}", f"{c.frames:,}", format_bytes(c.raw_bytes)) for c in counts],
         title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
     )
-    asked, here, many = (format_duration(cost.seconds(count)) for count in (min(workers, cores), cores, 64))
     click.echo(f"release: {plan.target.place}")
-    size = format_bytes(cost.bytes) + (f" ({format_bytes(disk)} on disk)" if disk < 0.99 * cost.bytes else "")
     click.echo(
-        f"{pluralize(cost.jobs, 'jobs')} to do, {pluralize(cost.done, 'shards')} done; {cost.steps:,} steps, {size}"
-    )
-    click.echo(
-        f"core time: {format_duration(cost.core_seconds)}; {asked} with --workers {workers}, "
-        f"{here} with the {cores} cores here, {many} with 64"
+        f"{pluralize(len(plan.jobs), 'jobs')} to do, {pluralize(plan.done, 'shards')} done; {left:,} episodes, "
+        f"{frames:,} {plan.unit}, at most {format_bytes(raw)} before compression"
     )

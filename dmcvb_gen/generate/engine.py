@@ -7,8 +7,6 @@
     regenerate   simulated                         every array, compared with the release's digests
     repaint      read from another release         every array; distractors are stored or drawn anew
     paint        read from the release itself      pictures, added to the shard
-
-`estimate` times the same functions on a few episodes.
 """
 
 from __future__ import annotations
@@ -114,14 +112,11 @@ def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobR
 # -- states ---------------------------------------------------------------------------------------
 
 
-def simulated_episodes(
-    job: Job, threads: int = 1, episodes: range | None = None, max_steps: int | None = None
-) -> Episodes:
+def simulated_episodes(job: Job, threads: int = 1) -> Episodes:
     """Simulate the episodes of a job.
 
     Args:
       threads: threads of the physics.
-      episodes, max_steps: others than the job's, for estimates.
     """
     record = job.subsets[0]
     task = get_task(record.task)
@@ -129,14 +124,14 @@ def simulated_episodes(
     made = simulate(
         task,
         _policies(record.task, inputs_of(job, record).policies, tuple(policy.digest for policy in record.policies)),
-        list(episodes or job.episodes),
+        list(job.episodes),
         job.seed,
         job.names,
         deterministic=record.deterministic,
         goal_pairs=pairs,
         episodes_per_goal=record.episodes_per_goal,
         threads=threads,
-        max_steps=max_steps or record.max_steps,
+        max_steps=record.max_steps,
     )
     return Episodes(made.episodes, made.physics, made.length, made.arrays(), seconds=made.seconds)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,6 @@ from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.files import (
     copy_file,
     folder_in_the_making,
-    free_bytes,
     json_bytes,
     remove_partial,
     sha256_bytes,
@@ -67,7 +67,7 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
-from dmcvb_gen.text import format_bytes, pluralize, quoted
+from dmcvb_gen.text import pluralize, quoted
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class Plan:
       inputs: of each subset, by name; None if the release's own copies serve.
       jobs: jobs that are still to do; settings that share trajectories are one job.
       done: committed shards that are there already.
+      chosen: subset -> episodes that this rollout is about, whether they are there or not.
       growth: gains of the release that is there: "walker-walk/random/none" for a new subset, "walker-walk/random/none
         (40 episodes more)" for one that grows.
     """
@@ -89,6 +90,7 @@ class Plan:
     inputs: Mapping[str, Inputs] | None
     jobs: tuple[Job, ...]
     done: int
+    chosen: Mapping[str, int]
     growth: tuple[str, ...] = ()
 
     @property
@@ -148,7 +150,10 @@ def make_plan(
     left = left_to_do(jobs, done)
     growth = _growth(there, records) if there is not None else ()
     _refuse_labels(there, left, target.place)
-    return Plan(target, manifest, inputs, left, _count(jobs) - _count(left), growth)
+    chosen: Counter[str] = Counter()
+    for job in jobs:
+        chosen.update({record.name: len(job.episodes) for record in job.subsets})
+    return Plan(target, manifest, inputs, left, _count(jobs) - _count(left), chosen, growth)
 
 
 def _growth(there: Manifest, records: Iterable[SubsetRecord]) -> tuple[str, ...]:
@@ -307,24 +312,22 @@ def _without_local_paths(
 # -- the release's folder or bucket ---------------------------------------------------------------
 
 
-def prepare(plan: Plan, expected_bytes: float = 0, other_versions: bool = False, shared: bool = False) -> Plan:
+def prepare(plan: Plan, other_versions: bool = False, shared: bool = False) -> Plan:
     """Create the release: its manifest, policies, videos and empty arrays; a plan whose manifest is the one there.
 
     Args:
-      expected_bytes: room that will be needed in the folder.
       other_versions: go on although packages have other versions here than where the release was begun.
       shared: other machines write to the folder too, so the manifest is written by the first of all alone.
 
     Raises:
-      StoreError: what is there contradicts this recipe or was begun with other versions; it cannot be written, or the
-        disk lacks the room.
+      StoreError: what is there contradicts this recipe or was begun with other versions, or it cannot be written.
     """
     there = plan.target.manifest()
     if there is not None:
         if not other_versions:
             check_versions(there)
     if plan.target.folder:
-        manifest = _prepare_folder(plan, plan.target.folder, there, expected_bytes, shared)
+        manifest = _prepare_folder(plan, plan.target.folder, there, shared)
     elif there is None:
         manifest = _prepare_bucket(plan, plan.target)
     else:
@@ -343,13 +346,8 @@ def check_versions(manifest: Manifest) -> None:
             )
 
 
-def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, expected_bytes: float, shared: bool) -> Manifest:
+def _prepare_folder(plan: Plan, root: Path, there: Manifest | None, shared: bool) -> Manifest:
     kept = there is not None and merged(there, plan.manifest, str(root)) is there
-    if expected_bytes > (free := free_bytes(root)):
-        raise StoreError(
-            f"about {format_bytes(expected_bytes)} are needed and {format_bytes(free)} are free "
-            f"at {root}; make room, choose another --out or fewer --episodes"
-        )
     if there is not None and kept and (shared or _is_done(there, plan)):
         manifest = there
     else:

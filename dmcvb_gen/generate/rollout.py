@@ -10,9 +10,8 @@ from typing import Any
 
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import free_bytes
+from dmcvb_gen.generate.counts import check_room
 from dmcvb_gen.generate.engine import JobResult
-from dmcvb_gen.generate.estimate import room_needed
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.plan import Plan, finish, make_plan, prepare
 from dmcvb_gen.generate.recipe import Recipe
@@ -91,18 +90,15 @@ def _check_shards(given: int | None, plan: Plan) -> None:
             )
 
 
-def prepare_rollout(plan: Plan, options: Options, begin: bool = False, notify: Callable[[str], None] = ignore) -> Plan:
+def prepare_rollout(plan: Plan, options: Options, begin: bool = False) -> Plan:
     """Make a plan's release ready for its jobs; see `plan.prepare`.
 
     Args:
       begin: other machines make the shards, so this one needs no room for them.
-      notify: told what takes seconds.
     """
-    room, folder = 0.0, plan.target.folder
-    if folder and not begin:
-        workers = options["workers"] if isinstance(options["workers"], int) else 1
-        room = room_needed(plan, free_bytes(folder), workers, notify)
-    return prepare(plan, room, options["other_versions"], begin or bool(options["part"]))
+    if not begin:
+        check_room(plan)
+    return prepare(plan, options["other_versions"], begin or bool(options["part"]))
 
 
 def run_plan(

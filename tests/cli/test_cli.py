@@ -69,9 +69,16 @@ def test_the_same_command_with_other_options_is_refused(tmp_path):
 
 def test_dry_run_shows_the_plan_and_writes_nothing(tmp_path):
     result = run(*SMALL, "--distractor", "none", "--out", tmp_path / "x", "--dry-run")
-    assert result.exit_code == 0 and "core time: " in result.output and not (tmp_path / "x").exists()
+    assert result.exit_code == 0 and "1 job to do" in result.output and not (tmp_path / "x").exists()
     facts = json.loads(run(*SMALL, "--out", tmp_path / "x", "--dry-run", "--json").output)
-    assert facts["steps"] == 500 and facts["jobs"] == 1 and facts["bytes"] > 0
+    assert facts["frames"] == 501 and facts["jobs"] == 1 and facts["raw_bytes"] > 501 * 16 * 16 * 3
+
+
+def test_a_dry_run_of_a_release_that_is_there_says_so(tmp_path):
+    made = [*SMALL, "--max-steps", "3", "--out", tmp_path / "x"]
+    assert run(*made).exit_code == 0
+    [row] = [line for line in run(*made, "--dry-run").output.splitlines() if line.startswith("walker-walk/random")]
+    assert row.split()[1:4] == ["1", "0", "0"]
 
 
 def test_list_says_what_is_here():

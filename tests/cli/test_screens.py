@@ -33,7 +33,7 @@ def test_tables_fit_80_columns_and_cut_no_word(small_release, small_mazes, tmp_p
         ("info", small_mazes): ["ant-maze-tiny/random/visible", "episodes", "mean"],
         ("status", small_release): ["walker-walk/random/dynamic", "done", "open"],
         tuple(evaluate): ["ant-maze-medium7x7a", "success", "DMC-VB paper"],
-    } | {tuple(plan): [f"{plan[1]}/random/", "core time"] for plan in plans(tmp_path)}
+    } | {tuple(plan): [f"{plan[1]}/random/", "to make"] for plan in plans(tmp_path)}
     for arguments, expected in words.items():
         lines = screen(arguments)
         wide = [line for line in lines if len(line) > 80 and str(tmp_path) not in line]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -211,13 +209,3 @@ def test_bad_requests(tmp_path):
         result = run(*arguments)
         assert result.exit_code == 2 and message in result.output, (arguments, result.output)
     assert not (tmp_path / "r").exists()
-
-
-def test_show_maze(tmp_path):
-    out = tmp_path / "maze.png"
-    result = CliRunner().invoke(main, ["show-maze", "easy7x7c", "--out", str(out), "--json"])
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.output)["path_m"] > 10 and out.read_bytes()[:4] == b"\x89PNG"
-    assert CliRunner().invoke(main, ["show-maze", "easy7x7c", "--goal", "0,0"]).exit_code == 2
-    own = CliRunner().invoke(main, ["show-maze", "ant-maze-mine:*****/*...*/*****", "--out", str(out), "--json"])
-    assert own.exit_code == 0 and json.loads(own.stdout)["rows"] == ["*****", "*...*", "*****"], own.output

@@ -23,8 +23,7 @@ from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.files import write_json
-from dmcvb_gen.generate import estimate as estimating
-from dmcvb_gen.generate.estimate import estimate, measurements, raw_bytes
+from dmcvb_gen.generate.counts import LEAST_SHARE, count
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.generate.regenerate import Regeneration
@@ -178,73 +177,34 @@ def test_a_full_disk_is_said_and_costs_nothing_that_is_committed(small_release, 
     assert digests(roll_out(small_recipe(), copy)) == reference(small_release)
 
 
-def test_more_than_the_disk_holds_is_refused_before_any_work(tmp_path):
-    with pytest.raises(StoreError, match="TB are needed"):
-        prepare(make_plan(small_recipe(), tmp_path / "r"), expected_bytes=1e18)
-
-
-@pytest.mark.parametrize("family", ["walker", "mazes"])
-@pytest.mark.parametrize("pixels", [True, False])
-def test_a_disk_that_is_smaller_than_raw_arrays_is_measured_for(tmp_path, monkeypatch, family, pixels):
+@pytest.mark.parametrize(("family", "frame"), [("walker", 16 * 16 * 3), ("mazes", 4 * 2 * 16 * 16 * 3)])
+def test_a_disk_that_cannot_hold_the_release_is_refused_before_any_work(tmp_path, monkeypatch, family, frame):
+    """60 steps, so 61 frames; four views of mazes, with the goal and without it."""
     task, setting = {"walker": ("walker-walk", "dynamic"), "mazes": (TINY_MAZE, "visible")}[family]
     subsets = [{"tasks": task, "levels": "random", "settings": setting, "episodes": 3, "max_steps": 60}]
-    plan = make_plan(small_recipe(subsets=subsets), tmp_path / "r", pixels=pixels)
-    needed, raw, told = estimate(plan).disk_bytes, raw_bytes(plan), []
-    assert 0 < needed < raw
-    options = {"workers": 1, "other_versions": False, "part": None}
+    plan, options = make_plan(small_recipe(subsets=subsets), tmp_path / "r"), {"other_versions": False, "part": None}
+    images = 3 * 61 * frame
 
     def free(amount):
         monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=amount))
 
-    free(needed * 0.5)
-    with pytest.raises(StoreError, match=r"^about .*B are needed and .*B are free"):
-        prepare_rollout(plan, options, notify=told.append)
+    free(LEAST_SHARE * images)
+    with pytest.raises(StoreError, match=r"^at least .*B are needed and .*B are free at .*; make room"):
+        prepare_rollout(plan, options)
     assert not (tmp_path / "r").exists()
-    free((needed + raw) / 2)
-    prepare_rollout(plan, options, notify=told.append)
-    assert len(told) == 2 and all("measuring" in line for line in told)
-    free(raw)
-    prepare_rollout(plan, options, notify=told.append)
-    assert len(told) == 2
+    free(LEAST_SHARE * images * 4)
+    prepare_rollout(plan, options)
 
 
-def test_the_estimate_comes_near_what_the_release_became(small_release, tmp_path):
-    cost = estimate(make_plan(small_recipe(), tmp_path / "r"))
+def test_counts_are_those_of_the_release_that_is_made(small_release, tmp_path):
     release = open_release(small_release)
-    assert cost.jobs == 2 and cost.episodes == 9 and cost.steps == 4500
+    before = {subset.name: subset for subset in count(make_plan(small_recipe(), tmp_path / "r"))}
     for name, subset in release.subsets.items():
-        assert 0.75 * subset.bytes < subset.steps * cost.rates[name].bytes_per_step < 1.25 * subset.bytes
-    assert all(1e-6 < rate.seconds_per_step < 1 for rate in cost.rates.values())
+        assert (before[name].done, before[name].left) == (0, len(subset.episodes))
+        assert before[name].frames == subset.steps + len(subset.episodes) and subset.bytes < before[name].raw_bytes
+    after = count(make_plan(small_recipe(), small_release))
+    assert [(subset.done, subset.left, subset.frames, subset.raw_bytes) for subset in after] == [(3, 0, 0, 0)] * 3
     assert not (tmp_path / "r").exists()
-
-
-def test_mazes_of_a_level_share_their_estimate_of_an_episode(tmp_path, monkeypatch):
-    simulated = []
-    whole = estimating._simulate
-    monkeypatch.setattr(estimating, "_simulate", lambda *job: simulated.append(whole(*job)[0]) or (simulated[-1], 1.0))
-    mazes = {"tasks": [TINY_MAZE, "ant-maze-empty7x7"], "levels": "random", "settings": ["visible", "hidden"]}
-    walker = {"tasks": "walker-walk", "levels": "random", "settings": ["none"]}
-    subsets = [pattern | {"episodes": 5, "max_steps": 30} for pattern in (mazes, walker)]
-    cost = estimate(make_plan(small_recipe(subsets=subsets), tmp_path / "r"))
-    lengths = sorted((sample.length.tolist() for sample in simulated), key=len)
-    assert [len(length) for length in lengths] == [2, 3, 3]  # the walker's, and six of the mazes together
-    mean = np.mean(lengths[1] + lengths[2])
-    assert {rate.steps_per_episode for name, rate in cost.rates.items() if "maze" in name} == {mean}
-    assert cost.steps == round(5 * (30 + 4 * mean))
-
-
-def test_tasks_are_measured_side_by_side(tmp_path):
-    given = {"levels": "random", "episodes": 2, "max_steps": 30}
-    mazes = given | {"tasks": [TINY_MAZE, "ant-maze-empty7x7"], "settings": ["visible", "hidden"]}
-    walker = given | {"tasks": "walker-walk", "settings": ["none", "dynamic"]}
-    plan = make_plan(small_recipe(subsets=[mazes, walker]), tmp_path / "r")
-    ticks = {1: [], 2: []}
-    alone, beside = (estimate(plan, workers, ticks[workers].append) for workers in ticks)
-    assert sum(ticks[1]) == sum(ticks[2]) == measurements(plan) == 3 + 3  # one maze is painted for both
-    for name, rate in alone.rates.items():
-        assert beside.rates[name].steps_per_episode == rate.steps_per_episode
-        assert beside.rates[name].bytes_per_step == pytest.approx(rate.bytes_per_step)
-    assert (beside.steps, beside.episodes, beside.jobs) == (alone.steps, alone.episodes, alone.jobs)
 
 
 def test_shipped_recipes_expand_to_what_the_paper_has():
@@ -432,7 +392,7 @@ def test_a_dry_run_for_a_bucket_knows_policies_and_videos_that_are_not_there_yet
     sizes = ["--max-steps", "20", "--out", f"file://{tmp_path}/bucket", "--scratch", str(tmp_path / "scratch")]
     result = CliRunner().invoke(main, [*asked, *sizes, "--dry-run", "--json"])
     assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["steps"] > 0 and not (tmp_path / "bucket").exists()
+    assert json.loads(result.stdout)["frames"] > 0 and not (tmp_path / "bucket").exists()
 
 
 @pytest.mark.parametrize("task", ["walker-walk", "ant-maze-empty7x7"])

@@ -151,6 +151,7 @@ main(sys.argv[1:], prog_name="dmcvb-gen")
         for done in [command(*asked) for asked in commands]:
             assert done.returncode == 0, done.stderr
         assert (tmp_path / task / "preview/preview.webp").exists()
-    for asked, package in (("train-behaviour", "torch"), ("show-maze", "matplotlib")):
-        refused = command(asked, "walker-walk" if package == "torch" else "easy7x7a")
+    drawn = ["evaluate-behaviour", "ant-maze-empty7x7", "--level", "random", "--episodes", "2", "--pictures", "paths"]
+    for asked, package in ((["train-behaviour", "walker-walk"], "torch"), (drawn, "matplotlib")):
+        refused = command(*asked)
         assert refused.returncode == 2 and f"pip install {package}" in refused.stderr, refused.stderr

@@ -15,7 +15,6 @@ URL = "s3://bucket/x"
 COMMANDS = {
     "backgrounds": ["backgrounds", "--out", URL],
     "backgrounds, sheet": ["backgrounds", "--sheet", f"{URL}.png"],
-    "show-maze": ["show-maze", "empty7x7", "--out", f"{URL}.png"],
     "train-behaviour": ["train-behaviour", "walker-walk", "--out", URL],
     "evaluate-behaviour": ["evaluate-behaviour", "walker-walk", "--pictures", URL],
     "validate": ["validate", "RELEASE", "--out", URL],

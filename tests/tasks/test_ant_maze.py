@@ -1,13 +1,11 @@
 """Ant mazes against dm_control's composer environment, brute-force distances and hand-made layouts."""
 
 import heapq
-import json
 
 import labmaze
 import mujoco
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from dm_control import composer, mjcf
 from dm_control.locomotion.arenas import mazes
 from dm_control.locomotion.props import target_sphere
@@ -18,7 +16,6 @@ from hypothesis import strategies as st
 from labmaze import assets
 from scipy import ndimage
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import LayoutError, UnknownNameError
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, fixed_pairs, layout_task_id
@@ -26,8 +23,6 @@ from dmcvb_gen.tasks.ant_maze.arena import WALL_HEIGHT
 from dmcvb_gen.tasks.ant_maze.distance import (
     PIXELS,
     _floor,
-    center_pixel,
-    descend,
     geodesic_field,
     look_up,
     make_field,
@@ -473,6 +468,27 @@ def test_rewards_are_between_minus_one_and_zero(text, seed, reward):
     assert np.isclose(field.values[floor].max(), field.largest)
 
 
+def descend(layout, field, start, step=0.05):
+    """The path down the field from a position: (point, 2) x and y, meters, until it stops falling."""
+    position, path = np.asarray(start, float)[:2], [np.asarray(start, float)[:2]]
+    stack, reach = field.values[None], CELL / PIXELS
+    turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    around = reach * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    floor = _floor(layout)[0].astype(float)[None]
+    here = look_up("geodesic", layout, stack, position[None])[0]
+    for _ in range(int(sum(layout.shape) * CELL * 4 / step)):
+        near = position + around
+        values = look_up("geodesic", layout, np.repeat(stack, len(near), axis=0), near)
+        open_ = look_up("geodesic", layout, np.repeat(floor, len(near), axis=0), near) > 0.5
+        best = int(np.argmin(np.where(open_, values, np.inf)))
+        if values[best] >= here:
+            break
+        position = position + around[best] * (step / reach)
+        here = look_up("geodesic", layout, stack, position[None])[0]
+        path.append(position)
+    return np.array(path)
+
+
 @pytest.mark.parametrize("task_id", ANT_MAZE_TASKS)
 def test_distance_falls_along_the_shortest_path(task_id):
     layout = get_task(task_id).layout
@@ -574,27 +590,3 @@ def test_simulations_hold_no_textures_and_all_else_that_painters_see(name):
     names = [[model.geom(i).name for i in range(model.ngeom)] for model in (bare, whole)]
     materials = [[model.mat(i).name for i in range(model.nmat)] for model in (bare, whole)]
     assert names[0] == names[1] and materials[0] == materials[1]
-
-
-def shown(tmp_path, *arguments):
-    """What show-maze says of medium7x7a."""
-    asked = ["show-maze", "medium7x7a", *arguments, "--out", str(tmp_path / "maze.png"), "--json"]
-    result = CliRunner().invoke(main, asked)
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
-
-
-@pytest.mark.parametrize("given", ["start", "goal"])
-def test_one_end_of_a_path_takes_the_farthest_cell_for_the_other(given, tmp_path):
-    other = {"start": "goal", "goal": "start"}[given]
-    facts = shown(tmp_path, f"--{given}", "1,5")
-    assert facts[given] == [1, 5] != facts[other]
-    layout = get_layout("medium7x7a")
-    fields = [geodesic_field(layout, layout.world(cell)) for cell in layout.free]  # the way back from every cell
-    assert facts["path_m"] == pytest.approx(max(field.values[center_pixel((1, 5))] for field in fields), rel=0.05)
-
-
-def test_a_path_has_two_ends():
-    result = CliRunner().invoke(main, ["show-maze", "medium7x7a", "--start", "1,5", "--goal", "1,5"])
-    assert result.exit_code == 2 and "start and goal are both (1, 5); give two floor cells" in result.output
-    assert result.output.count("\n") == 1

@@ -133,24 +133,3 @@ def look_up(reward: str, layout: Layout, fields: np.ndarray, positions: np.ndarr
     top = fields[each, row, column] * (1 - weight[:, 1]) + fields[each, row, column + 1] * weight[:, 1]
     bottom = fields[each, row + 1, column] * (1 - weight[:, 1]) + fields[each, row + 1, column + 1] * weight[:, 1]
     return top * (1 - weight[:, 0]) + bottom * weight[:, 0]
-
-
-def descend(layout: Layout, field: DistanceField, start: np.ndarray, step: float = 0.05) -> np.ndarray:
-    """The path down the field from a position: (point, 2) x and y, meters, until it stops falling."""
-    position, path = np.asarray(start, float)[:2], [np.asarray(start, float)[:2]]
-    stack, reach = field.values[None], CELL / PIXELS
-    turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    around = reach * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    floor = _floor(layout)[0].astype(float)[None]
-    here = look_up("geodesic", layout, stack, position[None])[0]
-    for _ in range(int(sum(layout.shape) * CELL * 4 / step)):
-        near = position + around
-        values = look_up("geodesic", layout, np.repeat(stack, len(near), axis=0), near)
-        open_ = look_up("geodesic", layout, np.repeat(floor, len(near), axis=0), near) > 0.5
-        best = int(np.argmin(np.where(open_, values, np.inf)))
-        if values[best] >= here:
-            break
-        position = position + around[best] * (step / reach)
-        here = look_up("geodesic", layout, stack, position[None])[0]
-        path.append(position)
-    return np.array(path)

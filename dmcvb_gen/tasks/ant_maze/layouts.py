@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dmcvb_gen.errors import LayoutError, UnknownNameError
-from dmcvb_gen.spec import MazeName
+from dmcvb_gen.errors import LayoutError
 
 CELL = 2.5
 """Meters a side of a cell (paper, appendix on the ant maze)."""
@@ -160,22 +159,6 @@ def load_layout(path: str | Path) -> Layout:
         raise LayoutError(f"cannot read layout {path} ({error}); give a text file of '*' and ' '") from None
     name = re.sub(r"[^A-Za-z0-9_]", "_", path.stem).lstrip("_") or "layout"
     return make_layout(name, text)
-
-
-def find_layout(source: str) -> Layout:
-    """A layout by its name, by a maze's task id, or from a text file.
-
-    Raises:
-      UnknownNameError, LayoutError: there is none, or it cannot be used.
-    """
-    name = MazeName.parse(source) or MazeName(source)
-    if name.rows:
-        return make_layout(name.layout, name.rows)
-    if name.layout in LAYOUTS:
-        return get_layout(name.layout)
-    if Path(source).suffix or Path(source).exists():
-        return load_layout(source)
-    raise UnknownNameError("layout", source, LAYOUTS)
 
 
 def fixed_pairs(layout: Layout, count: int, seed: int) -> list[tuple[tuple[int, int], tuple[int, int]]]:
