@@ -11,7 +11,7 @@ trap 'rm -rf "$work"' EXIT
 venvs="${VENVS:-$work}"
 
 echo "making a walker and a maze release and their exports ..."
-python scripts/make_integration_exports.py "$work" "${chosen[@]}"
+python tests/integrations/heavy/make_exports.py "$work" "${chosen[@]}"
 
 make_venv() { # name, python, packages ...
   [ -e "$venvs/venv-$1/.ready" ] && return

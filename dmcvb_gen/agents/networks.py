@@ -60,15 +60,8 @@ class Architecture:
 PAPER = Architecture((32, 64, 128, 256), (2, 2, 1, 1))
 """The paper's: 64 x 64 pictures become 16 x 16 x 256 = 65,536 features, and 0.2 GFLOP a stack of 9 channels."""
 
-NARROW = Architecture((16, 32, 32, 64), (2, 2, 2, 1), "relu")
-"""For short trainings on a CPU: 8 x 8 x 64 = 4,096 features for a 23rd of the paper's work, without GELU, which takes
-a quarter of a step of so narrow a network and does not raise its score (`scripts/bench_profiles.py`)."""
-
 PATCHES = Architecture((64, 64, 64), (4, 2, 1), "relu", patch=True, differences=True, latent=256)
 """For short trainings on a CPU: 4x4 patches of the newest frame and of frame differences, 8 x 8 x 64 features."""
-
-NETWORKS = {"paper": PAPER, "narrow": NARROW, "patches": PATCHES}
-"""Name -> architecture."""
 
 
 def initialize(module: nn.Module) -> nn.Module:

@@ -11,7 +11,7 @@ TOP = Path(__file__).parents[2]
 
 
 def test_the_index_is_that_of_the_cards():
-    index = runpy.run_path(str(TOP / "scripts/make_card_index.py"))["index"]
+    index = runpy.run_path(str(TOP / "docs/_scripts/card_index.py"))["index"]
     page = (TOP / "dataset_cards/README.md").read_text()
     assert page == index()
     for path in (TOP / "dataset_cards").glob(f"*/{MANIFEST}"):

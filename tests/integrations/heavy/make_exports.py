@@ -1,6 +1,6 @@
 """Make small releases of a walker and a maze, export them, and keep the stored values beside, for the heavy tests.
 
-python scripts/make_integration_exports.py FOLDER lerobot tfds zarr2
+python tests/integrations/heavy/make_exports.py FOLDER lerobot tfds zarr2
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT))
 
 from dmcvb_gen.dataset import open_release  # noqa: E402

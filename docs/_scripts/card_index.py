@@ -1,7 +1,7 @@
 """Writes dataset_cards/README.md, the index of all cards, from the manifests beside them.
 
-python scripts/make_card_index.py
-python scripts/make_card_index.py --check    # exit code 1 where the index is not what the cards say
+python docs/_scripts/card_index.py
+python docs/_scripts/card_index.py --check    # exit code 1 where the index is not what the cards say
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
 
-CARDS = Path(__file__).parents[1] / "dataset_cards"
+CARDS = Path(__file__).parents[2] / "dataset_cards"
 HEAD = """# Data set cards
 
 Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
@@ -55,7 +55,7 @@ def main() -> int:
     page, text = CARDS / "README.md", index()
     if parser.parse_args().check:
         same = page.exists() and page.read_text() == text
-        print(f"{page} {'is up to date' if same else 'is out of date: python scripts/make_card_index.py'}")
+        print(f"{page} {'is up to date' if same else 'is out of date: python docs/_scripts/card_index.py'}")
         return 0 if same else 1
     page.write_text(text)
     print(f"wrote {page}")
