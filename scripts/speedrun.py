@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 
 from dmcvb_gen.dataset.manifest import environment
-from dmcvb_gen.policies.evaluation import evaluate
+from dmcvb_gen.policies.evaluation import FRESH, evaluate
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.tasks import get_task
@@ -70,7 +70,7 @@ def main() -> None:
             if mean < goal:
                 return
             newest = max((folder / "checkpoints").glob("[0-9]*.safetensors"))
-            fresh = evaluate(load_policy(newest, task), task, EPISODES, SEED)[0].mean
+            fresh = evaluate(load_policy(newest, task), task, EPISODES, SEED, streams=FRESH)[0].mean
             print(f"  {fresh:.0f} on {EPISODES} fresh episodes, {goal:.0f} is wanted", flush=True)
             if fresh >= goal:
                 raise Reached(fresh)

@@ -13,8 +13,8 @@ from dmcvb_gen.policies.archives import bundled_digests, bundled_file
 from dmcvb_gen.spec import TRAINED_LEVELS, MazeName, task_folder
 from dmcvb_gen.text import quoted
 
-CONVERTED = (".zip", ".pt", ".pth")
-"""Files of other programs' policies, which are converted: Stable-Baselines3's and torch's."""
+CONVERTED = (".zip", ".pt", ".pth", ".cleanrl_model")
+"""Files of other programs' policies, which are converted: Stable-Baselines3's, torch's and CleanRL's."""
 _MIXED = re.compile(r"mixed_([0-9]+)\.safetensors")
 
 

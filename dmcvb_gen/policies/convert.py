@@ -7,14 +7,15 @@ Nothing is unpickled: parameters are read by torch's weights-only loader, and of
     from                              body                            mean         noise
     SB3 SAC, TQC                      actor.latent_pi.0, .2, ...      actor.mu     actor.log_std
     SB3 TD3, DDPG                     actor.mu.0, .2, ...             the last     none
-    SB3 PPO, A2C                      mlp_extractor.policy_net.0, ... action_net   log_std
+    SB3 PPO, A2C, TRPO                mlp_extractor.policy_net.0, ... action_net   log_std
     CleanRL PPO (continuous)          actor_mean.0, .2, ...           the last     actor_logstd
     CleanRL SAC                       fc1, fc2, ...                   fc_mean      none: its bounds are CleanRL's own
     CleanRL TD3, DDPG                 fc1, fc2, ...                   fc_mu        none
     torch.nn.Sequential               0, 2, ...                       the last     none
 
 Sizes come from the weights and must fit the task. Converted policies act by our fixed-order arithmetic, so their data
-regenerate bit for bit; their actions agree with the other program's to rounding.
+regenerate bit for bit; their actions agree with the other program's to rounding, and where SB3 is installed that is
+checked with its own `predict`.
 """
 
 from __future__ import annotations
@@ -24,32 +25,34 @@ import hashlib
 import io
 import re
 import tempfile
-import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pydantic
 
 from dmcvb_gen.errors import PolicyFileError
-from dmcvb_gen.files import parse_json, sha256_file
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.policies.sb3_zip import Facts, facts_of, predict, read_members
 from dmcvb_gen.storage.remote import storage_errors
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.base import Task
 
 UNCLIPPED = 1e30
 """Stands for "not clipped" in a policy file's header."""
-MAX_BYTES = 2**30
-"""Largest parameters that are read out of a zip."""
-PARAMETERS, DATA = "policy.pth", "data"
-"""Members of an SB3 zip that are read."""
+NO_NOISE = -80.0
+"""Log standard deviation of a policy that keeps its mean action alone."""
+WRAPPERS = re.compile(r"^(_orig_mod\.|module\.)+")
+"""What torch.compile and DataParallel put before every name."""
+AGREEMENT = 1e-3
+"""Largest difference between our actions and SB3's, of a range from -1 to 1."""
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """Parameter names under which a program keeps the parts of an actor.
 
     Attributes:
@@ -59,26 +62,37 @@ class Layout:
       log_std: the layer of log standard deviations, or a vector of them.
       activation: None: must be given.
       distribution: None: must be given.
+      others: beginnings of the names of what is no part of the actor.
     """
 
     algorithm: str
     body: str
     mean: str | None
-    log_std: str | None = None
-    activation: str | None = "relu"
-    distribution: str | None = "deterministic"
+    log_std: str | None
+    activation: str | None
+    distribution: str | None
+    others: tuple[str, ...] = ()
 
 
+CRITICS = (
+    "critic",
+    "value_net.",
+    "mlp_extractor.value_net.",
+    "actor_target.",
+    "qf",
+    "fc_logstd.",
+    "action_scale",
+    "action_bias",
+)
 LAYOUTS = (
-    Layout("sb3", "actor.latent_pi.", "actor.mu", "actor.log_std", distribution="squashed_gaussian"),
-    Layout("sb3", "actor.mu.", None),
-    Layout("sb3", "mlp_extractor.policy_net.", "action_net", "log_std", "tanh", "gaussian"),
-    Layout("cleanrl", "actor_mean.", None, "actor_logstd", "tanh", "gaussian"),
-    Layout("cleanrl", "fc", "fc_mean"),
-    Layout("cleanrl", "fc", "fc_mu"),
+    Layout("sb3", "actor.latent_pi.", "actor.mu", "actor.log_std", "relu", "squashed_gaussian", CRITICS),
+    Layout("sb3", "actor.mu.", None, None, "relu", "deterministic", CRITICS),
+    Layout("sb3", "mlp_extractor.policy_net.", "action_net", "log_std", "tanh", "gaussian", CRITICS),
+    Layout("cleanrl", "actor_mean.", None, "actor_logstd", "tanh", "gaussian", CRITICS),
+    Layout("cleanrl", "fc", "fc_mean", None, "relu", "deterministic", CRITICS),
+    Layout("cleanrl", "fc", "fc_mu", None, "relu", "deterministic", CRITICS),
     Layout("torch", "", None, None, None, None),
 )
-
 PROGRAMS = {"sb3": "Stable-Baselines3", "cleanrl": "CleanRL"}
 """Algorithm of a layout -> the name of its program, for messages."""
 
@@ -126,30 +140,31 @@ def convert(
         that are not finite; or an option has no effect.
     """
     path, task = Path(path), get_task(task_id)
-    state, facts = _read(path)
-    layout, layers = _layout(path, state)
+    state, data = _read(path)
+    facts = None if data is None else facts_of(path, data)
+    layout, body, mean = _layout(path, state)
     if distribution is not None and layout.distribution is not None:
         raise PolicyFileError(
             f"--actions has no effect: {path} has an actor of {PROGRAMS[layout.algorithm]}, whose actions are known; "
             "remove it"
         )
-    noted, steps = _noted(path, facts)
-    activation = activation or noted or layout.activation
-    distribution = distribution if layout.distribution is None else layout.distribution
+    activation = activation or (facts and facts.activation) or layout.activation
+    distribution = layout.distribution or distribution
     if activation is None or distribution is None:
         raise PolicyFileError(f"{path} does not say its activation and its actions; give --activation and --actions")
-    body, mean = (layers, layout.mean) if layout.mean else (layers[:-1], layers[-1])
-    weights = _weights(path, state, body, str(mean), layout.log_std, distribution)
-    sizes = (weights["body.0.weight" if body else "mean.weight"].shape[1], weights["mean.weight"].shape[0])
+    weights = _weights(path, state, body, mean, layout.log_std, distribution)
+    sizes = weights["body.0.weight" if body else "mean.weight"].shape[1], weights["mean.weight"].shape[0]
     widths = tuple(int(weights[f"body.{2 * index}.weight"].shape[0]) for index in range(len(body)))
-    if sizes != (task.behaviour_size, task.action_size) or (hidden is not None and tuple(hidden) != widths):
-        asked = task.behaviour_size, *(hidden if hidden is not None else widths), task.action_size
-        found = sizes[0], *widths, sizes[1]
+    _check_sizes(path, task, sizes, widths, hidden)
+    if facts:
+        _check_actions(path, task, facts.low, facts.high)
+    if facts and facts.normalized and statistics is None:
         raise PolicyFileError(
-            f"{path} has layers of {' x '.join(map(str, found))}, {task_id} and the sizes given ask for "
-            f"{' x '.join(map(str, asked))} (observation, hidden, action); train it on this task"
+            f"{path} was trained behind VecNormalize, whose numbers are not in it; give its mean and std of "
+            "observations with --statistics (0 and 1 if it normalized rewards alone)"
         )
     weights |= _normalization(statistics, task.behaviour_size)
+    normalizes = bool(weights["observation_mean"].any() or (weights["observation_std"] != 1).any())
     header = _header(
         path,
         task=task_id,
@@ -157,15 +172,19 @@ def convert(
         observation_size=sizes[0],
         action_size=sizes[1],
         algorithm=layout.algorithm,
-        agent_step=steps,
+        agent_step=facts.steps if facts else 0,
         level=level,
         hidden=widths,
         activation=activation,
         distribution=distribution,
-        clip_observation=UNCLIPPED if statistics is None else 10.0,
+        clip_observation=10.0 if normalizes else UNCLIPPED,
         training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
     )
     _check_weights(path, header, weights)
+    if facts:
+        _compare(path, header, weights, facts, state)
+        first = "body.0.weight" if body else "mean.weight"
+        weights[first] = weights[first][:, np.argsort(_order(path, task, facts))]
     return header, weights
 
 
@@ -185,15 +204,12 @@ def convert_file(path: str | Path, task_id: str, out: str | Path, **options: Any
 # -- reading --------------------------------------------------------------------------------------
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Parameters by name, and the plain facts of an SB3 zip's `data` (none of a state dict)."""
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
+    """Parameters by name, and the JSON of an SB3 zip (None of a state dict)."""
     import torch
 
     try:
-        if path.suffix == ".zip":
-            data, facts = _sb3_members(path)
-        else:
-            data, facts = path.read_bytes(), {}
+        data, facts = read_members(path) if path.suffix == ".zip" else (path.read_bytes(), None)
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except OSError as error:
         raise PolicyFileError(f"cannot read {path}: {error.strerror or error}; give the path of a policy") from None
@@ -209,58 +225,92 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise PolicyFileError(
             f"{path} holds no state dict of tensors; save one with torch.save(actor.state_dict(), ...)"
         )
-    return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}, facts
-
-
-def _sb3_members(path: Path) -> tuple[bytes, dict[str, Any]]:
-    with zipfile.ZipFile(path) as archive:
-        members = {info.filename: info for info in archive.infolist()}
-        if PARAMETERS not in members or DATA not in members:
-            raise ValueError(f"no {PARAMETERS} and {DATA} inside, so it is no zip of Stable-Baselines3")
-        if max(members[PARAMETERS].file_size, members[DATA].file_size) > MAX_BYTES:
-            raise ValueError("its parameters are larger than 1 GiB")
-        facts = parse_json(archive.read(DATA))
-        return archive.read(PARAMETERS), facts if isinstance(facts, dict) else {}
-
-
-def _noted(path: Path, facts: Mapping[str, Any]) -> tuple[str | None, int]:
-    """Activation (None: the default) and steps that an SB3 zip's `data` notes in plain text."""
-    if facts.get("use_sde"):
-        raise PolicyFileError(f"{path} was trained with use_sde=True, which we do not have; train it without")
-    kwargs = facts.get("policy_kwargs")
-    function = kwargs.get("activation_fn") if isinstance(kwargs, dict) else None
-    steps = facts.get("num_timesteps")
-    steps = steps if isinstance(steps, int) and steps >= 0 else 0
-    if function is None:
-        return None, steps
-    name = re.sub(r"\W+$", "", str(function)).rsplit(".", 1)[-1].lower()
-    if name not in ("relu", "tanh", "elu", "gelu"):
-        raise PolicyFileError(f"{path} has activation {name!r}; only relu, tanh, elu and gelu can be converted")
-    return name, steps
+    arrays = {name: value.detach().to(torch.float32).numpy() for name, value in state.items()}
+    return {WRAPPERS.sub("", str(name)): value for name, value in arrays.items()}, facts
 
 
 # -- the parts of an actor ------------------------------------------------------------------------
 
 
-def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[str]]:
-    """The layout whose names a state dict has, and its numbered layers in order."""
+def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[str], str]:
+    """The layout whose names a state dict has, its hidden layers in order, and the layer that gives the mean."""
     for layout in LAYOUTS:
         pattern = re.compile(rf"{re.escape(layout.body)}(\d+)\.weight")
         numbers = sorted(int(found[1]) for found in map(pattern.fullmatch, state) if found)
-        if numbers and (layout.mean is None or f"{layout.mean}.weight" in state):
-            strange = [name for name in state if name.startswith(("features_extractor.", "pi_features_extractor."))]
-            layers = [f"{layout.body}{number}" for number in numbers]
-            dense = [*layers, layout.mean] if layout.mean else layers
-            strange += [name for name in dense if state[f"{name}.weight"].ndim != 2]
-            if strange:
-                raise PolicyFileError(
-                    f"{path} has {strange[0]!r}, which is no dense layer; only plain MLPs can be converted"
-                )
-            return layout, layers
+        layers = [f"{layout.body}{number}" for number in numbers if state[f"{layout.body}{number}.weight"].ndim == 2]
+        if layers and (layout.mean is None or f"{layout.mean}.weight" in state):
+            layers += [layout.mean] if layout.mean else []
+            used = {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
+            used |= {f"{layout.log_std}{part}" for part in ("", ".weight", ".bias")}
+            for name in state:
+                if name not in used and not name.startswith(layout.others or "\0"):
+                    raise PolicyFileError(
+                        f"{path} has {name!r}, which is no part of a plain MLP; only plain MLP actors can be "
+                        "converted, so train it without"
+                    )
+            return layout, layers[:-1], layers[-1]
     raise PolicyFileError(
         f"{path} has none of the actors that are known (it has {', '.join(list(state)[:3]) or 'nothing'}, ...); save "
         "the actor as a torch.nn.Sequential's state dict"
     )
+
+
+def _check_sizes(
+    path: Path, task: Task, sizes: tuple[int, int], widths: tuple[int, ...], hidden: Sequence[int] | None
+) -> None:
+    if sizes == (task.behaviour_size, task.action_size) and (hidden is None or tuple(hidden) == widths):
+        return
+    asked = task.behaviour_size, *(hidden if hidden is not None else widths), task.action_size
+    found = sizes[0], *widths, sizes[1]
+    raise PolicyFileError(
+        f"{path} has layers of {' x '.join(map(str, found))}, {task.id} and the sizes given ask for "
+        f"{' x '.join(map(str, asked))} (observation, hidden, action); train it on this task"
+    )
+
+
+def _check_actions(path: Path, task: Task, low: np.ndarray, high: np.ndarray) -> None:
+    """Refuse an actor whose actions have other bounds than the task's, as nobody says how its environment took them."""
+    if (low != -1).any() or (high != 1).any():
+        raise PolicyFileError(
+            f"{path} acts from {np.round(low, 6).tolist()} to {np.round(high, 6).tolist()}, {task.id} takes actions "
+            "from -1 to 1; train it with the task's own bounds"
+        )
+
+
+def _order(path: Path, task: Task, facts: Facts) -> np.ndarray:
+    """(observation,) int: the place in the task's observation of each number that the actor takes."""
+    if facts.fields is None:
+        return np.arange(task.behaviour_size)
+    ours = task.state_fields if task.observation == "state" else {}
+    if dict(facts.fields) != dict(ours):
+        raise PolicyFileError(
+            f"{path} observes {facts.fields}, {task.id} shows {dict(ours) or task.observation}; train it on "
+            "observations with these names and sizes"
+        )
+    places = np.arange(task.behaviour_size)
+    return np.concatenate([places[task.state_slices[name]] for name in facts.fields])
+
+
+def _compare(
+    path: Path,
+    header: PolicyHeader,
+    weights: Mapping[str, np.ndarray],
+    facts: Facts,
+    state: Mapping[str, np.ndarray],
+) -> None:
+    """Refuse a policy that acts otherwise than SB3 does on normalized observations in the zip's order."""
+    size = header.observation_size
+    seen = np.random.default_rng(0).normal(size=(64, size)).astype(np.float32)
+    actor = {name: value for name, value in state.items() if not name.startswith(CRITICS)}
+    theirs = predict(facts, actor, header.distribution, header.hidden, seen)
+    plain = header.model_copy(update={"clip_observation": UNCLIPPED})
+    ours = Policy(plain, {**weights, **_normalization(None, size)}, "").act(seen, deterministic=True)
+    off = 0.0 if theirs is None else float(np.abs(ours - theirs).max())
+    if off > AGREEMENT:
+        raise PolicyFileError(
+            f"{path} acts by {off:.2g} otherwise than Stable-Baselines3 does; it has a part that is not known here, so "
+            "give it as a function of your own with --behaviour MODULE:FUNCTION"
+        )
 
 
 def _weights(
@@ -276,7 +326,7 @@ def _weights(
         }
         if distribution == "gaussian":
             size = len(weights["mean.bias"])
-            weights["log_std_vector"] = state[log_std].reshape(size) if log_std else np.full(size, -80.0, np.float32)
+            weights["log_std_vector"] = state[log_std].reshape(size) if log_std else np.full(size, NO_NOISE, np.float32)
     except (KeyError, ValueError, TypeError) as error:
         raise PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict") from None
     scale, bias = state.get("action_scale"), state.get("action_bias")

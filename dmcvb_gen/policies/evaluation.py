@@ -10,11 +10,23 @@ from dmcvb_gen.policies.header import Evaluation
 from dmcvb_gen.policies.simulate import Simulation, simulate
 from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
 
+FRESH = "selection"
+"""Streams of the episodes that decide which checkpoint is picked: a training's evaluations see none of them."""
+
 
 def evaluate(
-    policy: Policy, task: Task, episodes: int = 100, seed: int = 1, deterministic: bool = True, threads: int = 1
+    policy: Policy,
+    task: Task,
+    episodes: int = 100,
+    seed: int = 1,
+    deterministic: bool = True,
+    threads: int = 1,
+    streams: str = "evaluation",
 ) -> tuple[Evaluation, Simulation]:
     """Roll a policy out over fresh episodes (streams of their own, apart from every release's).
+
+    Args:
+      streams: name of the episodes' streams; `FRESH` has none of the episodes that trainings are evaluated on.
 
     Returns:
       Return statistics, and the episodes they come from.
@@ -24,7 +36,7 @@ def evaluate(
         [policy],
         range(episodes),
         seed,
-        (task.id, "evaluation"),
+        (task.id, streams),
         deterministic=deterministic,
         threads=threads,
     )

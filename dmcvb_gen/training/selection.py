@@ -24,7 +24,7 @@ from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
-from dmcvb_gen.policies.evaluation import evaluate
+from dmcvb_gen.policies.evaluation import FRESH, evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
@@ -308,7 +308,7 @@ def select_checkpoints(
             expect(progress, max(len(measured) + 1, MAZE_CHECKPOINTS if mazes else 1 + CANDIDATES // 2 + MIXED_COUNT))
             progress(f"step {int(path.stem):,}")
             policy = load_policy(path, task)
-            measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic)[0]
+            measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic, streams=FRESH)[0]
         return measured[path][1]
 
     def pick() -> Selection:
@@ -347,7 +347,7 @@ def _base(task: Task, episodes: int, seed: int) -> float:
     """Return at 0 % of the way: that of random actions where returns may be negative, else 0."""
     if task.return_range[0] >= 0:
         return 0.0
-    return evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed)[0].mean
+    return evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed, streams=FRESH)[0].mean
 
 
 def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from sb3_contrib import CrossQ, RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from dmcvb_gen.cli import main
@@ -189,16 +191,62 @@ SB3 = {
 }
 
 
+@pytest.mark.parametrize("named", [False, True], ids=["vector", "fields"])
 @pytest.mark.parametrize("name", SB3)
-def test_an_sb3_policy_acts_as_sb3_does(task, name, tmp_path):
+def test_an_sb3_policy_acts_as_sb3_does(task, name, named, tmp_path):
+    """Observations of a Dict space reach SB3's networks in the alphabetical order of their names, not in the task's."""
+    if named and task.id != WALKER:
+        return
     algorithm, arguments = SB3[name]
-    made = model(algorithm, task, **arguments)
+    space = Space(task)
+    seen = np.random.default_rng(0).normal(size=(5, task.behaviour_size)).astype(np.float32)
+    parts = {field: seen[:, part] for field, part in task.state_slices.items()} if named else seen
+    if named:
+        boxes = {field: gymnasium.spaces.Box(-9, 9, part.shape[1:], np.float32) for field, part in parts.items()}
+        space.observation_space = gymnasium.spaces.Dict(boxes)
+    made = algorithm("MultiInputPolicy" if named else "MlpPolicy", space, seed=0, device="cpu", **arguments)
     made.save(tmp_path / "model.zip")
     header, weights = convert(tmp_path / "model.zip", task.id)
     save_policy(tmp_path / "p.safetensors", header, weights)
-    seen = np.random.default_rng(0).normal(size=(5, task.behaviour_size)).astype(np.float32)
-    theirs, _ = made.predict(seen, deterministic=True)
+    theirs, _ = made.predict(parts, deterministic=True)
     np.testing.assert_allclose(load_policy(tmp_path / "p.safetensors").act(seen, None, True), theirs, atol=1e-5)
+
+
+class Doubled(FlattenExtractor):
+    def forward(self, observations):
+        return 2 * super().forward(observations)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs", "change", "words"),
+    [
+        (SAC, {}, {"low": 0.0}, "acts from [0.0, 0.0"),
+        (TD3, {}, {"high": 2.0}, "train it with the task's own bounds"),
+        (PPO, {"n_steps": 8, "batch_size": 8}, {"low": -2.0, "high": 2.0}, "acts from [-2.0, -2.0"),
+        (SAC, {"policy_kwargs": {"features_extractor_class": Doubled}}, {}, "a features extractor (Doubled)"),
+        (PPO, {"n_steps": 8, "batch_size": 8, "use_sde": True}, {}, "use_sde"),
+        (CrossQ, {}, {}, "'actor.latent_pi.0.scale', which is no part of a plain MLP"),
+        (RecurrentPPO, {"n_steps": 8, "batch_size": 8}, {}, "a recurrent part (LSTM)"),
+        (SAC, {}, {"names": ("a", "b")}, "observes {'a': 12, 'b': 12}, walker-walk shows {'orientations': 14"),
+        (SAC, {}, {"normalized": True}, "VecNormalize"),
+    ],
+)
+def test_what_is_not_a_plain_mlp_on_the_tasks_own_spaces_is_refused_and_named(
+    algorithm, kwargs, change, words, tmp_path
+):
+    task = get_task(WALKER)
+    space, kind = Space(task), "MlpLstmPolicy" if algorithm is RecurrentPPO else "MlpPolicy"
+    bounds = change.get("low", -1.0), change.get("high", 1.0)
+    space.action_space = gymnasium.spaces.Box(*bounds, (task.action_size,), np.float32)
+    if names := change.get("names"):
+        part, kind = gymnasium.spaces.Box(-9, 9, (task.behaviour_size // len(names),), np.float32), "MultiInputPolicy"
+        space.observation_space = gymnasium.spaces.Dict(dict.fromkeys(names, part))
+    made = algorithm(kind, space, device="cpu", **kwargs)
+    if change.get("normalized"):
+        made._last_original_obs = np.zeros((1, task.behaviour_size), np.float32)  # as SB3 keeps it behind VecNormalize
+    made.save(tmp_path / "model.zip")
+    assert words in refused("convert-policy", tmp_path / "model.zip", WALKER, "--out", tmp_path / "p.safetensors")
+    assert not (tmp_path / "p.safetensors").exists()
 
 
 def test_data_of_an_sb3_zip_regenerate_bit_for_bit(task, tmp_path):
@@ -262,6 +310,18 @@ class CleanRlPpo(nn.Module):
 
     def forward(self, x):
         return self.actor_mean(x).clip(-1, 1)
+
+
+@pytest.mark.parametrize("wrapper", ["", "_orig_mod.", "module."])
+def test_what_torch_puts_before_names_and_cleanrls_own_ending_are_read(wrapper, tmp_path):
+    task = get_task(WALKER)
+    actor, path = CleanRlSac(task.behaviour_size, task.action_size), tmp_path / "sac.cleanrl_model"
+    torch.save(({f"{wrapper}{name}": value for name, value in actor.state_dict().items()}, {}, {}), path)
+    header, weights = convert(path, WALKER)
+    save_policy(tmp_path / "p.safetensors", header, weights)
+    seen = np.random.default_rng(0).normal(size=(5, task.behaviour_size)).astype(np.float32)
+    theirs = actor(torch.from_numpy(seen)).detach().numpy()
+    np.testing.assert_allclose(load_policy(tmp_path / "p.safetensors").act(seen, None, True), theirs, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", [CleanRlSac, CleanRlPpo])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import shlex
 from pathlib import Path
@@ -15,7 +16,9 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.own_code import TASKS, allow
+from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import level_files
+from dmcvb_gen.policies.evaluation import FRESH, evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import read_header, save_policy
@@ -60,6 +63,15 @@ def select(returns, base=0.0, noise=0.0, fresh=None):
         return Evaluation(mean=value, std=abs(noise), episodes=100, mode="mean", seed=0)
 
     return pick_checkpoints(curve, base, converge([p[0] for p in curve], seen, base), measure)
+
+
+@pytest.mark.parametrize("step", [0, 20_000])
+def test_the_episodes_that_decide_are_none_that_a_training_was_evaluated_on(step):
+    task = get_task("cartpole-swingup")
+    policy = random_policy(task)
+    seen, fresh = (evaluate(policy, task, 2, step, streams=name)[1] for name in ("evaluation", FRESH))
+    assert not np.isin(fresh.state[:, 0], seen.state[:, 0]).any()
+    assert inspect.signature(evaluate).parameters["streams"].default == "evaluation"  # a training's
 
 
 def test_a_monotone_curve_gives_the_first_at_95_and_the_one_at_50():
