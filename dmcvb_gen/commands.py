@@ -70,7 +70,6 @@ def rollout(
     size: int | None = None,
     renderer: str | None = None,
     samples: Samples | None = None,
-    device: str | None = None,
     backgrounds: Location | None = None,
     split: Split | None = None,
     behaviour: Location | None = None,
@@ -116,9 +115,8 @@ def rollout(
       episode_range (RANGE): Generate only the shards with episodes A to B - 1.
       seed: Random seed of the release. [default: 0]
       size: Width and height of the images, in pixels. [default: 64]
-      renderer: native, warp or opengl. [default: native; with --device cuda: warp]
-      samples: Samples per pixel: 1, 2, 4 or 8; native has 4. [default: warp 2, others 4]
-      device: Device that renders: cpu, or cuda with warp. [default: cpu]
+      renderer: native or opengl. [default: native if it paints the tasks]
+      samples: Samples per pixel: 1, 2, 4 or 8; native has 4. [default: 4]
       backgrounds: Background videos: builtin, or a folder. [default: builtin]
       split: Background videos and maze styles: train or val. [default: train]
       behaviour (BEHAVIOUR): Policy instead of the bundled one: a policy file, a training run, an SB3
@@ -160,7 +158,6 @@ def paint(
     views: Names | None = None,
     goal: GoalPictures | None = None,
     workers: Workers = 1,
-    device: str = "cpu",
     backgrounds: Location | None = None,
     progress: bool = True,
     notify: Callable[[str], None] = ignore,
@@ -175,7 +172,6 @@ def paint(
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
       goal: Mazes: render only images with, or without, the goal. [default: both]
       workers: Worker processes.
-      device: Device that renders: cpu, or cuda with warp.
       backgrounds (FOLDER): Folder of the background videos, if the release has no copies.
 
     `notify` is called with each difference to the environment that made the release, before rendering.
@@ -194,7 +190,7 @@ def paint(
         )
     release = local_path(release)
     with progress_bar(progress, " frames") as bar:
-        config = _render_config(size, views, goal, backgrounds, workers, device, bar, notify)
+        config = _render_config(size, views, goal, backgrounds, workers, bar, notify)
         return paint_release(release, as_names(only), episodes, config)
 
 
@@ -211,7 +207,6 @@ def repaint(
     backgrounds: Location | None = None,
     split: Split | None = None,
     labels: Names = (),
-    device: str = "cpu",
     name: str | None = None,
     out: Local,
     workers: Workers = 1,
@@ -225,12 +220,11 @@ def repaint(
       distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: the subset's own]
       difficulty: Strength of the distractors. [default: the subset's own; medium with --distractor]
       size: Width and height in pixels. [default: the subset's own]
-      renderer: native, warp or opengl. [default: the subset's own]
+      renderer: native or opengl. [default: the subset's own]
       samples: Samples per pixel: 1, 2, 4 or 8.
       backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
       split: Background videos and maze styles. [default: the recipe's]
       labels: Also store a modality: depth, segmentation, parts, flow (optical flow to the next frame) or your own.
-      device: Device that renders: cpu, or cuda with warp.
       name: Name of the new release. [default: NAME-repainted]
       out (FOLDER): Folder of the new release.
       workers: Worker processes.
@@ -242,7 +236,7 @@ def repaint(
     from dmcvb_gen.generate.repaint import repaint as run
     from dmcvb_gen.loaders.release import open_for_reading
 
-    look = (distractor, difficulty, size, renderer, samples, _videos(backgrounds), split, device)
+    look = (distractor, difficulty, size, renderer, samples, _videos(backgrounds), split)
     with progress_bar(progress, " frames") as bar:
         run(Repainting(release, out, as_names(only), *look, tuple(dict.fromkeys(as_names(labels))), name), workers, bar)
     return open_for_reading(str(out))
@@ -258,7 +252,6 @@ def regenerate(
     check: bool = False,
     out: Local | None = None,
     backgrounds: Location | None = None,
-    device: str | None = None,
     workers: Workers = 1,
     progress: bool = True,
 ) -> "Outcome":
@@ -272,7 +265,6 @@ def regenerate(
       check: Compare digests and change nothing.
       out (FOLDER): Write the shards to this folder instead.
       backgrounds (FOLDER): Folder of the background videos, if it has moved.
-      device: Render on cpu or cuda instead of the manifest's device.
       workers: Worker processes.
 
     Raises:
@@ -297,7 +289,7 @@ def regenerate(
         source = release if manifest is None else stack.enter_context(manifest_source(manifest))
         assert source is not None
         bar = stack.enter_context(progress_bar(progress, " frames"))
-        work = Regeneration(source, as_names(only), episodes, videos, device, workers)
+        work = Regeneration(source, as_names(only), episodes, videos, workers)
         return work.remake(out, bar) if out else work.check(bar) if check else work.repair(bar)
 
 
@@ -428,7 +420,7 @@ def download(options: Mapping[str, Any], notify: Callable[[str], None] = ignore)
         progress_bar(options["progress"], "B", "fetched") as moved,
         progress_bar(options["progress"], " frames", "painted") as frames,
     ):
-        painter = _render_config(*look, None, usable_cores(), "cpu", frames, notify)
+        painter = _render_config(*look, None, usable_cores(), frames, notify)
         return fetch_and_paint(*what, painter=painter, tick=moved, **given)
 
 
@@ -605,11 +597,11 @@ def _videos(backgrounds: Location | None) -> str | None:
     return None if backgrounds is None else background_source(backgrounds)
 
 
-def _render_config(size, views, goal, backgrounds, workers, device, bar, notify) -> Any:
+def _render_config(size, views, goal, backgrounds, workers, bar, notify) -> Any:
     from dmcvb_gen.generate.paint import RenderConfig, RenderOverrides
 
     overrides = RenderOverrides(size, None if views is None else as_names(views), goal)
-    return RenderConfig(overrides, workers, device, _videos(backgrounds), bar, notify)
+    return RenderConfig(overrides, workers, _videos(backgrounds), bar, notify)
 
 
 @contextmanager

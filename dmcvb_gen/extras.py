@@ -8,7 +8,6 @@ EXTRAS = {
     "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
     "pictures": ("imageio_ffmpeg", "matplotlib"),
     "xarray": ("xarray",),
-    "gpu": ("mujoco_warp", "warp"),
     "s3": ("s3fs",),
     "gs": ("gcsfs",),
     "hf": ("huggingface_hub", "pyarrow"),
@@ -25,8 +24,6 @@ SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safe
 _PACKAGES = {
     "stable_baselines3": "stable-baselines3",
     "sb3_contrib": "sb3-contrib",
-    "mujoco_warp": "mujoco-warp",
-    "warp": "warp-lang",
     "rerun": "rerun-sdk",
     "skfmm": "scikit-fmm",
     "dm_control": "dm-control",

@@ -53,7 +53,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", nargs="+", default=[*LOCOMOTION_TASKS, "ant-maze-medium7x7a"])
     parser.add_argument("--settings", nargs="+", default=["none", "static", "dynamic"])
-    parser.add_argument("--renderers", nargs="+", default=["native", "warp"])
+    parser.add_argument("--renderers", nargs="+", default=["native"])
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--frames", type=int, default=512, help="OpenGL paints an eighth of them")
     parser.add_argument("--out", help="side-by-side PNG: OpenGL, then the others")

@@ -213,11 +213,8 @@ class Evaluator:
                 scene.size,
                 backgrounds=self._videos,
                 floor_alpha=floor_alpha_for(self.task, self.setting),
-                device="cuda" if str(device).startswith("cuda") and scene.renderer == "warp" else "cpu",
                 samples=scene.samples,
             )
-            if hasattr(self.renderer, "worlds"):
-                self.renderer.worlds = episodes  # frames a launch: more would only be padding
 
     def close(self) -> None:
         """Free the renderer."""

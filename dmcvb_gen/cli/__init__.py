@@ -27,7 +27,6 @@ GROUPS = {
         "paint": ("paint:paint", "Render the images of a release stored without pixels."),
         "repaint": ("release:repaint", "Render stored episodes again: other distractors, size or renderer."),
         "regenerate": ("release:regenerate", "Generate a release again from its manifest: check, repair or copy."),
-        "backgrounds": ("backgrounds:backgrounds", "Make background clips of falling objects."),
     },
     "Train policies": {
         "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),

@@ -20,7 +20,7 @@ OPTION_GROUPS = {
     "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count", "correlated"),
     "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
-    "Images": ("size", "renderer", "samples", "device", "backgrounds", "split", "pixels"),
+    "Images": ("size", "renderer", "samples", "backgrounds", "split", "pixels"),
     "Where": ("out", "storage_options", "scratch", "scratch_size"),
     "Workers and many machines": (
         *("workers", "executor", "ray_address", "init", "part", "finishing", "other_versions", "slurm_script"),
@@ -73,7 +73,7 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
         return _finish(target, finish_target, as_json)
     plan = rollout_plan(options, request, target)
     if request:
-        _tell_what_is_asked(request, options)
+        _tell_what_is_asked(request)
     _tell_what_is_there(plan, shared=dry_run or init or bool(options["part"]))
     _tell_what_stays(plan, options)
     if dry_run:
@@ -84,13 +84,11 @@ def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options
     _run(plan, workers, as_json, whole=not options["part"])
 
 
-def _tell_what_is_asked(request, options):
-    """Notes on another renderer than the usual one, and on the use of one's own videos."""
+def _tell_what_is_asked(request):
+    """A note on the use of one's own videos."""
     from dmcvb_gen.distractors.backgrounds import videos_by_split
 
-    device, source, split = options["device"] or "cpu", request.backgrounds, request.split
-    if device != "cpu" and not options["recipe"] and not options["renderer"]:
-        click.echo(f"Using the warp renderer: native does not support {device.upper()}.", err=True)
+    source, split = request.backgrounds, request.split
     if source != "builtin" and (counts := videos_by_split(source)):
         other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
         click.echo(

@@ -35,8 +35,6 @@ def check_exclusive_options(context: click.Context) -> None:
     if not is_url(context.params["out"] or ""):
         in_place = ("storage_options", "scratch", "scratch_size")
         refuse(context, in_place, "--out is no URL, so shards are made in place")
-    if is_given(context, "pixels"):
-        refuse(context, ("device",), "--no-pixels paints nothing; name the renderer by --renderer")
 
 
 def refuse(context: click.Context, names: tuple[str, ...], reason: str) -> None:

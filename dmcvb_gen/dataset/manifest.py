@@ -277,22 +277,20 @@ def shard_episodes(subset: SubsetRecord, shard: int) -> tuple[int, int]:
     return first, min(first + subset.episodes_per_shard, subset.episodes)
 
 
-def environment(device: str = "cpu") -> dict[str, str]:
-    """Versions, processor and painting device that can change a bit of the data."""
-    return dict(_environment(device))
+def environment() -> dict[str, str]:
+    """Versions and the processor that can change a bit of the data."""
+    return dict(_environment())
 
 
 @functools.cache
-def _environment(device: str) -> dict[str, str]:
+def _environment() -> dict[str, str]:
     packages: tuple[str, ...] = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
-    packages += ("mujoco-warp", "warp-lang") if device != "cpu" else ()
     versions = {name: version for name in packages if (version := _version(name))}
     return {
         "dmcvb-gen": __version__,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "cpu": _cpu_name(),
-        "device": device,
         **versions,
     }
 

@@ -188,7 +188,7 @@ def shard_arrays(
       (name, (episode, row, ...)), or (name, (episode,)) for arrays without steps.
     """
     task, length, rows = get_task(record.task), episodes.length, episodes.physics.shape[1]
-    renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds, job.device)
+    renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds)
     labels = episodes.labels
     if labels is None:
         streams, states = (record, job.seed, job.names, episodes.index), (episodes.physics, length)
@@ -222,7 +222,7 @@ def _write_and_commit(
     Raises:
       StoreError: it cannot be written, or another machine has committed this shard with other bytes.
     """
-    made_by = environment(job.device)
+    made_by = environment()
     if job.stored and job.in_place:
         subset = job.stored.subset
         added = write_pictures(Path(subset.root), record, subset.commits[job.shard], arrays, made_by)

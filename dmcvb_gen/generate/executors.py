@@ -22,8 +22,6 @@ from dmcvb_gen.text import format_bytes
 
 PROCESS_BYTES = 1 << 30
 """Memory that a worker takes before it holds any episode: libraries, models, a renderer's buffers."""
-GPU_SHARE = 0.25
-"""Share of a GPU for a worker that renders there; it spends the rest of its time simulating."""
 
 
 def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallback = ignore) -> Iterator[JobResult]:
@@ -151,8 +149,7 @@ def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
 
 def needs_of(jobs: Sequence[Job]) -> Needs:
     """Return the most memory and scratch space that any job takes."""
-    cuda = any(job.device != "cpu" for job in jobs)
-    return Needs(memory=max(map(_memory, jobs), default=0), gpus=GPU_SHARE if cuda else 0)
+    return Needs(memory=max(map(_memory, jobs), default=0))
 
 
 def _memory(job: Job) -> int:

@@ -46,7 +46,6 @@ class Job:
       shard: index of the shard.
       inputs: policies and videos; None: the release's own copies.
       seed, names: the random streams of the episodes.
-      device: renders the pictures, "cpu" or "cuda".
       stored: source that states are read from; None: they are simulated.
       labels: "depth", "segmentation" and "flow", stored beside the pixels.
     """
@@ -57,7 +56,6 @@ class Job:
     inputs: Inputs | None
     seed: int
     names: tuple[str, ...]
-    device: str = "cpu"
     stored: Stored | None = None
     labels: tuple[str, ...] = ()
 
@@ -81,7 +79,6 @@ def make_jobs(
     shards: Mapping[ShardKey, SubsetRecord],
     target: Target,
     inputs: Mapping[str, Inputs] | None = None,
-    device: str | None = None,
     stored: Mapping[str, Stored] | None = None,
     labels: tuple[str, ...] = (),
 ) -> tuple[Job, ...]:
@@ -90,7 +87,6 @@ def make_jobs(
     Args:
       target: the release that the jobs write to.
       inputs: inputs of each subset, by name; the release's own copies by default.
-      device: render there instead of on the manifest's device.
       stored: source of the states of each subset, by name; by default they are simulated.
       labels: see `Job`.
 
@@ -101,14 +97,13 @@ def make_jobs(
     for (name, shard), record in shards.items():
         if record.setting == FIXED and not (record.fixed_goals and record.episodes_per_goal):
             raise RecipeError(f"the manifest does not say the goals of {name}; make it from its recipe again")
-        where = device or record.renderer.get("device") or "cpu"
         seed = manifest.recipe_of(name).get("seed", 0)
         source = stored[name] if stored else None  # which no two subsets share
-        key = (*_trajectory(manifest, record), source, seed, shard, inputs and inputs[name], where)
+        key = (*_trajectory(manifest, record), source, seed, shard, inputs and inputs[name])
         groups.setdefault(key, []).append(record)
     return tuple(
-        Job(target, tuple(records), shard, given, seed, names, where, source, labels)
-        for (names, *_, source, seed, shard, given, where), records in groups.items()
+        Job(target, tuple(records), shard, given, seed, names, source, labels)
+        for (names, *_, source, seed, shard, given), records in groups.items()
     )
 
 

@@ -47,8 +47,6 @@ from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import quoted
 
-ABOUT_THE_PLACE = ("device",)
-"""What a painter says of itself that decides no pixel on a CPU."""
 REPAINTED = "-repainted"
 """What the name of a release ends in that is painted otherwise than it was published."""
 
@@ -100,7 +98,6 @@ class RenderConfig:
     Attributes:
       overrides: pictures other than the manifest's.
       workers: processes, or a Ray cluster that sees the same folder.
-      device: "cpu" or "cuda".
       backgrounds: folder of the videos, if the release has no copies.
       progress: called with the number of frames rendered since the last call.
       notify: called with a line for each difference to the environment that made the release, before rendering.
@@ -108,7 +105,6 @@ class RenderConfig:
 
     overrides: RenderOverrides = RenderOverrides()
     workers: Workers = 1
-    device: str = "cpu"
     backgrounds: str | None = None
     progress: ProgressCallback = ignore
     notify: Callable[[str], None] = field(default=ignore)
@@ -226,7 +222,7 @@ class RenderSession:
             if old[name].pixels or name in painted:
                 raise _has_others(old[name])
         sources = {name: background_source(root, new[name], config.backgrounds) for name in sorted(needed)}
-        differences = render_differences(manifest, [new[name] for name in sorted(needed)], sources, config.device)
+        differences = render_differences(manifest, [new[name] for name in sorted(needed)], sources)
         for text in differences:
             config.notify(text)
         known = frozenset(name for name, record in new.items() if record.size == old[name].size) - _resized(manifest)
@@ -267,7 +263,7 @@ class RenderSession:
             return None
         source = Stored(Subset(str(self.root), record, {shard: commit}, {}), in_place=True)
         inputs = Inputs(backgrounds=self.backgrounds[name])
-        return Job(Target.at(self.root), (record,), shard, inputs, 0, (), self.config.device, source)
+        return Job(Target.at(self.root), (record,), shard, inputs, 0, (), source)
 
     def _compared(self, job: Job, painted: CommitRecord) -> tuple[str, bool, bool]:
         assert job.stored
@@ -304,7 +300,7 @@ def _has_others(record: SubsetRecord) -> StoreError:
 
 
 def render_differences(
-    manifest: Manifest, records: Iterable[SubsetRecord], backgrounds: Mapping[str, str], device: str = "cpu"
+    manifest: Manifest, records: Iterable[SubsetRecord], backgrounds: Mapping[str, str]
 ) -> tuple[str, ...]:
     """List what may change pixels here compared with the release's origin: versions, processor, renderer.
 
@@ -315,14 +311,13 @@ def render_differences(
     found: dict[str, None] = {}
     records = list(records)
     for record in records:
-        here = painting_facts(record, backgrounds[record.name], device)["renderer"]
+        here = painting_facts(record, backgrounds[record.name])["renderer"]
         for name in sorted(set(here) | set(record.renderer)):
             was, now = record.renderer.get(name, "nothing"), here.get(name, "nothing")
-            if name not in ABOUT_THE_PLACE and was != now:
+            if was != now:
                 found[f"{record.renderer['name']}'s {name} is {now} here, {was} in the manifest"] = None
     for name, (there, now) in environment_diff(manifest).items() if records else ():
-        if name not in ABOUT_THE_PLACE:
-            found[f"{name} is {now} here, {there} where the release was made"] = None
+        found[f"{name} is {now} here, {there} where the release was made"] = None
     return tuple(found)
 
 

@@ -111,7 +111,6 @@ def make_plan(
     recipe: Recipe | None,
     out: str | Path | Target,
     only: Sequence[str] = (),
-    device: str | None = None,
     episodes: tuple[int, int] | None = None,
     part: tuple[int, int] = (1, 1),
     pixels: bool = True,
@@ -122,7 +121,6 @@ def make_plan(
       recipe: None goes on with the release that is there, from its manifest alone.
       out: the release's folder or target; what is committed there already is left out of the jobs.
       only: subset patterns such as "walker-walk/*/static"; a part of the recipe is rolled out.
-      device: device that renders; by default that on which the release that is there was begun, or on the CPU.
       episodes: (first, last + 1) of a part of each subset; the shards that hold any of them are rolled out.
       part: (K, N): of all jobs, done or not, every N-th from the K-th on.
       pixels: paint pictures; without, `generate.paint` can do it later.
@@ -133,9 +131,9 @@ def make_plan(
     target = out if isinstance(out, Target) else Target.at(local_path(out))
     there = target.manifest()
     if recipe is not None:
-        manifest, inputs = describe(recipe, device or "cpu", pixels)
+        manifest, inputs = describe(recipe, pixels)
     elif there is not None:
-        _check_goes_on(there, target, device, pixels)
+        _check_goes_on(there, target, pixels)
         manifest, inputs = there, None
     else:
         raise StoreError(f"{target.place} holds no release to go on with; give TASKs or --recipe")
@@ -146,7 +144,7 @@ def make_plan(
     records = list({record.name: record for record in shards.values()}.values())
     done = target.commits(records) if there is not None else {}
     _refuse_half_painted(there, records, done, target.place)
-    jobs = part_of(make_jobs(grown, shards, target, None if target.uploads else inputs, device), part)
+    jobs = part_of(make_jobs(grown, shards, target, None if target.uploads else inputs), part)
     left = left_to_do(jobs, done)
     growth = _growth(there, records) if there is not None else ()
     _refuse_labels(there, left, target.place)
@@ -187,7 +185,7 @@ def _refuse_labels(there: Manifest | None, jobs: Iterable[Job], place: str) -> N
             )
 
 
-def _check_goes_on(there: Manifest, target: Target, device: str | None, pixels: bool) -> None:
+def _check_goes_on(there: Manifest, target: Target, pixels: bool) -> None:
     """Raises StoreError if a release that goes on from its manifest cannot be as the options want it."""
     painted = any(record.pixels for record in there.subsets)
     if not pixels and painted:
@@ -195,8 +193,6 @@ def _check_goes_on(there: Manifest, target: Target, device: str | None, pixels: 
             f"{target.place} was begun with images and keeps storing them; remove --no-pixels, or give TASKs or "
             "--recipe with another --out"
         )
-    if device not in (None, "cpu") and not painted:
-        raise StoreError(f"{target.place} was begun without images, so none are rendered on {device}; remove --device")
 
 
 def _count(jobs: Sequence[Job]) -> int:
@@ -206,7 +202,7 @@ def _count(jobs: Sequence[Job]) -> int:
 # -- what the release will be ---------------------------------------------------------------------
 
 
-def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[Manifest, dict[str, Inputs]]:
+def describe(recipe: Recipe, pixels: bool = True) -> tuple[Manifest, dict[str, Inputs]]:
     """The manifest of a recipe's release, as it is before any shard, and what each subset is made from.
 
     The manifest names no place of this machine: policies and videos go by where the release keeps its copies.
@@ -223,7 +219,7 @@ def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[
         record = _record(recipe, request, files)
         look = (record.task, record.distractor)
         if look not in painted:
-            painted[look] = painting_facts(record, recipe.backgrounds, device)
+            painted[look] = painting_facts(record, recipe.backgrounds)
         records[request.name] = record.model_copy(update=painted[look] | {"pixels": pixels})
         inputs[request.name] = Inputs(tuple(map(str, files)), recipe.backgrounds)
     manifest = Manifest(
@@ -233,7 +229,7 @@ def describe(recipe: Recipe, device: str = "cpu", pixels: bool = True) -> tuple[
         authors=recipe.authors,
         recipe=_without_local_paths(recipe, requests, records),
         subsets=tuple(records.values()),
-        environments=(environment(device),),
+        environments=(environment(),),
     )
     return manifest, inputs
 
@@ -276,13 +272,13 @@ def _policy_record(path: Path, task: Task) -> PolicyRecord:
     return PolicyRecord(name=path.stem, digest=policy.digest, path=copy, header=header)
 
 
-def painting_facts(record: SubsetRecord, backgrounds: str, device: str) -> dict[str, Any]:
+def painting_facts(record: SubsetRecord, backgrounds: str) -> dict[str, Any]:
     """`renderer` and `backgrounds` of a subset's record, from a painter that was started for it.
 
     Raises:
       DmcvbError: the videos or the renderer cannot be used.
     """
-    renderer, videos = renderer_for(record, backgrounds, device=device)
+    renderer, videos = renderer_for(record, backgrounds)
     facts = renderer.describe()
     renderer.close()
     shown = None
@@ -339,7 +335,7 @@ def check_versions(manifest: Manifest) -> None:
     """Raises StoreError if a package has another version here than where a release was begun."""
     begun, here = manifest.environments[0] if manifest.environments else {}, environment()
     for name, version in here.items():
-        if name not in ("system", "cpu", "device") and begun.get(name, version) != version:
+        if name not in ("system", "cpu") and begun.get(name, version) != version:
             raise StoreError(
                 f"the release was begun with {name} {begun[name]} and this is {name} {version}, which may change bits; "
                 f"install {name} {begun[name]}, or give --other-versions"

@@ -60,7 +60,7 @@ Names = Annotated[tuple[str, ...], pydantic.BeforeValidator(_as_tuple), pydantic
 
 
 class RendererChoice(_Model):
-    """Which renderer paints: backend "native", "warp" or "opengl"; samples a pixel (None: the renderer's default)."""
+    """Which renderer paints: backend "native" or "opengl"; samples a pixel (None: the renderer's default)."""
 
     backend: str = "native"
     samples: Literal[1, 2, 4, 8] | None = None

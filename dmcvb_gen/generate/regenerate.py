@@ -177,7 +177,6 @@ class Regeneration:
       root: the release's folder.
       only, episodes: subset patterns and (first, last + 1): the shards that hold any of them; all by default.
       backgrounds: folder of the videos, if they are not in the release.
-      device: render there instead of on the manifest's device.
       workers: processes, or a Ray cluster that sees the same folders.
     """
 
@@ -185,7 +184,6 @@ class Regeneration:
     only: Sequence[str] = ()
     episodes: tuple[int, int] | None = None
     backgrounds: str | None = None
-    device: str | None = None
     workers: Workers = 1
 
     def check(self, progress: ProgressCallback = ignore) -> Outcome:
@@ -341,7 +339,7 @@ class Regeneration:
         inputs = release_inputs(root, records, self.backgrounds)
         if copy:
             copy_inputs(folder, records, inputs)
-        jobs = make_jobs(manifest, shards, Target.at(folder), inputs, self.device)
+        jobs = make_jobs(manifest, shards, Target.at(folder), inputs)
         for result in run_jobs(jobs, self.workers, progress):
             yield from result.commits
 

@@ -39,14 +39,13 @@ def check_renderer(name: str) -> None:
 
 
 def renderer_for(
-    record: SubsetRecord, backgrounds: str, split: str | None = None, device: str = "cpu", **overrides: Any
+    record: SubsetRecord, backgrounds: str, split: str | None = None, **overrides: Any
 ) -> tuple[Renderer, Any]:
     """The renderer of a subset, and its videos (None if its distractor shows none).
 
     Args:
       backgrounds: "builtin" or a folder of videos.
       split: "train" or "val" videos; the record's by default.
-      device: "cpu" or "cuda".
       overrides: `name` and `samples`, instead of the record's.
     """
     task, setting = get_task(record.task), record.distractor
@@ -59,7 +58,6 @@ def renderer_for(
         record.size,
         backgrounds=videos,
         floor_alpha=floor_alpha_for(task, setting),
-        device=device,
         **choice,
     )
     return renderer, videos
@@ -71,14 +69,14 @@ class RendererCache:
     def __init__(self):
         self._made: dict[tuple, tuple[Renderer, Any]] = {}
 
-    def get(self, record: SubsetRecord, backgrounds: str, device: str) -> tuple[Renderer, Any]:
+    def get(self, record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:
         """Return the renderer that `renderer_for` would make, from the cache if it is there."""
         setting = record.distractor
         key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
-        key += (backgrounds, record.split, device)
+        key += (backgrounds, record.split)
         if key not in self._made:
             self.close()
-            self._made[key] = renderer_for(record, backgrounds, record.split, device)
+            self._made[key] = renderer_for(record, backgrounds, record.split)
             atexit.unregister(self.close)
             atexit.register(self.close)  # now, before OpenGL's library ends: it may have come with this renderer
         return self._made[key]

@@ -50,7 +50,6 @@ class Repainting:
       renderer, samples: see `rollout`.
       backgrounds: "builtin" or a folder of videos.
       split: "train" or "val": the videos of locomotion, the styles of mazes.
-      device: device that renders.
       labels: "depth", "segmentation" and "flow", stored beside the pixels.
       name: name of the new release.
     """
@@ -65,7 +64,6 @@ class Repainting:
     samples: int | None = None
     backgrounds: str | None = None
     split: str | None = None
-    device: str = "cpu"
     labels: Sequence[str] = ()
     name: str | None = None
 
@@ -139,7 +137,7 @@ def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallbac
     inputs = {name: pair.inputs for name, pair in pairs.items()}
     copy_inputs(out, [pair.record for pair in pairs.values()], inputs)
     sources = {name: Stored(pair.source, new_labels=not pair.keeps_labels) for name, pair in pairs.items()}
-    jobs = make_jobs(manifest, todo, target, inputs, request.device, sources, tuple(request.labels))
+    jobs = make_jobs(manifest, todo, target, inputs, sources, tuple(request.labels))
     for _ in run_jobs(jobs, workers, progress):
         pass
     return finish_together(out)
@@ -209,7 +207,7 @@ def _pair(release: Release, subset: Subset, request: Repainting) -> Repainted:
         }
     )
     source = request.backgrounds or _old_backgrounds(release, old)
-    record = record.model_copy(update=painting_facts(record, source, request.device))
+    record = record.model_copy(update=painting_facts(record, source))
     return Repainted(subset, record, Inputs(policy_files(release.path, old), source))
 
 
@@ -256,7 +254,7 @@ def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Rep
         authors=old.authors,
         recipe=first[0].model_dump(mode="json"),
         subsets=tuple(pair.record for pair in pairs.values()),
-        environments=(environment(request.device),),
+        environments=(environment(),),
         lineage=(*old.lineage, lineage),
     )
     additions = tuple(

@@ -48,15 +48,12 @@ RECIPE_OPTIONS |= {"independent"}
 """Options that say what to make, not where or how."""
 
 
-def make_request(
-    tasks: Sequence[str] = (), recipe: str | Path | None = None, *, device: str = "cpu", **given: Any
-) -> Recipe:
+def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **given: Any) -> Recipe:
     """The recipe of what was asked for.
 
     Args:
       tasks: names; with a recipe, those that are taken of it.
       recipe: a YAML file or the name of a shipped recipe.
-      device: device that renders; other devices have another default renderer.
       given: options of `RECIPE_OPTIONS` that somebody gave, and no defaults.
 
     Raises:
@@ -72,7 +69,7 @@ def make_request(
     if recipe:
         made = _changed_recipe(load_recipe(recipe), tasks, given)
     else:
-        made = _recipe_from_options(tasks, given | {"renderer": given.get("renderer") or renderer_of(tasks, device)})
+        made = _recipe_from_options(tasks, given | {"renderer": given.get("renderer") or renderer_of(tasks)})
     check_options_used(made, given)
     if given.get("sample") and is_own(str(given.get("behaviour") or "")):
         raise RecipeError("--sample has no effect here: a function of your own draws by itself; remove it")
@@ -104,13 +101,11 @@ def behaviour_source(given: str | Path | None) -> str | None:
     return str(Path(given).resolve())
 
 
-def renderer_of(tasks: Sequence[str], device: str = "cpu") -> str:
+def renderer_of(tasks: Sequence[str]) -> str:
     """The default renderer of tasks that are rolled out together: the first one that is not native, if any."""
     from dmcvb_gen.rendering import default_renderer
     from dmcvb_gen.tasks import get_task
 
-    if device != "cpu":
-        return "warp"
     allow(tasks)
     chosen = [default_renderer(get_task(task)) for task in tasks]
     return next((name for name in chosen if name != "native"), "native")

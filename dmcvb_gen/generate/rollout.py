@@ -51,7 +51,7 @@ def request_of(options: Options) -> Recipe | None:
     tasks, recipe = as_names(options["tasks"]), options["recipe"]
     if options["out"] and not (tasks or recipe or given):
         return None
-    return make_request(tasks, recipe, device=options["device"] or "cpu", **given)
+    return make_request(tasks, recipe, **given)
 
 
 def _is_given(value: Any) -> bool:
@@ -71,9 +71,8 @@ def rollout_plan(options: Options, request: Recipe | None, target: Target) -> Pl
     Raises:
       DmcvbError: anything that would fail later, found before any work.
     """
-    device = options["device"] or ("cpu" if request else None)  # else where it was begun
     only, part = as_names(options["only"]), options["part"] or (1, 1)
-    plan = make_plan(request, target, only, device, options["episode_range"], part, options["pixels"])
+    plan = make_plan(request, target, only, options["episode_range"], part, options["pixels"])
     _check_shards(options["episodes_per_shard"], plan)
     return plan
 

@@ -416,7 +416,7 @@ def _making(manifest: Manifest) -> list[str]:
     if videos:
         lines.append(f"Background videos: digest {', '.join(videos)}.")
     for number, made in enumerate(manifest.environments):
-        names = ("system", "cpu", "python", "mujoco", "mujoco-warp", "torch", "zarr")
+        names = ("system", "cpu", "python", "mujoco", "torch", "zarr")
         where = ", ".join(f"{name} {made[name]}" for name in names if name in made)
         lines.append(f"Environment {number + 1}: {where}.")
     for entry in manifest.lineage:
@@ -443,11 +443,6 @@ def _limits(release: Release) -> list[str]:
     manifest, limits = release.manifest, []
     if not manifest.complete:
         limits.append("Not complete: only a part of the recipe's shards is here.")
-    if any(record.renderer.get("name") == "warp" for record in manifest.subsets):
-        limits.append(
-            "Pictures come from a ray tracer, which has no floor reflections and no mip-mapped textures: they differ "
-            "from dm_control's OpenGL pictures by a few grey levels on average."
-        )
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
     policies = {policy.digest: policy for record in manifest.subsets for policy in record.policies}.values()

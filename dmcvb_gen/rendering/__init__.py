@@ -54,7 +54,6 @@ def make_renderer(
     *,
     backgrounds=None,
     floor_alpha: float = 1.0,
-    device: str = "cpu",
     samples: int | None = None,
 ) -> Renderer:
     """A renderer by its name.
@@ -63,14 +62,13 @@ def make_renderer(
       size: pixels a side.
       backgrounds: the videos that labels may name (`load_backgrounds`).
       floor_alpha: opacity of the ground plane (`distractors.floor_alpha_for`).
-      device: "cpu" or "cuda" (warp).
       samples: samples a pixel; None: the default.
 
     Raises:
       UnknownNameError, RenderingError: no such renderer, or it cannot start here.
     """
     chosen: Callable[..., Renderer] = renderer_class(name)
-    return chosen(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha, device=device, samples=samples)
+    return chosen(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha, samples=samples)
 
 
 def available_renderers() -> dict[str, str | None]:
@@ -82,14 +80,13 @@ def available_renderers() -> dict[str, str | None]:
 def default_renderer(task: Task) -> str:
     """The renderer that paints a task on a CPU unless another one is asked for.
 
-    It is native if that paints the task, else opengl (or warp, if OpenGL cannot start here).
+    It is native if that paints the task, else opengl.
     """
     try:
         renderer_class("native").check_task(task)
     except RenderingError as error:
-        other = "warp" if renderer_class("opengl").unavailable() else "opengl"
-        _log.warning("%s is painted by %s: %s", task_folder(task.id), other, error)
-        return other
+        _log.warning("%s is painted by opengl: %s", task_folder(task.id), error)
+        return "opengl"
     return "native"
 
 

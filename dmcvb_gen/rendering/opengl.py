@@ -6,14 +6,13 @@ one render an agent step, kinematics without a physics step.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import ctypes.util
 import functools
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
@@ -39,7 +38,7 @@ _PROBE = "from mujoco.egl import GLContext; c = GLContext(8, 8); c.make_current(
 def unavailable() -> str | None:
     """Why EGL cannot start here (and the cure), or None. Tried in a process of its own: a failure can abort."""
     if ctypes.util.find_library("EGL") is None:
-        return "libEGL is missing; install it (Debian: apt-get install libegl1 libgl1) or use --renderer warp"
+        return "libEGL is missing; install it (Debian: apt-get install libegl1 libgl1)"
     run = subprocess.run(
         [sys.executable, "-c", _PROBE],
         capture_output=True,
@@ -48,7 +47,7 @@ def unavailable() -> str | None:
     )
     if run.returncode:
         last = (run.stderr.strip().splitlines() or ["no message"])[-1]
-        return f"EGL does not start ({last}); install libegl1 and libgl1 (Debian) or use --renderer warp"
+        return f"EGL does not start ({last}); install libegl1 and libgl1 (Debian)"
     return None
 
 
@@ -61,9 +60,7 @@ class OpenglRenderer(Renderer):
     def unavailable(cls):
         return unavailable()
 
-    def __init__(
-        self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
-    ):
+    def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
         check_size(size)
         reason = unavailable()
         if reason:
@@ -238,33 +235,3 @@ class OpenglRenderer(Renderer):
 
 
 RENDERER = OpenglRenderer
-
-
-@contextlib.contextmanager
-def offscreen(model: mujoco.MjModel, size: int) -> Iterator[Callable[[mujoco.MjData, str], np.ndarray]]:
-    """A function (data, camera name) -> (size, size, 3) uint8 for any model, while the context lasts."""
-    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-    from mujoco.egl import GLContext
-
-    gl = GLContext(size, size)
-    gl.make_current()
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-    scene, option, camera = mujoco.MjvScene(model, maxgeom=MAX_GEOMS), mujoco.MjvOption(), mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-    rectangle = mujoco.MjrRect(0, 0, size, size)
-
-    def shoot(data: mujoco.MjData, name: str) -> np.ndarray:
-        camera.fixedcamid = model.camera(name).id
-        mujoco.mj_forward(model, data)
-        mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
-        mujoco.mjr_render(rectangle, scene, context)
-        picture = np.empty((size, size, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, rectangle, context)
-        return picture[::-1]
-
-    try:
-        yield shoot
-    finally:
-        context.free()
-        gl.free()

@@ -73,7 +73,6 @@ def assert_refused(result, options, cure):
         ([WALKER, "--scratch", "x"], "--out is no URL"),
         ([WALKER, "--scratch-size", "1GB"], "--out is no URL"),
         ([WALKER, "--option", "a=b"], "--out is no URL"),
-        ([WALKER, "--no-pixels", "--device", "cuda"], "--no-pixels paints nothing"),
         ([WALKER, "--workers", "2", "--executor", "ray"], "remove it"),
         ([WALKER, "--ray-address", "x:1"], "--executor ray"),
         ([WALKER, "--behaviour", ""], "is empty"),
@@ -143,10 +142,9 @@ def test_a_release_that_goes_on_from_its_manifest_says_what_it_cannot_take(tmp_p
     assert result.exit_code == 2 and words in result.output + result.stderr
 
 
-def test_a_release_without_pictures_goes_on_without_and_takes_no_device(tmp_path):
+def test_a_release_without_pictures_goes_on_without(tmp_path):
     prepare(make_plan(small_recipe(), tmp_path / "r", pixels=False))
     assert rollout("--out", tmp_path / "r", "--no-pixels", "--init").exit_code == 0
-    assert_refused(rollout("--out", tmp_path / "r", "--device", "cuda"), ["--device"], "remove --device")
 
 
 def test_what_some_subsets_take_up_is_heard(asked):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -219,3 +222,13 @@ def test_a_missing_decoder_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ModuleNotFoundError, match="imageio_ffmpeg"):
         load_backgrounds(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_made_clip_is_a_video(tmp_path):
+    pytest.importorskip("mujoco.egl")
+    script = Path(__file__).parents[2] / "scripts" / "make_clips.py"
+    command = [sys.executable, str(script), "--videos", "1", "--seed", "5", "--out", str(tmp_path)]
+    subprocess.run(command, check=True, env=os.environ | {"MUJOCO_GL": "egl"})
+    frames = load_backgrounds(tmp_path, "train").frames(0).astype(int)
+    assert frames.shape == (24, 256, 256, 3) and frames.std() > 15 and np.abs(np.diff(frames, axis=0)).mean() > 0.5

@@ -147,7 +147,6 @@ name: small
 version: 1.0.0
 seed: 3
 size: 16
-renderer: {backend: warp, samples: 1}
 subsets:
   - tasks: [walker-walk, cheetah-run]
     levels: [random]

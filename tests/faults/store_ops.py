@@ -39,7 +39,7 @@ def record_of(name: str) -> SubsetRecord:
         size=SIZE,
         views=SHAPES[name].views,
         max_steps=SHAPES[name].max_steps,
-        renderer={"name": "warp", "samples": 1},
+        renderer={"name": "native", "samples": None},
     )
 
 

@@ -105,7 +105,7 @@ def frames(task, seed, count):
     return physics, sample_distractors(task, Distractor(), physics[:, None], generators)[:, 0]
 
 
-@pytest.mark.parametrize("name", ["warp", "opengl"])
+@pytest.mark.parametrize("name", ["native", "opengl"])
 def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
     reason = available_renderers()[name]
     if reason:
@@ -126,7 +126,7 @@ def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
     assert seen_anywhere > 10  # pictures that need no second rendering
 
 
-@pytest.mark.parametrize("name", ["warp", "opengl"])
+@pytest.mark.parametrize("name", ["opengl"])
 def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(name):
     reason = available_renderers()[name]
     if reason:
@@ -164,14 +164,14 @@ def filled(physics, length):
 
 
 def test_renderers_agree_on_mazes():
-    """warp's pictures are near OpenGL's in every view and style."""
+    """native's pictures are near OpenGL's in every view and style."""
     reason = available_renderers()["opengl"]
     if reason:
         pytest.skip(reason)
     task = get_task("ant-maze-medium7x7c")
     physics, labels = frames(task, 1, 12)
     pictures = []
-    for name in ("warp", "opengl"):
+    for name in ("native", "opengl"):
         renderer = make_renderer(name, task, 64)
         pictures.append(renderer.render(physics, labels).astype(int))
         renderer.close()

@@ -514,12 +514,6 @@ def test_a_folder_is_listed_while_others_write_into_it(whole, tmp_path):
         writer.join()
 
 
-def test_a_slurm_script_for_gpus_is_written_where_none_is():
-    asked = ["rollout", "walker-walk", "--device", "cuda", "--episodes", "2", "--out", "r", "--slurm-script", "2"]
-    result = CliRunner().invoke(main, asked)
-    assert result.exit_code == 0 and "--device cuda" in result.stdout, result.output
-
-
 def test_the_slurm_script_does_parts_and_finishes(tmp_path, recipe_file):
     arguments = ["rollout", "--recipe", str(recipe_file), "--out", "s3://bucket/x", "--workers", "4"]
     script = CliRunner().invoke(main, [*arguments, "--slurm-script", "3"]).output
@@ -562,8 +556,6 @@ def test_an_address_where_no_cluster_answers_is_one_line(tmp_path):
     arguments = [
         *BUCKET,
         str(tmp_path / "r"),
-        "--renderer",
-        "warp",
         "--executor",
         "ray",
         "--ray-address",

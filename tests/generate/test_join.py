@@ -6,12 +6,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 import dmcvb_gen
 from dmcvb_gen.dataset.index import INDEX, read_index, root_digest, trusted_index
 from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.dataset.reader import load_manifest
-from dmcvb_gen.distractors.clips import make_clips
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import json_bytes
 from dmcvb_gen.generate.join import join, join_folders
@@ -109,7 +109,9 @@ def test_a_part_of_what_was_joined_is_made_again_with_its_bytes(made, tmp_path, 
 
 
 def test_parts_may_show_videos_of_their_own(tmp_path):
-    make_clips(1, 0, tmp_path / "videos")
+    for split in ("train", "val"):
+        (tmp_path / "videos" / split).mkdir(parents=True)
+        Image.new("RGB", (64, 64), "teal").save(tmp_path / "videos" / split / "still.png")
     clips = {"backgrounds": str(tmp_path / "videos")}
     for name in PATTERNS:
         roll_out(recipe(name, name, **clips), tmp_path / name)

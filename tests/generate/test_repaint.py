@@ -245,7 +245,7 @@ def test_mistakes_are_refused_before_any_painting(small_release, small_mazes, tm
         repaint(Repainting(small_release, tmp_path / "r", distractor="static"))
     with pytest.raises(DmcvbError, match="8 to 1024"):
         repaint(Repainting(small_release, tmp_path / "r", size=4))
-    with pytest.raises(DmcvbError, match="warp"):
+    with pytest.raises(DmcvbError, match="native"):
         repaint(Repainting(small_release, tmp_path / "r", renderer="povray"))
     with pytest.raises(DmcvbError, match="dynamic"):
         repaint(Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="blurry"))

@@ -22,7 +22,6 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
-from dmcvb_gen.files import write_json
 from dmcvb_gen.generate.counts import LEAST_SHARE, count
 from dmcvb_gen.generate.plan import make_plan, prepare
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
@@ -226,7 +225,7 @@ def test_shipped_recipes_expand_to_what_the_paper_has():
         ({"seed": -1}, RecipeError, "seed"),
         ({"name": "a/b"}, RecipeError, "name"),
         ({"colour": "red"}, RecipeError, "colour"),
-        ({"renderer": {"backend": "povray"}}, UnknownNameError, "warp"),
+        ({"renderer": {"backend": "povray"}}, UnknownNameError, "native"),
         ({"backgrounds": "/nowhere"}, DmcvbError, "does not exist"),
         ({"subsets": []}, RecipeError, "subsets"),
     ],
@@ -415,18 +414,6 @@ def test_what_a_growing_subset_keeps_is_said_or_refused(tmp_path, task):
     assert len(subset.commits) == 2 and not subset.unpainted.any()
     part = run("--episodes", "8", "--range", "4:5")
     assert part.exit_code == 0 and "says what is missing" in part.output
-
-
-@pytest.mark.parametrize("recipe", [small_recipe, maze_recipe])
-def test_going_on_from_a_manifest_paints_where_it_was_begun(tmp_path, recipe):
-    folder = tmp_path / "r"
-    prepare(make_plan(recipe(), folder))
-    assert {job.device for job in make_plan(None, folder).jobs} == {"cpu"}
-    manifest = open_release(folder).manifest
-    records = tuple(r.model_copy(update={"renderer": r.renderer | {"device": "cuda"}}) for r in manifest.subsets)
-    write_json(folder / "manifest.json", manifest.model_copy(update={"subsets": records}))
-    assert {job.device for job in make_plan(None, folder).jobs} == {"cuda"}
-    assert {job.device for job in make_plan(None, folder, device="cpu").jobs} == {"cpu"}
 
 
 @pytest.mark.parametrize("recipe", [small_recipe, maze_recipe])

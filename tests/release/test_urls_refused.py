@@ -13,8 +13,6 @@ from dmcvb_gen.storage.remote import local_path
 
 URL = "s3://bucket/x"
 COMMANDS = {
-    "backgrounds": ["backgrounds", "--out", URL],
-    "backgrounds, sheet": ["backgrounds", "--sheet", f"{URL}.png"],
     "train-behaviour": ["train-behaviour", "walker-walk", "--out", URL],
     "evaluate-behaviour": ["evaluate-behaviour", "walker-walk", "--pictures", URL],
     "validate": ["validate", "RELEASE", "--out", URL],
@@ -94,12 +92,6 @@ def _light(root):
     without_pictures(root, URL)
 
 
-def _clips(root):
-    from dmcvb_gen.distractors.clips import make_clips
-
-    make_clips(1, 0, URL)
-
-
 def _report(root):
     from dmcvb_gen.benchmarks.validate import check_writable
 
@@ -113,7 +105,7 @@ def _train(root):
     open_run(URL, RunConfig("walker-walk", "sac", 1, 0, {}), resume=False)
 
 
-CALLS = (_plan, _repaint, _remake, _import, _card, _preview, _export, _light, _clips, _report, _train)
+CALLS = (_plan, _repaint, _remake, _import, _card, _preview, _export, _light, _report, _train)
 
 
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__.strip("_"))

@@ -156,7 +156,7 @@ def test_a_background_on_the_sky_is_what_pillow_makes_of_it(shape):
 
 
 def test_what_it_does_not_paint_is_refused():
-    with pytest.raises(RenderingError, match="dog-walk has geoms of type mesh, .* use --renderer opengl or warp"):
+    with pytest.raises(RenderingError, match="dog-walk has geoms of type mesh, .* use --renderer opengl"):
         make_renderer("native", get_task("dog-walk"), 64)
     with pytest.raises(RenderingError, match="4 samples"):
         make_renderer("native", get_task("walker-walk"), 64, samples=2)

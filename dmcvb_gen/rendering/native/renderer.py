@@ -51,14 +51,8 @@ class NativeRenderer(Renderer):
     def check_task(cls, task):
         scene_of(task)
 
-    def __init__(
-        self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, device="cpu", samples: int | None = None
-    ):
+    def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
         check_size(size)
-        if device != "cpu":
-            raise RenderingError(
-                f"renderer 'native' paints on the CPU, not on {device!r}; use --device cpu or --renderer warp"
-            )
         if samples not in (None, SAMPLES):
             raise RenderingError(f"renderer 'native' takes {SAMPLES} samples a pixel, not {samples}; give none")
         self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)

@@ -252,7 +252,7 @@ def _cords(task: Task, model: mujoco.MjModel) -> list[tuple[int, int, int]]:
 
 
 def _not_painted(task: Task, what: str) -> RenderingError:
-    return RenderingError(f"{task.id} has {what}, which 'native' does not paint; use --renderer opengl or warp")
+    return RenderingError(f"{task.id} has {what}, which 'native' does not paint; use --renderer opengl")
 
 
 def _is_special(model: mujoco.MjModel, camera: int) -> bool:

@@ -185,7 +185,7 @@ class Textures:
         model = self._model
         height, width, channels = (int(a[index]) for a in (model.tex_height, model.tex_width, model.tex_nchannel))
         if channels not in (3, 4):
-            raise RenderingError(f"texture {model.texture(index).name!r} is not RGB; use --renderer warp")
+            raise RenderingError(f"texture {model.texture(index).name!r} is not RGB; use --renderer opengl")
         address = int(model.tex_adr[index])
         data = model.tex_data[address : address + height * width * channels].reshape(height, width, channels)[..., :3]
         if faces == 1:
