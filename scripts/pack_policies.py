@@ -27,7 +27,7 @@ def main() -> None:
         print(f"{given.folder}: {len(bundled_digests())} policies")
         return
     pack(given.folder, DATA)
-    sizes = {path.name: path.stat().st_size for path in DATA.glob("*.zip")}
+    sizes = {path.name: path.stat().st_size for path in DATA.glob("*.xz")}
     print(f"{sum(sizes.values()) / 1e6:.1f} MB: " + ", ".join(f"{name} {size:,}" for name, size in sizes.items()))
 
 

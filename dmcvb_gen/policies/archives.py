@@ -1,8 +1,9 @@
 """Unpack the package's own policies into the user's cache.
 
-`data/<group>.zip` hold the files, one archive a group (a locomotion task, or all mazes, whose policies repeat one
-network), see `packing`; `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every
-use.
+`data/<group>.xz` hold the files, one archive a group (a locomotion task, or all mazes, whose policies repeat one
+network); `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every use. An archive
+is xz over a list of the files' names and headers and, behind it, the bytes of all float32 weights: first all lowest
+bytes, then all second ones, ..., because signs and exponents resemble each other and noise does not.
 `scripts/pack_policies.py` makes archives and list.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import json
+import lzma
 import os
 import tempfile
 from importlib import resources
@@ -21,6 +23,8 @@ from dmcvb_gen.files import replacing, sha256_file
 from dmcvb_gen.spec import is_maze
 
 INDEX = "policies.json"
+WORD = 8
+"""Bytes of a length, in an archive as in a safetensors file."""
 
 
 def data_folder() -> Traversable:
@@ -65,10 +69,8 @@ def _is_sound(path: Path, name: str) -> bool:
 
 def _unpack(name: str) -> Path:
     """Unpack a file and the others of its task; a few tenths of a second."""
-    from dmcvb_gen.policies.packing import unpack_files  # loads numpy
-
     task = name.split("/")[0]
-    group = unpack_files((data_folder() / f"{group_of(task)}.zip").read_bytes())
+    group = unpack_files((data_folder() / f"{group_of(task)}.xz").read_bytes())
     files = {file: content for file, content in group.items() if file.startswith(f"{task}/")}
     reason: OSError | None = None
     for folder in cache_folders():
@@ -87,23 +89,38 @@ def _unpack(name: str) -> Path:
     )
 
 
+def pack_files(contents: dict[str, bytes]) -> bytes:
+    """Pack safetensors files of float32 arrays, name -> bytes, into the bytes of one archive."""
+    ends = {name: WORD + int.from_bytes(content[:WORD], "little") for name, content in contents.items()}
+    index = [[name, content[: ends[name]].decode("latin-1"), len(content)] for name, content in contents.items()]
+    listing = json.dumps(index).encode()
+    weights = b"".join(content[ends[name] :] for name, content in contents.items())
+    planes = b"".join(weights[byte::4] for byte in range(4))
+    return lzma.compress(len(listing).to_bytes(WORD, "little") + listing + planes, preset=9 | lzma.PRESET_EXTREME)
+
+
+def unpack_files(archive: bytes) -> dict[str, bytes]:
+    """The files of an archive: name -> bytes."""
+    content = lzma.decompress(archive)
+    start = WORD + int.from_bytes(content[:WORD], "little")
+    planes, weights = content[start:], bytearray(len(content) - start)
+    for byte in range(4):
+        weights[byte::4] = planes[byte * len(weights) // 4 : (byte + 1) * len(weights) // 4]
+    files, at = {}, 0
+    for name, head, size in json.loads(content[WORD:start]):
+        files[name] = head.encode("latin-1") + weights[at : at + size - len(head)]
+        at += size - len(head)
+    return files
+
+
 def pack(folder: Path, out: Path) -> None:
-    """Write archives and list from the policy files <task>/<level>.safetensors of a folder.
-
-    Raises:
-      ValueError: a file has arrays that are not float32.
-    """
-    from dmcvb_gen.policies.packing import pack_files
-
-    # Checkpoints of one run in their order, its last one after them, so that each resembles the one before.
-    paths = sorted(
-        folder.glob("*/*.safetensors"), key=lambda path: (path.stem == "expert", path.stem == "medium", path)
-    )
+    """Write archives and list from the policy files <task>/<level>.safetensors of a folder."""
+    paths = sorted(folder.glob("*/*.safetensors"))
     groups: dict[str, dict[str, bytes]] = {}
     for path in paths:
         group = groups.setdefault(group_of(path.parent.name), {})
         group[path.relative_to(folder).as_posix()] = path.read_bytes()
     for group_name, contents in groups.items():
-        (out / f"{group_name}.zip").write_bytes(pack_files(contents))
-    digests = {path.relative_to(folder).as_posix(): sha256_file(path) for path in sorted(paths)}
+        (out / f"{group_name}.xz").write_bytes(pack_files(contents))
+    digests = {path.relative_to(folder).as_posix(): sha256_file(path) for path in paths}
     (out / INDEX).write_text(json.dumps(digests, indent=1) + "\n")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import logging
 import re
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from dmcvb_gen.text import quoted
 
 CONVERTED = (".zip", ".pt", ".pth", ".cleanrl_model")
 """Files of other programs' policies, which are converted: Stable-Baselines3's, torch's and CleanRL's."""
+log = logging.getLogger(__name__)
+
 _MIXED = re.compile(r"mixed_([0-9]+)\.safetensors")
 
 
@@ -67,36 +71,42 @@ def levels_of(behaviour: str | Path) -> list[str]:
     Raises:
       PolicyFileError: there are none, or no such file or folder.
     """
-    path = Path(behaviour)
-    if not path.exists():
-        raise _neither(behaviour)
+    path = checkpoint_of(behaviour) or Path(behaviour)
     if path.is_file():
         from dmcvb_gen.policies.policy_file import read_header  # loads numba, which listing needs not
 
         return [read_header(path).level or path.stem]
     for folder in (path / "selected", path):
-        levels = [level for level in TRAINED_LEVELS if level_files(folder, level)]
-        if levels:
+        if levels := [level for level in TRAINED_LEVELS if level_files(folder, level)]:
             return levels
-    reasons = _reasons(path)
-    if reasons:
-        raise PolicyFileError(f"{behaviour} has no selected policies: {next(iter(reasons.values()))}")
-    raise PolicyFileError(
-        f"{behaviour} has no selected policies; run `dmcvb-gen select-checkpoints {quoted(behaviour)}` first, "
-        "or give a policy file"
-    )
+    raise _nothing_in(path, None)
 
 
-def _neither(behaviour: str | Path) -> PolicyFileError:
-    return PolicyFileError(f"{behaviour} is neither a policy file, a run folder nor <module>:<function>")
+def checkpoint_of(behaviour: str | Path) -> Path | None:
+    """The checkpoint that RUN@latest or RUN@STEP names; None of a name of another form.
+
+    Raises:
+      PolicyFileError: the run has no such checkpoint.
+    """
+    run, _, asked = str(behaviour).rpartition("@")
+    if not Path(run, "checkpoints").is_dir() or not run or Path(behaviour).exists():
+        return None
+    files = {int(path.stem): path for path in Path(run, "checkpoints").glob("[0-9]*.safetensors")}
+    if not files:
+        raise PolicyFileError(f"{run} has no checkpoint yet; train it longer")
+    if asked == "latest":
+        _tell(f"{behaviour} is the checkpoint of agent step {max(files):,}.")
+        return files[max(files)]
+    step = int(asked) if asked.isdecimal() else -1
+    if step not in files:
+        near = sorted(sorted(files, key=lambda known: abs(known - step))[:3])
+        raise PolicyFileError(f"{run} has no checkpoint {asked!r}; give latest, or an agent step such as {near}")
+    return files[step]
 
 
-def _reasons(run: Path) -> dict[str, str]:
-    """Level -> why the last selection picked none of it; empty if there was none, or its file is damaged."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        levels = parse_json((run / "selection.json").read_bytes()).get("levels", {})
-        return {level: found["reason"] for level, found in levels.items() if found.get("reason")}
-    return {}
+@functools.cache
+def _tell(message: str) -> None:
+    log.warning(message)
 
 
 def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = None) -> list[Path]:
@@ -104,33 +114,43 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
 
     Args:
       behaviour: a policy file, another program's (`policies.convert`), a run folder in which checkpoints were selected,
-        a folder of level files, or "<module>:<function>".
+        RUN@latest or RUN@STEP for one checkpoint of a run, a folder of level files, or "<module>:<function>".
 
     Raises:
       DmcvbError: there is nothing for that level.
     """
     if behaviour is None:
         return bundled_policies(task_id, level)
-    path = Path(behaviour)
+    path = checkpoint_of(behaviour) or Path(behaviour)
     if path.suffix in CONVERTED and path.is_file():
         from dmcvb_gen.policies.convert import converted
 
         return [converted(path, task_id, level)]
     if path.is_file() or is_own(str(behaviour)):
         return [path]
-    if not path.is_dir():
-        raise _neither(behaviour)
     for folder in (path / "selected", path):
-        files = level_files(folder, level)
-        if files:
+        if files := level_files(folder, level):
             return files
-    if why := _reasons(path).get(level):
-        raise PolicyFileError(f"{behaviour} has no {level} policy selected: {why}")
+    raise _nothing_in(path, level)
+
+
+def _nothing_in(path: Path, level: str | None) -> PolicyFileError:
+    """Why a path has no policy of a level, or of any."""
+    if not path.is_dir():
+        return PolicyFileError(f"{path} is neither a policy file, a run folder nor <module>:<function>")
+    reasons: dict[str, str] = {}
+    with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
+        levels = parse_json((path / "selection.json").read_bytes()).get("levels", {})
+        reasons = {name: found["reason"] for name, found in levels.items() if found.get("reason")}
+    what = f"{level} policy" if level else "policies"
+    if why := reasons.get(level) if level else next(iter(reasons.values()), None):
+        return PolicyFileError(f"{path} has no {what} selected: {why}")
     if level == "mixed" and (strange := sorted(path.glob("mixed_*.safetensors"))):
-        raise PolicyFileError(
-            f"{behaviour} has no numbered mixed policy, only {strange[0].name}; name its files mixed_0.safetensors, "
+        return PolicyFileError(
+            f"{path} has no numbered mixed policy, only {strange[0].name}; name its files mixed_0.safetensors, "
             "mixed_1.safetensors, ..."
         )
-    raise PolicyFileError(
-        f"{behaviour} has no {level} policy selected; run `dmcvb-gen select-checkpoints {quoted(behaviour)}` first"
+    one = f", or give one checkpoint: {quoted(f'{path}@latest')}" if (path / "checkpoints").is_dir() else ""
+    return PolicyFileError(
+        f"{path} has no {what} selected; run `dmcvb-gen select-checkpoints {quoted(path)}` first{one}"
     )

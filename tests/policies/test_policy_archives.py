@@ -11,8 +11,7 @@ from safetensors.numpy import save
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies import archives
-from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack
-from dmcvb_gen.policies.packing import pack_files
+from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack, pack_files
 
 NAME = "walker-walk/expert.safetensors"
 
@@ -67,7 +66,7 @@ def test_packed_files_come_out_as_they_were(tmp_path, monkeypatch, cache):
         (folder / name).write_bytes(content)
     out.mkdir()
     pack(folder, out)
-    assert sorted(path.name for path in out.iterdir()) == ["a-task.zip", "ant-maze.zip", "policies.json"]
+    assert sorted(path.name for path in out.iterdir()) == ["a-task.xz", "ant-maze.xz", "policies.json"]
     monkeypatch.setattr(archives, "data_folder", lambda: out)
     bundled_digests.cache_clear()
     try:
@@ -80,10 +79,4 @@ def test_what_files_share_is_packed_once():
     def size(*seeds):
         return len(pack_files({str(place): policy(seed) for place, seed in enumerate(seeds)}))
 
-    same, alike = size(1, 1) - size(1), size(1, 2) - size(1)
-    assert same < 400 and same < alike < 0.9 * size(1)
-
-
-def test_arrays_of_other_types_are_refused():
-    with pytest.raises(ValueError, match="weight is F64"):
-        pack_files({"a": save({"weight": np.zeros(3)})})
+    assert size(1, 1) - size(1) < 400
