@@ -24,10 +24,10 @@ from dmcvb_gen.dataset.manifest import environment
 from dmcvb_gen.policies.evaluation import FRESH, evaluate
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.training.defaults import parse_settings, run_config
-from dmcvb_gen.training.sac import precision_setting
 from dmcvb_gen.training.training import open_run
 
 SHARE, EPISODES, SEED = 0.95, 100, 20_000
@@ -50,7 +50,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     settings = parse_settings(tuple(given.pairs), None, "sac")
-    settings |= precision_setting(settings, given.precision)
+    settings |= {"bfloat16": choose_precision(given.precision) == "bfloat16"}
     expert = paper_returns(given.task, "expert")
     if not expert:
         sys.exit(f"{given.task} has no expert in the paper's tables; give walker-walk, cheetah-run or humanoid-walk")

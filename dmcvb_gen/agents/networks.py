@@ -6,7 +6,7 @@ Sizes are those of the paper's appendix "Architecture and hyperparameters". Fram
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -178,23 +178,6 @@ def observation_encoder(channels: int, size: int = 64, architecture: Architectur
     """phi for frame stacks."""
     body = Convolutions(channels, size, architecture, frames)
     return Encoder(body, body.features, architecture.latent)
-
-
-def encoder_product(architecture: Architecture, batch: int = 16) -> Callable[[torch.dtype], object]:
-    """Both passes through an encoder in a precision, as losses compute them: what `choose_precision` times.
-
-    Args:
-      batch: stacks of three 64 x 64 frames. Trainings have larger batches, which would take longer to time.
-    """
-    encoder = observation_encoder(9, architecture=architecture)
-    pictures = (torch.rand(batch, 9, 64, 64) - 0.5).contiguous(memory_format=torch.channels_last)
-
-    def product(precision: torch.dtype) -> None:
-        with torch.autocast("cpu", torch.bfloat16, enabled=precision == torch.bfloat16):
-            loss = encoder(pictures).square().mean()
-        loss.backward()
-
-    return product
 
 
 def state_encoder(state_size: int) -> Encoder:

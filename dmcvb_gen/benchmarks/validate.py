@@ -14,7 +14,6 @@ import torch
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.data import training_episodes
-from dmcvb_gen.agents.networks import encoder_product
 from dmcvb_gen.benchmarks.checks import Structure, check_structure
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.kept import kept_scores, other_scores
@@ -128,7 +127,7 @@ def make_setup(
       out: folder of the report, by default reports/<the release's folder>.
       profile: "smoke", "brief", "quick" or "paper". scale: factor of its steps.
       workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
-      precision: "auto" times float32 and bfloat16 and takes the faster one; a report that goes on keeps to its own.
+      precision: "auto" takes bfloat16 if the device has instructions for it; a report that goes on keeps to its own.
       memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
       training: False if only the structure is checked, which needs no probe of the precision.
       fields: others of `Setup`.
@@ -142,7 +141,7 @@ def make_setup(
     threads = threads or (default_threads(workers) if isinstance(workers, int) else 1)
     if training:
         kept = kept_precision(out, device) if precision == "auto" else None
-        precision = kept or choose_precision(precision, encoder_product(sizes.network), device, threads)
+        precision = kept or choose_precision(precision, device)
     return Setup(
         root=str(path),
         out=str(out),

@@ -83,7 +83,7 @@ def train_behaviour(
       config (FILE): A YAML file of settings.
       init_from (RUN|FILE): Run or policy file to start from; guided: the guide.
       evaluate_every: Agent steps between evaluations while returns are low.
-      precision: sac: precision of hidden layers; auto times both.
+      precision: sac: precision of hidden layers; auto takes what the processor has instructions for.
       resume: Resume the run in --out with its own settings.
 
     `notify` is called with what the person should know: the precision, a resumed run without a saved state, a stop.
@@ -118,7 +118,8 @@ def train_behaviour(
     configuration = run_config(task, algorithm, changed | chosen, found, **given)  # type: ignore[arg-type]
     run = open_run(folder, configuration, resume)
     if chosen and precision == "auto":
-        notify(f"Computing in {'bfloat16' if chosen['bfloat16'] else 'float32'}, the faster one on this processor.")
+        name, has = ("bfloat16", "has") if chosen["bfloat16"] else ("float32", "has no")
+        notify(f"Computing in {name}: this processor {has} instructions for bfloat16.")
     saved, expert = run.saved(), paper_returns(task, "expert")
     if resume and not saved:
         notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
@@ -196,7 +197,7 @@ def task_of(task: str | None, layout: str | Path | None) -> str:
 
 def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: Any) -> dict[str, bool]:
     """The setting that --precision decides; none if a run is resumed or has one of its own."""
-    from dmcvb_gen.training.sac import precision_setting
+    from dmcvb_gen.precision import choose_precision
 
     if algorithm != "sac":
         if asked != "auto":
@@ -206,4 +207,4 @@ def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: A
         return {}
     if "bfloat16" in settings:
         raise DmcvbError("give --precision or --set bfloat16, not both")
-    return precision_setting(settings, asked)
+    return {"bfloat16": choose_precision(asked) == "bfloat16"}

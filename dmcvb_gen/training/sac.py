@@ -2,7 +2,7 @@
 
 SAC (Haarnoja et al. 2018) with what makes humanoids learnable and CPUs fast: running observation
 normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products if the
-processor has them, compiled updates. scripts/bench_training.py sets it beside Stable-Baselines3's SAC.
+processor has them, compiled updates.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from torch import nn
 
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
-from dmcvb_gen.precision import choose_precision, dense_product
 from dmcvb_gen.training.networks import Actor
 from dmcvb_gen.training.row_files import map_rows, rows_in
 from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, ReplaySettings
@@ -53,7 +52,7 @@ class SacSettings(ReplaySettings):
       clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
         tasks want).
       weight_decay: weight decay of AdamW, on actor and critics.
-      bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32); see `precision_setting`.
+      bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
     """
 
     actor_every: Count = 2
@@ -72,13 +71,6 @@ class SacSettings(ReplaySettings):
     clipped: bool = True
     weight_decay: NonNegative = 0.0
     bfloat16: bool = False
-
-
-def precision_setting(settings: Mapping[str, Any], asked: str = "auto") -> dict[str, bool]:
-    """{"bfloat16": ...} for a training with `settings`; "auto" times the critics' products in both precisions."""
-    sizes = SacSettings(**settings)
-    precision = choose_precision(asked, dense_product(sizes.critic_hidden[-1], sizes.batch_size))
-    return {"bfloat16": precision == "bfloat16"}
 
 
 RETURN_LIMIT = 5.0
