@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import click
 
 from dmcvb_gen import commands
-from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, print_table, remote_option
+from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.dataset.index import is_card, is_video
@@ -18,9 +16,6 @@ from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import pluralize, quoted
-
-if TYPE_CHECKING:
-    from dmcvb_gen.release.compare import Comparison, Spread
 
 
 @command_of(commands.verify)
@@ -221,45 +216,18 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
 @click.command("diff")
 @click.argument("one", metavar="RELEASE|URL")
 @click.argument("other", metavar="RELEASE|URL")
-@click.option("--data", is_flag=True, help="Also compare returns, lengths, successes and states of common subsets.")
 @remote_option
 @json_option
-def diff_command(one, other, data, options, as_json):
+def diff_command(one, other, options, as_json):
     """Compare two releases by their manifests and commit records: subsets, episodes and digests.
 
-    With --data, also compare the values: each z is the difference of the means in standard deviations of the first
-    release. Exit code 0 when nothing differs, 1 when something does.
+    Exit code 0 when nothing differs, 1 when something does.
 
     \b
     dmcvb-gen diff releases/mini s3://bucket/dmcvb-mini
-    dmcvb-gen diff releases/imported releases/mine --data
     """
-    from dmcvb_gen.release.compare import compare
-    from dmcvb_gen.release.diff import diff, open_both
+    from dmcvb_gen.release.diff import diff
 
     found = diff(one, other, options)
-    compared = compare(*open_both(one, other, options)) if data else []
-    facts: dict[str, Any] = {"differences": [dataclasses.asdict(difference) for difference in found]}
-    facts["data"] = [dataclasses.asdict(row) | {"z": row.z} for row in compared]
-    answer(as_json, facts, *(map(str, found) if found else ["no difference"]))
-    if not as_json:
-        _print_comparisons(compared)
-    click.get_current_context().exit(1 if found else 0)
-
-
-def _print_comparisons(compared: Sequence[Comparison]) -> None:
-    """A table a subset: the first release's values, the second's, and z."""
-    columns = ["quantity", "mean", "std", "p25", "median", "p75", "mean 2", "std 2", "p25 2", "median 2", "p75 2", "z"]
-    quartiles = ("p25", "p75", "p25 2", "p75 2", "median", "median 2")
-    for name in dict.fromkeys(row.subset for row in compared):
-        rows = [
-            [row.quantity, *_values(row.one), *_values(row.other), "" if row.z is None else f"{row.z:+.2f}"]
-            for row in compared
-            if row.subset == name
-        ]
-        print_table(columns, rows, title=name, optional=[quartiles])
-
-
-def _values(spread: Spread) -> list[str]:
-    numbers = (spread.mean, spread.std, spread.p25, spread.median, spread.p75)
-    return ["" if number is None else f"{number:.4g}" for number in numbers]
+    facts = [dataclasses.asdict(difference) for difference in found]
+    answer(as_json, {"differences": facts}, *(found or ["no difference"]), code=1 if found else 0)

@@ -37,16 +37,10 @@ def diff(one: str | Path, other: str | Path, options: dict | None = None) -> lis
     Raises:
       StoreError: one of them is no release, or cannot be read; options without a URL.
     """
-    a, b = open_both(one, other, options)
-    return [*_releases(a, b), *(found for name in _names(a, b) for found in _subsets(a, b, name))]
-
-
-def open_both(one: str | Path, other: str | Path, options: dict | None = None) -> tuple[Release, Release]:
-    """Open two releases to compare; `options` are for those that are URLs. Raises: see `diff`."""
     if not (is_url(one) or is_url(other)):
         check_no_options(one, options)
     a, b = (open_release(place, options if is_url(place) else None) for place in (one, other))
-    return a, b
+    return [*_releases(a, b), *(found for name in _names(a, b) for found in _subsets(a, b, name))]
 
 
 def _names(a: Release, b: Release) -> list[str]:

@@ -74,11 +74,6 @@ def _episodes(subset: Subset, name: str) -> Iterable[np.ndarray]:
         yield values[name]
 
 
-def read_states(subset: Subset) -> Iterable[np.ndarray]:
-    """States of the first `EPISODES` episodes, the last observations included: (length + 1, state) each."""
-    return _episodes(subset, "state")
-
-
 def state_statistics(release: Release) -> list[StateStatistics]:
     """Statistics of the states of every task of a release, in its order."""
     tasks: dict[str, list[np.ndarray]] = {}

@@ -9,8 +9,6 @@ import re
 import shutil
 import threading
 
-import numpy as np
-import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
@@ -18,10 +16,8 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.writer import commit_path
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.diff import diff
-from dmcvb_gen.release.export import export
-from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.publish import publish
-from tests.conftest import maze_recipe, roll_out, small_recipe
+from tests.conftest import maze_recipe, roll_out
 
 NAME, MAZE = "walker-walk/random/none", "ant-maze-tiny/random/visible"
 
@@ -43,7 +39,7 @@ def test_another_seed_changes_arrays_and_missing_episodes_are_counted(maze_relea
     result = CliRunner().invoke(main, ["diff", str(small_release), str(tmp_path / "copy"), "--json"])
     assert result.exit_code == 1
     found = [{"subset": NAME, "message": "episodes that are there: 3 and 2"}]
-    assert json.loads(result.output) == {"differences": found, "data": []}
+    assert json.loads(result.output) == {"differences": found}
     shutil.copytree(maze_release, tmp_path / "a")
     shutil.copytree(maze_release, tmp_path / "b")
     for folder, shard in (("a", 0), ("b", 1)):
@@ -119,35 +115,6 @@ def test_a_url_is_no_folder(tmp_path, small_release):
         assert result.exit_code == 2 and "Traceback" not in result.output and "publish" in result.output
     for command in (["export", str(small_release), "--to", "npz", "--out", url], ["import", "x", "--out", url]):
         assert CliRunner().invoke(main, command).exit_code == 2
-
-
-@pytest.mark.slow
-def test_data_of_two_releases_are_compared(maze_release, small_release, tmp_path):
-    """An imported subset beside one of ours: returns, lengths, successes and each number of the state, with its z."""
-    export(str(small_release), "rlds", tmp_path / "tfds", [NAME])
-    import_tfds(tmp_path / "tfds", tmp_path / "imported")
-    for imported, name, recipe in ((tmp_path / "imported", NAME, small_recipe), (maze_release, MAZE, maze_recipe)):
-        roll_out(recipe().model_copy(update={"seed": 5}), mine := tmp_path / f"mine-{len(name)}")
-        result = CliRunner().invoke(main, ["diff", str(imported), str(mine), "--data", "--json"])
-        assert result.exit_code == 1, result.output
-        rows = {row["quantity"]: row for row in json.loads(result.output)["data"] if row["subset"] == name}
-        one, other = (open_release(place)[name] for place in (imported, mine))
-        returns = rows["return"]
-        assert returns["one"]["mean"] == pytest.approx(one.returns.mean()) and returns["one"]["count"] == len(
-            one.returns
-        )
-        assert returns["other"]["median"] == pytest.approx(float(np.median(other.returns)))
-        z = (other.returns.mean() - one.returns.mean()) / one.returns.std()
-        assert returns["z"] == pytest.approx(z)
-        assert rows["length"]["one"]["mean"] == one.lengths.mean() and ("success" in rows) == (name == MAZE)
-        state = np.concatenate([one.episode(int(e), ["state"])["state"] for e in one.episodes])
-        numbers = [row for quantity, row in rows.items() if quantity not in ("return", "length", "success")]
-        assert len(numbers) == state.shape[1]
-        assert numbers[3]["one"]["mean"] == pytest.approx(state[:, 3].mean(dtype=np.float64), rel=1e-5, abs=1e-6)
-        shown = CliRunner().invoke(main, ["diff", str(imported), str(mine), "--data"]).output
-        assert max(map(len, shown.splitlines()[-30:])) <= 80 and "return" in shown and "std 2" in shown
-    result = CliRunner().invoke(main, ["diff", str(small_release), str(maze_release), "--data"])
-    assert result.exit_code == 2 and "no subset in common" in result.output
 
 
 def test_options_are_for_urls(small_release):
