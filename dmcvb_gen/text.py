@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -31,3 +32,13 @@ def format_bytes(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     raise AssertionError("unreachable")
+
+
+def printable(text: str, line: str = "\n") -> str:
+    """A text of somebody else as a terminal may print it: control characters, which it would obey, become "?".
+
+    Args:
+      line: what a line break becomes.
+    """
+    kept = {"\n": line, "\t": " "}
+    return "".join(kept.get(c, "?") if unicodedata.category(c)[0] == "C" else c for c in text)

@@ -18,6 +18,7 @@ import click
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
+from dmcvb_gen.text import printable
 from dmcvb_gen.version import __version__
 
 GROUPS = {
@@ -91,7 +92,7 @@ class LazyGroup(click.Group):
         except click.exceptions.NoArgsIsHelpError:
             raise
         except click.UsageError as error:
-            click.echo(f"error: {_wrong_usage(error)}", err=True)
+            click.echo(f"error: {printable(_wrong_usage(error))}", err=True)
             raise click.exceptions.Exit(error.exit_code) from None
 
     def format_commands(self, ctx, formatter):
@@ -116,7 +117,7 @@ class LazyGroup(click.Group):
                 what = install_hint(error.name or "")
             if what is None:
                 raise
-            click.echo(f"error: {what}", err=True)
+            click.echo(f"error: {printable(what)}", err=True)
             ctx.exit(2)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.text import format_bytes
+from dmcvb_gen.text import format_bytes, printable
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
 
@@ -62,7 +62,7 @@ def print_table(
 
     console, heads = Console(highlight=False), [column.removeprefix("<") for column in columns]
     left = {i for i, column in enumerate(columns) if i == 0 or column.startswith("<")}
-    lines, shown, stacked = [list(map(str, row)) for row in rows], list(range(len(heads))), False
+    lines, shown, stacked = [[printable(str(cell)) for cell in row] for row in rows], list(range(len(heads))), False
     widths = [max(len(line[i]) for line in [heads, *lines]) for i in range(len(heads))]
 
     def width() -> int:
@@ -103,7 +103,7 @@ def answer(as_json: bool, facts: Any, *lines: Any, code: int = 0) -> None:
         print_json(facts)
     else:
         for line in lines:
-            click.echo(line)
+            click.echo(printable(str(line)))
     if code:
         click.get_current_context().exit(code)
 

@@ -58,38 +58,13 @@ def write_table(release: Release, path: Path) -> None:
                 writer.write_table(pa.Table.from_pydict(_facts(subset, few) | _frames(subset, few), _schema()))
 
 
-def table_problem(release: Release, path: Path, part: bool = False) -> str | None:
-    """Say what in a table does not fit its release, apart from the pictures; None if it fits.
-
-    Args:
-      part: only a part of the release is here; compare only the rows of these episodes.
-    """
-    if not path.is_file():
-        return "is missing"
-    names = [name for name in COLUMNS if name != "first_frame"]
+def table_rows(path: Path) -> set[tuple]:
+    """The rows of a table without the pictures; none if there is no table that can be read."""
     try:
-        stored = pq.read_table(path, columns=names)
+        table = pq.read_table(path, columns=[name for name in COLUMNS if name != "first_frame"])
     except (pa.ArrowInvalid, OSError, KeyError):
-        return "cannot be read"
-    plain = pa.schema([(name, COLUMNS[name][0]) for name in names])
-    parts = [pa.Table.from_pydict(_facts(subset, subset.episodes), plain) for subset in release.subsets.values()]
-    if stored.schema.names != names:
-        return "does not fit the release's episodes"
-    wanted, stored = pa.concat_tables(parts), stored.cast(plain)
-    if part:
-        stored = _rows_of(stored, wanted)
-    fits = stored.equals(wanted)
-    return None if fits else "does not fit the release's episodes"
-
-
-def _rows_of(table: pa.Table, wanted: pa.Table) -> pa.Table:
-    """The rows of a table for the episodes of another table, in the order of that table."""
-
-    def keys(table: pa.Table) -> list[tuple[str, int]]:
-        return list(zip(table["subset"].to_pylist(), table["episode"].to_pylist(), strict=True))
-
-    rows = {key: row for row, key in enumerate(keys(table))}
-    return table.take([rows[key] for key in keys(wanted) if key in rows])
+        return set()
+    return {tuple(row.values()) for row in table.to_pylist()}
 
 
 def header_facts(path: Path) -> dict[str, Any]:

@@ -1,0 +1,38 @@
+"""Fill the templates of a card: Markdown in which no text of a release becomes markup, and JSON."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from typing import Any
+
+from dmcvb_gen.text import printable
+
+MARKUP = str.maketrans({character: f"&#{ord(character)};" for character in "<>&[]|"})
+"""Characters of which Markdown makes elements, links and cells -> the same characters as entities."""
+
+
+def markdown(value: object) -> str:
+    """A text in one line that shows its characters and is no HTML, no link and no cell of a table."""
+    return printable(str(value), line=" ").translate(MARKUP)
+
+
+def fill(name: str, **values: Any) -> str:
+    """A template of `release/data`. In Markdown, values are escaped unless the template calls them safe."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    def escaped(value: object) -> object:
+        return value if isinstance(value, Markup) or not name.endswith(".md.jinja") else markdown(value)
+
+    environment = Environment(
+        loader=PackageLoader("dmcvb_gen.release", "data"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+        finalize=escaped,
+    )
+    environment.filters["python"] = lambda text: Markup(json.dumps(printable(text, line=" ")))
+    environment.filters["shell"] = lambda text: Markup(shlex.quote(printable(text, line=" ")))
+    return environment.get_template(name).render(**values)
