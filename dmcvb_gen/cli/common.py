@@ -85,7 +85,7 @@ def print_table(
             console.print(Text(text, style), soft_wrap=True)
 
     if title:
-        console.print(Text(title, "bold"), soft_wrap=False)
+        console.print(Text(printable(title), "bold"), soft_wrap=False)
     put(heads, "bold")
     for line in lines:
         put(line, "dim" if line[0].startswith(" ") else "")

@@ -18,7 +18,7 @@ from dmcvb_gen.cli.common import (
 )
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.storage.remote import is_url, public
-from dmcvb_gen.text import format_bytes, pluralize, quoted
+from dmcvb_gen.text import format_bytes, pluralize, printable, quoted
 
 
 @click.command()
@@ -64,7 +64,7 @@ def info(path, options, as_json):
     size = format_bytes(facts["bytes"])
     if facts["disk_bytes"] not in (None, facts["bytes"]):
         size += f" ({format_bytes(facts['disk_bytes'])} on disk)"
-    click.echo(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}")
+    click.echo(printable(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}"))
     if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
         click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):

@@ -12,6 +12,10 @@ MARKUP = str.maketrans({character: f"&#{ord(character)};" for character in "<>&[
 """Characters of which Markdown makes elements, links and cells -> the same characters as entities."""
 
 
+class Safe(str):
+    """A text that is Markdown already."""
+
+
 def markdown(value: object) -> str:
     """A text in one line that shows its characters and is no HTML, no link and no cell of a table."""
     return printable(str(value), line=" ").translate(MARKUP)
@@ -20,10 +24,9 @@ def markdown(value: object) -> str:
 def fill(name: str, **values: Any) -> str:
     """A template of `release/data`. In Markdown, values are escaped unless the template calls them safe."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     def escaped(value: object) -> object:
-        return value if isinstance(value, Markup) or not name.endswith(".md.jinja") else markdown(value)
+        return value if isinstance(value, Safe) or not name.endswith(".md.jinja") else markdown(value)
 
     environment = Environment(
         loader=PackageLoader("dmcvb_gen.release", "data"),
@@ -33,6 +36,7 @@ def fill(name: str, **values: Any) -> str:
         undefined=StrictUndefined,
         finalize=escaped,
     )
-    environment.filters["python"] = lambda text: Markup(json.dumps(printable(text, line=" ")))
-    environment.filters["shell"] = lambda text: Markup(shlex.quote(printable(text, line=" ")))
+    environment.filters["safe"] = Safe
+    environment.filters["python"] = lambda text: Safe(json.dumps(printable(text, line=" ")))
+    environment.filters["shell"] = lambda text: Safe(shlex.quote(printable(text, line=" ")))
     return environment.get_template(name).render(**values)

@@ -217,6 +217,7 @@ def test_a_card_is_replaced_whole_or_not_at_all(copy, monkeypatch):
         write_card(copy)
     kept = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file() and path.suffix != PARTIAL}
     assert kept == before
+    monkeypatch.undo()
     assert [file.path for file in card_files(copy) if PARTIAL in file.path] == [] and check_card(copy) == []
 
 

@@ -65,13 +65,9 @@ def test_the_card_is_held_against_what_is_here(part):
         group["reward"][0, 0] += 0.5
         group["return"][0] += 0.5
 
-    text = (part / "README.md").read_text()
-    (part / "README.md").write_text(text.replace(f"`{subset.record.digest[:12]}`", "`0123456789ab`", 1))
-    assert check_card(part) == [f"README.md says another digest of {subset.name}"]
-    (part / "README.md").write_text(text)
     rewrite(part, subset.name, better)
     result = run("card", part, "--check")
-    assert result.exit_code == 1 and "card/episodes.parquet does not fit the release's episodes" in result.output
+    assert result.exit_code == 1 and "card/episodes.parquet does not fit the episodes that are here" in result.output
     write_card(part)  # one of its own
     assert check_card(part) == [] and run("card", part, "--check").exit_code == 0
 
