@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
 from dmcvb_gen.agents.learners import Batch
-from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
@@ -39,8 +39,8 @@ ENCODED_ROWS = 256
 
 
 @dataclass(frozen=True)
-class Source:
-    """A part of a subset.
+class Slice:
+    """A part of a subset, by name.
 
     Attributes:
       share: share of its episodes, drawn by the seed of the split.
@@ -48,10 +48,20 @@ class Source:
       goal_pair: only episodes of this fixed (start, goal) pair (mazes).
     """
 
-    subset: Subset
+    subset: str
     share: float = 1.0
     episodes: int | None = None
     goal_pair: int | None = None
+
+    @property
+    def label(self) -> str:
+        """Its level, and how much of it: "expert", "20 expert", "5% expert", "expert goal 3"."""
+        level = self.subset.split("/")[-2]
+        if self.goal_pair is not None:
+            return f"{level} goal {self.goal_pair}"
+        if self.episodes is not None:
+            return f"{self.episodes} {level}"
+        return level if self.share == 1 else f"{100 * self.share:g}% {level}"
 
 
 @dataclass(frozen=True)
@@ -72,7 +82,7 @@ class Normalization:
         return cls(values.mean(dim=0).float(), std.float())
 
 
-class HeldFrames:
+class FrameTable:
     """The frames of a table that was read with a border of `PAD`, as a tensor.
 
     A shifted line of pixels is `size` bytes that stand together, so that picking frames, stacking them and moving them
@@ -157,21 +167,6 @@ class Sizes:
     stack: int = 0
 
 
-class Picks(NamedTuple):
-    """The random choices of a batch; each array is (batch,) int64.
-
-    Attributes:
-      index: which of `TrainingData.candidates`.
-      down, right: offsets of the pictures in 0..2 PAD; None: not shifted.
-      steps: steps to the next observation; None if the batch has none.
-    """
-
-    index: np.ndarray
-    down: np.ndarray | None = None
-    right: np.ndarray | None = None
-    steps: np.ndarray | None = None
-
-
 class TrainingData:
     """Episodes of one or several subsets, ready to be drawn from.
 
@@ -209,7 +204,7 @@ class TrainingData:
         self.train_rows, self.hold_out_rows = rows[~held[rows]], rows[held[rows]]
         self.normalization = Normalization.of(state[~held])
         self.state = self.normalization(state.float())
-        self.frames = None if table.frames is None else HeldFrames(table.frames, device)
+        self.frames = None if table.frames is None else FrameTable(table.frames, device)
         self.lengths, self.held_out, self.returns, self.stack = table.lengths, held_out, returns, stack
 
     @property
@@ -272,52 +267,24 @@ class TrainingData:
           hold_out: draw from the held-out episodes, without shifts.
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
           options: dtype, reuse and pictures of `transitions`.
-        """
-        rows = self.candidates(k if next_observation else 1, hold_out)
-        picks = self.pick(
-            len(rows), size, generator, next_observation, k, sample_k, shift and not hold_out and self.can_shift
-        )
-        index, down, right, steps = (None if values is None else self._to_device(values) for values in picks)
-        return self.transitions(rows[index], steps, down, right, **options)
-
-    @property
-    def can_shift(self) -> bool:
-        """True if there are pictures that are not encoded yet."""
-        return self.frames is not None and self.latent is None
-
-    def candidates(self, k: int = 1, hold_out: bool = False) -> torch.Tensor:
-        """(row,) long: the rows that a batch is drawn from, those with an observation k steps later.
 
         Raises:
-          DmcvbError: there are none.
+          DmcvbError: there are no transitions to draw from.
         """
         rows = self.hold_out_rows if hold_out else self.train_rows
-        if k > 1:
+        if next_observation and k > 1:
             rows = rows[rows + k <= self.end[rows]]
         if not len(rows):
-            raise DmcvbError(
-                f"there are no {'held-out ' if hold_out else ''}transitions to draw from (k = {k}); roll out more "
-                "episodes"
-            )
-        return rows
-
-    @staticmethod
-    def pick(
-        candidates: int,
-        size: int,
-        generator: np.random.Generator,
-        next_observation: bool = False,
-        k: int = 1,
-        sample_k: bool = False,
-        shift: bool = False,
-    ) -> Picks:
-        """Draw a batch from so many candidates; see `batch`."""
-        index = generator.integers(candidates, size=size)
-        down, right = generator.integers(2 * PAD + 1, size=(2, size)) if shift else (None, None)
-        steps = None
+            kind = "held-out " if hold_out else ""
+            raise DmcvbError(f"there are no {kind}transitions to draw from (k = {k}); roll out more episodes")
+        index = generator.integers(len(rows), size=size)
+        down = right = steps = None
+        if shift and not hold_out and self.frames is not None and self.latent is None:
+            down, right = map(self._to_device, generator.integers(2 * PAD + 1, size=(2, size)))
         if next_observation:
-            steps = generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k)
-        return Picks(index, down, right, steps)
+            drawn = generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k)
+            steps = self._to_device(drawn)
+        return self.transitions(rows[self._to_device(index)], steps, down, right, **options)
 
     def transitions(
         self,
@@ -424,20 +391,20 @@ def part_count(share: float, episodes: int) -> int:
     return max(1, round(share * episodes))
 
 
-def choose_episodes(source: Source, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """(episodes, held out) of a source: its share, and which of those no agent learns from.
+def choose_episodes(subset: Subset, part: Slice, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(episodes, held out) of a slice of a subset, and which of those no agent learns from.
 
     5 % are held out, but none of a single episode, of a counted few or of a goal pair's: the paper's policies learn
     from all of those.
     """
-    names = source.subset.episodes
-    if source.goal_pair is not None:
-        names = names[source.subset.read("goal_pair") == source.goal_pair]
+    names = subset.episodes
+    if part.goal_pair is not None:
+        names = names[subset.read("goal_pair") == part.goal_pair]
         if not len(names):
-            raise DmcvbError(f"{source.subset.name} has no episodes of goal pair {source.goal_pair}")
+            raise DmcvbError(f"{subset.name} has no episodes of goal pair {part.goal_pair}")
     order = np.random.default_rng(seed).permutation(len(names))
-    count = min(source.episodes or part_count(source.share, len(names)), len(names))
-    few = source.episodes is not None or source.goal_pair is not None
+    count = min(part.episodes or part_count(part.share, len(names)), len(names))
+    few = part.episodes is not None or part.goal_pair is not None
     out = 0 if few else count - training_episodes(count)
     chosen = order[:count]
     held = np.zeros(count, bool)
@@ -459,7 +426,8 @@ def default_memory(device: str = "cpu") -> int:
 
 
 def load_data(
-    sources: Sequence[Source],
+    release: Release,
+    slices: Sequence[Slice],
     *,
     pixels: bool = True,
     stack: int = FRAMES,
@@ -469,7 +437,7 @@ def load_data(
     scratch: str | Path | None = None,
     tick: Callable[[float], None] = ignore,
 ) -> TrainingData:
-    """Read subsets (mixed, if there are several) for training.
+    """Read slices of a release (mixed, if there are several) for training.
 
     Args:
       pixels: agents see pictures; else states.
@@ -482,13 +450,14 @@ def load_data(
     Raises:
       DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
     """
-    subsets = [source.subset for source in sources]
+    subsets = [release[part.subset] for part in slices]
     names = [training_pictures(subset).arrays if subset.pixel_arrays else () for subset in subsets]
     if len({(subset.task, subset.record.size, len(n)) for subset, n in zip(subsets, names, strict=True)}) != 1:
         raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or image sizes differ")
     if pixels and not names[0]:
         raise DmcvbError(f"{subsets[0].name} has no images that agents are trained on")
-    chosen, held_out = zip(*(choose_episodes(source, seed) for source in sources), strict=True)
+    split = [choose_episodes(subset, part, seed) for subset, part in zip(subsets, slices, strict=True)]
+    chosen, held_out = zip(*split, strict=True)
     parts = [Selection(s, e, n if pixels else ()) for s, e, n in zip(subsets, chosen, names, strict=True)]
     size, lengths = subsets[0].record.size, [part.subset.read("length", part.episodes) for part in parts]
     needed = int((np.concatenate(lengths) + 1).sum()) * 3 * len(names[0]) * size * (size + 2 * PAD)
@@ -499,4 +468,4 @@ def load_data(
     return TrainingData(table, np.concatenate(held_out), stack, returns, device)
 
 
-__all__ = ["Batch", "Normalization", "Source", "TrainingData", "batches", "load_data", "training_episodes"]
+__all__ = ["Batch", "Normalization", "Slice", "TrainingData", "batches", "load_data", "training_episodes"]

@@ -1,7 +1,7 @@
 """DINO: a frozen encoder of frame stacks from the weights of a vision transformer that the user brings.
 
-Nothing is downloaded. The network is timm's; its size is read from the shapes of the weights (ViT-S or -B, patches of 8
-or 16), whose names are those of the DINO release (Caron et al. 2021) and of timm.
+Nothing is downloaded. timm makes the network and reads its file; the sizes (ViT-S or -B, patches of 8 or 16) are those
+of the weights' shapes.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors import SafetensorError, safe_open
 from torch import nn
 
 from dmcvb_gen.agents.learners import ReadyEncoder, register_agent
@@ -55,36 +54,37 @@ class DinoEncoder(ReadyEncoder):
             raise DmcvbError(cls.missing)
         if size > INPUT:
             raise DmcvbError(f"DINO sees {INPUT} pixels a side at most, these images have {size}; repaint them smaller")
+        if Path(weights).suffix != ".safetensors":  # timm unpickles files of other names
+            raise DmcvbError(f"{weights} is no .safetensors file; give --dino-weights one")
         try:
-            tensors = load_file(str(weights))
+            vit = _timm().create_model("vit_small_patch16_224", checkpoint_path=str(weights), **_sizes(weights))
         except (OSError, SafetensorError) as error:
             raise DmcvbError(f"cannot read DINO weights {weights} ({error}); give a safetensors file") from None
-        try:
-            vit = _vision_transformer(tensors)
-            vit.load_state_dict({name: value for name, value in tensors.items() if not name.startswith("head")})
         except (KeyError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise DmcvbError(f"{weights} does not hold the weights of a DINO vision transformer ({reason})") from None
+        vit.reset_classifier(0)
         return cls(vit.float().eval().requires_grad_(False), channels)
 
 
-def _vision_transformer(weights: dict[str, torch.Tensor]) -> nn.Module:
-    """timm's network of the weights' sizes: (batch, 3, 224, 224), normalized as ImageNet -> (batch, width)."""
-    width, _, patch, _ = weights["patch_embed.proj.weight"].shape
-    depth = 1 + max(int(name.split(".")[1]) for name in weights if name.startswith("blocks."))
-    inner = weights["blocks.0.mlp.fc1.weight"].shape[0]
+def _sizes(weights: str | Path) -> dict[str, float]:
+    """timm's arguments for a network of the shapes in a file."""
+    with safe_open(str(weights), "pt") as file:
+        shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118 (not a dict)
+    if "patch_embed.proj.weight" not in shapes or "blocks.0.mlp.fc1.weight" not in shapes:
+        raise ValueError("no patch_embed.proj.weight and blocks.0.mlp.fc1.weight")
+    width, _, patch, _ = shapes["patch_embed.proj.weight"]
+    depth = 1 + max(int(name.split(".")[1]) for name in shapes if name.startswith("blocks."))
+    ratio, classes = shapes["blocks.0.mlp.fc1.weight"][0] / width, shapes.get("head.weight", [0])[0]
+    sizes = dict(patch_size=patch, embed_dim=width, depth=depth, num_heads=width // HEAD)
+    return sizes | dict(mlp_ratio=ratio, num_classes=classes)
+
+
+def _timm():
     try:
-        from timm.models.vision_transformer import VisionTransformer
+        import timm
     except ImportError:
         raise DmcvbError(f"the agent 'dino': {install_hint('timm')}") from None
     except RuntimeError as error:  # torchvision's kernels are of another build than torch
         raise DmcvbError(f"timm cannot start ({error}); install the torchvision that belongs to your torch") from None
-    return VisionTransformer(
-        img_size=INPUT,
-        patch_size=patch,
-        embed_dim=width,
-        depth=depth,
-        num_heads=width // HEAD,
-        mlp_ratio=inner / width,
-        num_classes=0,
-    )
+    return timm

@@ -1,8 +1,8 @@
 """Base of all agents: the batch that they learn from, the base classes of their parts, and the registry of parts.
 
-An agent is a policy, on its own encoder or on one that was pre-trained. Each part has a file in this folder, which
-reads like its equation: o is an observation (frame stack or state), already normalized and augmented; a the action
-taken there. Squared errors are means over batch and dimensions. `register_agent` makes a part known by its name.
+An agent is a policy, on its own encoder or on one that was pre-trained. `paper.py`, `td3_bc.py` and `dino.py` hold the
+parts, which read like their equations: o is an observation (frame stack or state), already normalized and augmented; a
+the action taken there. Squared errors are means over batch and dimensions. `register_agent` makes a part known by name.
 """
 
 from __future__ import annotations
@@ -91,9 +91,6 @@ class Learner(nn.Module, abc.ABC):
     """The methods that torch.compile is worth trying on."""
     pretrains = True
     """Whether it may pre-train the encoder of another policy."""
-    recordable = False
-    """Whether `update` asks for the same kernels every time, so that a GPU may record them once
-    (`agents.recorded`). Each class says so for itself."""
     options: Mapping[str, int | bool] = {}
     """Its options in an agent's name and their defaults: True or False for a word, a number for word=1..64."""
 

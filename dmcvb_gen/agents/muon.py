@@ -3,6 +3,9 @@
 A step of Adam can be large along a few directions of a matrix and small along all others; Muon makes it equally large
 along all (Jordan et al. 2024, "Muon: An optimizer for hidden layers in neural networks"). Steps are scaled to the size
 of Adam's, so that both take the same learning rate (Liu et al. 2025, "Muon is scalable for LLM training", section 2.2).
+
+torch.optim.Muon makes the same steps, of linear maps alone and in bfloat16 alone: on a processor that emulates bfloat16
+a 256 x 256 matrix takes it 360 ms, and 9 ms here in float32.
 """
 
 from __future__ import annotations
@@ -66,16 +69,18 @@ class Muon(torch.optim.Adam):
 
     @classmethod
     def instead_of(cls, optimizer: torch.optim.Optimizer, dtype: torch.dtype) -> torch.optim.Optimizer:
-        """One over the parameters of a plain Adam, at its learning rate.
+        """One over the parameters of an Adam that has torch's own settings, at its learning rate.
 
-        An agent may have chosen another optimizer; that one is returned unchanged.
+        An agent may have chosen another optimizer, or other settings: that one is returned unchanged.
         """
         group, *others = optimizer.param_groups
-        if type(optimizer) is not torch.optim.Adam or others or group["weight_decay"]:
+        usual = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]).defaults
+        chosen = [name for name in usual if name not in ("lr", "fused", "foreach") and group.get(name) != usual[name]]
+        if type(optimizer) is not torch.optim.Adam or others or chosen:
             return optimizer
         return cls(group["params"], group["lr"], dtype)
 
-    def _move(self, weight: torch.Tensor, lr: float | torch.Tensor) -> None:
+    def _move(self, weight: torch.Tensor, lr: float) -> None:
         gradient, state = weight.grad, self.state[weight]
         if not state:
             state |= {"step": torch.zeros((), device=weight.device), "momentum": torch.zeros_like(weight)}
@@ -86,8 +91,4 @@ class Muon(torch.optim.Adam):
         # Convolutions lie with the channels last in memory, so that this order of columns takes no copy.
         matrix = ahead.movedim(1, -1).flatten(1)
         step = orthogonalize(matrix.to(self.dtype)).to(weight.dtype) * (SCALE * max(matrix.shape) ** 0.5)
-        step = step.view_as(ahead.movedim(1, -1)).movedim(-1, 1)
-        if torch.is_tensor(lr):  # of a recorded update, which reads it anew every time
-            weight.sub_(step * lr)
-        else:
-            weight.add_(step, alpha=-lr)
+        weight.add_(step.view_as(ahead.movedim(1, -1)).movedim(-1, 1), alpha=-lr)

@@ -7,7 +7,7 @@ and resumed draws what it would have drawn.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ import torch
 from dmcvb_gen.agents.data import TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.agents.muon import Muon
-from dmcvb_gen.agents.recorded import RecordedUpdate, can_record, prepare
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
@@ -51,7 +50,6 @@ class TrainSettings:
       shift: pictures are shifted at random, as the paper's; short trainings learn several times as fast without.
       decay: the learning rate falls linearly to zero over the steps; the paper keeps it, short trainings gain by it.
       muon: hidden matrices move by `Muon`, not by the paper's Adam.
-      record: on a GPU, record the update once and replay it, if the learner and the data allow it.
     """
 
     steps: int = 400_000
@@ -65,7 +63,6 @@ class TrainSettings:
     shift: bool = True
     decay: bool = False
     muon: bool = False
-    record: bool = True
 
 
 def draw(
@@ -142,12 +139,15 @@ def train(
     log_every = max(1, settings.steps // settings.points)
     started = saved = time.perf_counter()
 
-    record = settings.record and can_record(learner, data)
-    if record:
-        prepare(learner)
+    def make(step: int, reuse: Batch | None) -> Batch:
+        return draw(learner, data, settings.batch_size, seed, step, shift=settings.shift, reuse=reuse)
+
     schedule = _Schedule(learner, settings)
-    for step, losses in (_recorded if record else _in_turn)(learner, data, settings, seed, first, schedule):
-        means.add(losses)
+    workers = max(settings.workers, 2 if data.frames is not None and data.frames.mapped else 0)
+    for step, batch in batches(make, first, settings.steps, workers):
+        torch.manual_seed((seed << 32) + step)
+        schedule.at(step)
+        means.add(learner.update(batch))
         done = step + 1
         tick(1)
         evaluating = done % settings.evaluate_every == 0 or done == settings.steps
@@ -164,49 +164,18 @@ def train(
     return curve
 
 
-Updates = Iterator[tuple[int, dict[str, torch.Tensor]]]
-"""(step, its losses), for every step of a training."""
-
-
-def _in_turn(
-    learner: Learner, data: TrainingData, settings: TrainSettings, seed: int, first: int, schedule: _Schedule
-) -> Updates:
-    def make(step: int, reuse: Batch | None) -> Batch:
-        return draw(learner, data, settings.batch_size, seed, step, shift=settings.shift, reuse=reuse)
-
-    workers = max(settings.workers, 2 if data.frames is not None and data.frames.mapped else 0)
-    for step, batch in batches(make, first, settings.steps, workers):
-        torch.manual_seed((seed << 32) + step)
-        schedule.at(step)
-        yield step, learner.update(batch)
-
-
-def _recorded(
-    learner: Learner, data: TrainingData, settings: TrainSettings, seed: int, first: int, schedule: _Schedule
-) -> Updates:
-    update = RecordedUpdate(learner, data, settings.batch_size, settings.shift)
-    for step in range(first, settings.steps):
-        generator = np.random.default_rng((seed, step, 0))  # as `draw` has it
-        torch.manual_seed((seed << 32) + step)
-        schedule.at(step)
-        yield step, update(generator)
-
-
 class _Schedule:
     """The learning rates of a learner's optimizers, step by step."""
 
     def __init__(self, learner: Learner, settings: TrainSettings):
         self._groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
-        self._own = [float(group["lr"]) for group in self._groups]
+        self._own = [group["lr"] for group in self._groups]
         self._settings = settings
 
     def at(self, step: int) -> None:
         factor = self._settings.rate * (1 - step / self._settings.steps if self._settings.decay else 1.0)
         for group, rate in zip(self._groups, self._own, strict=True):
-            if torch.is_tensor(group["lr"]):  # a recorded update reads it where it lies
-                group["lr"].fill_(rate * factor)
-            else:
-                group["lr"] = rate * factor
+            group["lr"] = rate * factor
 
     def restore(self) -> None:
         for group, rate in zip(self._groups, self._own, strict=True):

@@ -19,9 +19,9 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
-from dmcvb_gen.agents.data import Normalization, Source, TrainingData, choose_episodes, load_data
+from dmcvb_gen.agents.data import Normalization, Slice, TrainingData, choose_episodes, load_data
 from dmcvb_gen.agents.learners import Policy
-from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
+from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import Curve, TrainSettings, draw, forget, train
 from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, protocol, renderer_choice
 from dmcvb_gen.benchmarks.goals import goal_cells
@@ -36,7 +36,7 @@ from dmcvb_gen.benchmarks.setup import (
     read_result,
     sees_pictures,
 )
-from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell
 from dmcvb_gen.benchmarks.trained import save_agent
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.writer import subset_digest
@@ -52,10 +52,6 @@ ProgressCallback = Callable[[str, int], None]
 """Callback that is told what is being done and how many Adam steps were made since the last call."""
 
 
-def _source(release: Release, part: Part) -> Source:
-    return Source(release[part.subset], part.share, part.episodes, part.goal_pair)
-
-
 class _DataCache:
     """The data of the last parts asked for: cells that follow each other often share them."""
 
@@ -66,7 +62,7 @@ class _DataCache:
         self,
         setup: Setup,
         release: Release,
-        parts: Sequence[Part],
+        parts: Sequence[Slice],
         pixels: bool,
         stack: int,
         tick: ProgressCallback = ignore,
@@ -78,7 +74,8 @@ class _DataCache:
             self._key = self._data = None  # free the old pictures before new ones are read
             names = " + ".join(dict.fromkeys(part.subset for part in parts))
             self._data = load_data(
-                [_source(release, part) for part in parts],
+                release,
+                parts,
                 pixels=pixels,
                 seed=setup.seed,
                 device=setup.device,
@@ -258,7 +255,7 @@ def _run_own(setup: Setup, cell: Cell, own: OwnAgent, release: Release, mark: st
     data = _cache.get(setup, release, cell.policy, False, own.stack)
     sources = []
     for part in cell.policy:
-        episodes, held = choose_episodes(_source(release, part), setup.seed)
+        episodes, held = choose_episodes(release[part.subset], part, setup.seed)
         views = "agents" if own.pixels else ()
         sources.append(StepSource(release[part.subset], episodes[~held], views, own.stack))
     policy = own.policy(AgentData(tuple(sources), cell.task, cell.setting, setup.seed))
@@ -476,7 +473,7 @@ def inspect(
     held_out = len(data.hold_out_rows) > 0
     batch = draw(readouts["observation"], data, 8, setup.seed, 0, hold_out=held_out)
     with torch.no_grad(), readouts["observation"].precision():
-        seen = readouts["observation"].reconstruct(batch).float()
+        seen = readouts["observation"].predict(batch).float()
     newest = slice(-data.frames.channels, None)
     rows = [_to_pictures(pictures[:, newest][:, :3]) for pictures in (batch.observation, seen)]
     _save_sheet(setup.cells / f"{cell.id}.decoder.png", rows)

@@ -11,7 +11,7 @@ from typing import Any
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.benchmarks.profiles import budget, facts_of
 from dmcvb_gen.benchmarks.setup import Setup
-from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Slice
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.errors import DmcvbError
@@ -102,7 +102,7 @@ def _cell_of(result: Mapping[str, Any]) -> Cell | None:
     """The cell of a result; None if it names an agent or benchmark that is not known here."""
     try:
         facts = result["cell"]
-        parts = {name: tuple(Part(**part) for part in facts[name]) for name in ("policy", "pretrain")}
+        parts = {name: tuple(Slice(**part) for part in facts[name]) for name in ("policy", "pretrain")}
         BENCHMARKS.get(facts["benchmark"])
         return Cell(facts["benchmark"], facts["task"], facts["setting"], parse_agent(facts["agent_name"]), **parts)
     except (DmcvbError, LookupError, TypeError):

@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.evaluate import protocol
 from dmcvb_gen.benchmarks.goals import goal_cells
 from dmcvb_gen.benchmarks.own import OwnAgent
 from dmcvb_gen.benchmarks.profiles import Profile
-from dmcvb_gen.benchmarks.suites import Cell, Part, slug
+from dmcvb_gen.benchmarks.suites import Cell, Slice, slug
 from dmcvb_gen.dataset import Release, open_release
 from dmcvb_gen.dataset.writer import subset_digest
 from dmcvb_gen.files import write_json
@@ -106,7 +106,7 @@ class Pretraining:
     task: str
     setting: str
     agent: Agent
-    parts: tuple[Part, ...]
+    parts: tuple[Slice, ...]
 
     @property
     def id(self) -> str:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from dmcvb_gen.agents.catalog import Agent, parse_agent
+from dmcvb_gen.agents.data import Slice
 from dmcvb_gen.benchmarks.goals import goal_pairs
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.generate.inputs import BUILTIN, video_source
@@ -32,25 +33,6 @@ DEFAULT_SIZE = 64
 
 
 @dataclass(frozen=True)
-class Part:
-    """A part of a subset by name, as `agents.data.Source`."""
-
-    subset: str
-    share: float = 1.0
-    episodes: int | None = None
-    goal_pair: int | None = None
-
-    @property
-    def label(self) -> str:
-        level = self.subset.split("/")[-2]
-        if self.goal_pair is not None:
-            return f"{level} goal {self.goal_pair}"
-        if self.episodes is not None:
-            return f"{self.episodes} {level}"
-        return level if self.share == 1 else f"{100 * self.share:g}% {level}"
-
-
-@dataclass(frozen=True)
 class Cell:
     """One number of a benchmark: an agent, what its encoder and what its policy learns from.
 
@@ -63,8 +45,8 @@ class Cell:
     task: str
     setting: str
     agent: Agent
-    policy: tuple[Part, ...]
-    pretrain: tuple[Part, ...] = ()
+    policy: tuple[Slice, ...]
+    pretrain: tuple[Slice, ...] = ()
 
     @property
     def policy_label(self) -> str:
@@ -80,7 +62,7 @@ class Cell:
         return "+".join(labels)
 
     @property
-    def pretrain_parts(self) -> tuple[Part, ...]:
+    def pretrain_parts(self) -> tuple[Slice, ...]:
         return (self.pretrain or self.policy) if self.agent.pretrain else ()
 
     @property
@@ -150,14 +132,14 @@ class SubsetFinder:
             return None
         return tuple(self._names[task, level, setting] for level in levels)
 
-    def parts(self, task: str, levels: Iterable[str], setting: str, **share: Any) -> tuple[Part, ...] | None:
+    def parts(self, task: str, levels: Iterable[str], setting: str, **share: Any) -> tuple[Slice, ...] | None:
         names = self.find(task, levels, setting)
-        return names and tuple(Part(name, **share) for name in names)
+        return names and tuple(Slice(name, **share) for name in names)
 
-    def first(self, task: str, level: str, setting: str, most: int) -> tuple[Part, ...] | None:
+    def first(self, task: str, level: str, setting: str, most: int) -> tuple[Slice, ...] | None:
         """Some episodes of a subset, all of them if it has no more than that."""
         names = self.find(task, [level], setting)
-        return names and tuple(Part(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
+        return names and tuple(Slice(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
 
     def pairs(self, name: str) -> tuple[int, ...]:
         """The goal pairs of a fixed-goal subset whose episodes are all there; the others are noted."""

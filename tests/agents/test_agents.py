@@ -10,13 +10,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from dmcvb_gen.agents.autoencoder import Autoencoder
-from dmcvb_gen.agents.bc import BehaviorCloning
 from dmcvb_gen.agents.catalog import agent_names, make_encoder, make_policy, make_pretrainer, parse_agent
 from dmcvb_gen.agents.data import Sizes
 from dmcvb_gen.agents.dino import DinoEncoder
-from dmcvb_gen.agents.forward_dynamics import LatentForwardDynamics
-from dmcvb_gen.agents.inverse_dynamics import InverseDynamics
 from dmcvb_gen.agents.learners import Batch, move_towards
 from dmcvb_gen.agents.networks import (
     MLP,
@@ -29,9 +25,15 @@ from dmcvb_gen.agents.networks import (
     state_decoder,
     state_encoder,
 )
-from dmcvb_gen.agents.privileged_bc import PrivilegedBC
-from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
-from dmcvb_gen.agents.state_prediction import StatePrediction
+from dmcvb_gen.agents.paper import (
+    Autoencoder,
+    BehaviorCloning,
+    InverseDynamics,
+    LatentForwardDynamics,
+    ObservationProbe,
+    StatePrediction,
+    StateProbe,
+)
 from dmcvb_gen.agents.td3_bc import TD3BC
 from dmcvb_gen.agents.trainer import TrainSettings, train
 from dmcvb_gen.benchmarks.profiles import PROFILES
@@ -324,13 +326,12 @@ def td3(alpha=2.5, bounded=True):
 MOVED = {
     "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), ("encoder", "policy")),
     "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), ("policy",)),
-    "privileged bc": (lambda: PrivilegedBC(small_encoder(), SIZES), ("encoder", "estimator", "policy")),
     "id": (lambda: InverseDynamics(small_encoder(), SIZES), ("encoder", "f.")),
     "sampled id": (lambda: InverseDynamics(small_encoder(), SIZES, k=4, sample=True), ("encoder", "f.", "embed_k")),
     "lfd": (lambda: LatentForwardDynamics(small_encoder(), SIZES), ("encoder", "embed_action", "g.", "target_")),
-    "ae": (lambda: Autoencoder(small_encoder(), SIZES), ("encoder", "decoder")),
+    "ae": (lambda: Autoencoder(small_encoder(), SIZES), ("encoder", "psi")),
     "state": (lambda: StatePrediction(small_encoder(), SIZES), ("encoder", "h.")),
-    "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), ("decoder",)),
+    "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), ("psi",)),
     "state readout": (lambda: StateProbe(small_encoder(), SIZES), ("h.",)),
     "td3-bc, critics first": (td3, ("net.critic1", "net.critic2")),
 }
@@ -341,23 +342,6 @@ def test_one_update_moves_exactly_the_parameters_that_the_paper_says(kind):
     make, prefixes = MOVED[kind]
     learner = make()
     assert moved(learner) == names(learner, *prefixes)
-
-
-def test_privileged_bcs_policy_learns_from_true_states_alone():
-    learner = PrivilegedBC(small_encoder(), SIZES)
-    batch = make_batch()
-    losses = learner.losses(batch)
-    losses["cloning"].backward(retain_graph=True)
-    reached = {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
-    assert reached == {"policy"}
-    learner.zero_grad(set_to_none=True)
-    losses["estimate"].backward()
-    assert "policy" not in {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
-    held_out = [learner.metrics(batch)["cloning"] for _ in range(2)]
-    assert torch.equal(*held_out), "held-out losses have no noise"
-    with torch.no_grad():
-        estimate = learner.estimator(learner.encoder(batch.observation))
-        torch.testing.assert_close(learner.act(batch.observation), learner.policy(estimate))
 
 
 def test_td3_bc_moves_convolutions_and_both_trunks_by_the_actors_loss_alone():
@@ -490,7 +474,6 @@ OVERFIT = {
     "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), 40, 0.05),
     "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), STATE_SIZES), 60, 0.05),
     "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), 60, 0.05),
-    "privileged bc": (lambda: PrivilegedBC(small_encoder(), SIZES), 80, 0.1),
     "td3-bc": (lambda: td3(alpha=0.01), 80, 0.1),
     "td3-bc on states": (lambda: TD3BC(None, STATE_SIZES, alpha=0.01), 150, 0.1),
     "id": (lambda: InverseDynamics(small_encoder(), SIZES), 40, 0.05),
@@ -611,6 +594,9 @@ def test_a_file_that_is_no_dino_is_refused(tmp_path):
     (tmp_path / "y.safetensors").write_bytes(b"not one")
     with pytest.raises(DmcvbError, match="cannot read"):
         DinoEncoder.load(tmp_path / "y.safetensors", channels=9)
+    torch.save({"x": torch.zeros(1)}, tmp_path / "z.pth")
+    with pytest.raises(DmcvbError, match="is no .safetensors file"):
+        DinoEncoder.load(tmp_path / "z.pth", channels=9)
 
 
 @pytest.mark.parametrize("name", [name for name in agent_names() if not name.startswith("dino")])

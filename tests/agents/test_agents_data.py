@@ -11,9 +11,9 @@ import torch
 
 from dmcvb_gen.agents import data as agents_data
 from dmcvb_gen.agents import trainer
-from dmcvb_gen.agents.bc import BehaviorCloning
-from dmcvb_gen.agents.data import PAD, Source, TrainingData, batches, load_data, normalize_pixels
+from dmcvb_gen.agents.data import PAD, Slice, TrainingData, batches, load_data, normalize_pixels
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
+from dmcvb_gen.agents.paper import BehaviorCloning
 from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset import steps as steps_module
@@ -140,7 +140,7 @@ def test_states_are_normalized_by_the_training_episodes_with_a_floor():
 
 def test_a_subset_is_held_as_it_is_stored(small_release):
     subset = open_release(small_release)["walker-walk/random/dynamic"]
-    data = load_data([Source(subset)])
+    data = load_data({subset.name: subset}, [Slice(subset.name)])
     assert not data.frames.mapped and data.channels == 9
     assert (data.held_out.sum(), len(data), len(data.hold_out_rows)) == (1, 1000, 500)
     episode = subset.episode(2)
@@ -152,8 +152,9 @@ def test_a_subset_is_held_as_it_is_stored(small_release):
 
 
 def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_release, tmp_path):
-    sources = [Source(open_release(small_release)[f"walker-walk/random/{name}"]) for name in ("none", "dynamic")]
-    held, stored = load_data(sources), load_data(sources, memory=0, scratch=tmp_path)
+    release = open_release(small_release)
+    parts = [Slice(f"walker-walk/random/{name}") for name in ("none", "dynamic")]
+    held, stored = load_data(release, parts), load_data(release, parts, memory=0, scratch=tmp_path)
     assert stored.frames.mapped and not held.frames.mapped and not list(tmp_path.iterdir())
     for hold_out in (False, True):
         one, two = (
@@ -172,7 +173,7 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
 
 
 def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_release, tmp_path, monkeypatch):
-    data = load_data([Source(open_release(small_release)["walker-walk/random/none"])], memory=0, scratch=tmp_path)
+    data = load_data(open_release(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
     asked: list[tuple[int, int]] = []
     advise = agents_data._advise
 
@@ -190,21 +191,23 @@ def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_
 def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch):
     monkeypatch.setattr(steps_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(DmcvbError, match="fit neither into memory nor into .* another --out, or more --memory"):
-        load_data([Source(open_release(small_release)["walker-walk/random/none"])], memory=0, scratch=tmp_path)
+        load_data(open_release(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
+
+
+TWO = {"episodes": 2}
 
 
 def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):
-    subset = open_release(small_release)["walker-walk/random/none"]
-    half, two = load_data([Source(subset, share=0.34)]), load_data([Source(subset, episodes=2)])
+    release, name = open_release(small_release), "walker-walk/random/none"
+    half, two, again = (load_data(release, [Slice(name, **part)]) for part in ({"share": 0.34}, TWO, TWO))
     assert (len(half.lengths), len(half), len(half.hold_out_rows)) == (1, 500, 0)
     assert (len(two.lengths), len(two), len(two.hold_out_rows)) == (2, 1000, 0)  # a counted few are all learned from
-    again = load_data([Source(subset, episodes=2)])
     torch.testing.assert_close(again.action, two.action)
-    assert not torch.equal(load_data([Source(subset, episodes=2)], seed=5).action, two.action)
+    assert not torch.equal(load_data(release, [Slice(name, **TWO)], seed=5).action, two.action)
 
 
 def test_states_alone_need_no_pictures(small_release):
-    data = load_data([Source(open_release(small_release)["walker-walk/random/none"])], pixels=False)
+    data = load_data(open_release(small_release), [Slice("walker-walk/random/none")], pixels=False)
     batch = data.batch(4, np.random.default_rng(0), next_observation=True)
     assert batch.observation.shape == (4, 24) and torch.equal(batch.observation, batch.state)
 

@@ -62,10 +62,13 @@ def test_an_orthogonalized_matrix_has_singular_values_near_one():
     torch.testing.assert_close(orthogonalize(torch.zeros(40, 50)), torch.zeros(40, 50))  # of a layer that gets none
 
 
-@pytest.mark.parametrize("other", [torch.optim.SGD, torch.optim.AdamW])
-def test_an_optimizer_that_an_agent_chose_stays(other):
+@pytest.mark.parametrize("other, settings", [
+    (torch.optim.SGD, {}), (torch.optim.AdamW, {}), (torch.optim.Adam, {"betas": (0.5, 0.9)}),
+    (torch.optim.Adam, {"eps": 1e-5}), (torch.optim.Adam, {"weight_decay": 0.1}), (torch.optim.Adam, {"amsgrad": True}),
+])  # fmt: skip
+def test_an_optimizer_that_an_agent_chose_stays_with_its_settings(other, settings):
     weight = nn.Parameter(torch.randn(64, 64))
-    chosen = other([weight], lr=0.01)
+    chosen = other([weight], lr=0.01, **settings)
     assert Muon.instead_of(chosen, torch.float32) is chosen
     plain = torch.optim.Adam([weight], lr=0.02)
     [group] = Muon.instead_of(plain, torch.float32).param_groups

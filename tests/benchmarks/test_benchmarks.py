@@ -16,9 +16,9 @@ from PIL import Image
 
 from dmcvb_gen import own_code
 from dmcvb_gen.agents.catalog import make_encoder, parse_agent
-from dmcvb_gen.agents.data import Normalization, Source, default_memory, load_data, normalize_pixels
+from dmcvb_gen.agents.data import Normalization, Slice, default_memory, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import PARTS
-from dmcvb_gen.agents.probes import ObservationProbe, StateProbe
+from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.benchmarks import experiments, report
 from dmcvb_gen.benchmarks import validate as validate_module
 from dmcvb_gen.benchmarks.evaluate import Evaluator
@@ -28,7 +28,7 @@ from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
 from dmcvb_gen.benchmarks.report import compare
 from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
 from dmcvb_gen.benchmarks.setup import Setup, fingerprint, keep_precision, open_data, pretraining_of
-from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Part, plan_benchmark
+from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, plan_benchmark
 from dmcvb_gen.benchmarks.validate import _few_warnings, make_setup
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
@@ -289,7 +289,7 @@ def test_pictures_are_of_unseen_videos_newest_frame_last(small_release):
 
 def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_release):
     subset = open_release(small_release)["walker-walk/random/none"]
-    data = load_data([Source(subset)])
+    data = load_data({subset.name: subset}, [Slice(subset.name)])
     evaluator = Evaluator(subset, episodes=3, max_steps=4)
     streams = {name: evaluator.streams(name) for name in ("camera", "color", "background", "style")}
     walk = DistractorSampler(evaluator.task, evaluator.setting, 5, streams, None, split="val")
@@ -554,7 +554,7 @@ def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(who
     folder = str(request.getfixturevalue(whole))
     subset = next(iter(open_release(folder).subsets.values()))
     setup = Setup(folder, str(tmp_path), PROFILES["smoke"])
-    data, network = load_data([Source(subset)], pixels=True), setup.profile.network
+    data, network = load_data({subset.name: subset}, [Slice(subset.name)], pixels=True), setup.profile.network
     encoder = make_encoder(parse_agent("bc"), data.sizes, None, network)
     readouts = {
         "observation": ObservationProbe(encoder, data.sizes, network),
@@ -608,7 +608,7 @@ def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_releas
 
 def compared(task, pairs, benchmark="b1", setting="x"):
     """What `compare` says of agents' mean scores."""
-    part = (Part(f"{task}/expert/{setting}"),)
+    part = (Slice(f"{task}/expert/{setting}"),)
     results = [
         (Cell(benchmark, task, setting, parse_agent(name), part), {"score": {"mean": mean}}) for name, mean in pairs
     ]
@@ -644,7 +644,7 @@ def test_a_cells_seconds_are_those_of_all_its_sessions(small_release, tmp_path, 
 
 
 def test_data_that_grew_or_look_otherwise_are_read_again(small_release):
-    release, part = open_release(small_release), (Part("walker-walk/random/none"),)
+    release, part = open_release(small_release), (Slice("walker-walk/random/none"),)
     setup, cache = Setup(str(small_release), "out", PROFILES["smoke"]), _DataCache()
     subset = release[part[0].subset]
     half = Subset(subset.root, subset.record, {0: subset.commits[0]}, {})

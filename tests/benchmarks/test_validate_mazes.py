@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dmcvb_gen.agents.data import Source, load_data
+from dmcvb_gen.agents.data import Slice, load_data
 from dmcvb_gen.benchmarks.checks import check_labels, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.experiments import data_score
 from dmcvb_gen.benchmarks.goals import goal_cells
@@ -93,7 +93,7 @@ def test_a_maze_release_goes_through_b1_and_b3(report):
 
 def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(release):
     subset, task = open_release(release)[f"{NAME}/visible"], get_task(TINY)
-    data = load_data([Source(subset)], pixels=False, seed=0)
+    data = load_data({subset.name: subset}, [Slice(subset.name)], pixels=False, seed=0)
     first, ends = np.cumsum(data.lengths + 1) - data.lengths - 1, np.cumsum(data.lengths + 1) - 1
     data.discount[ends - 1] = 0  # as if the ant had got there
     state = data.state[first].numpy() * data.normalization.std.numpy() + data.normalization.mean.numpy()

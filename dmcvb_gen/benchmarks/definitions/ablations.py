@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from dmcvb_gen.agents.data import part_count
 from dmcvb_gen.benchmarks.claims import Answer, Place, Pooled, Scores, above
-from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Part, register_benchmark
+from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Slice, register_benchmark
 from dmcvb_gen.spec import VISIBLE, is_maze
 
 SHARES = (0.01, 0.05, 0.1, 0.25, 0.5)
@@ -33,7 +33,7 @@ class Ablations(Benchmark):
                 by_pictures = [agent for agent in agents if agent.name == "bc"]
                 shares = _distinct_shares(len(data.release[parts[0].subset].episodes))
                 for share, agent in itertools.product(shares, by_pictures):
-                    yield Cell(self.name, task, setting, agent, (Part(parts[0].subset, share=share),))
+                    yield Cell(self.name, task, setting, agent, (Slice(parts[0].subset, share=share),))
 
     @property
     def claims(self):

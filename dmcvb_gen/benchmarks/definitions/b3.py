@@ -9,7 +9,7 @@ import numpy as np
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.benchmarks.claims import Answer, Place, Pooled, Scores, above, mean_of, pretrained
-from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Part, register_benchmark
+from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Slice, register_benchmark
 from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, is_maze, task_folder
 
 LEVEL = "expert"
@@ -29,7 +29,7 @@ class FixedGoals(Benchmark):
             for level in data.levels(task, FIXED) or [LEVEL]:
                 fixed, hidden = data.find(task, [level], FIXED), data.parts(task, [level], HIDDEN)
                 for pair in data.pairs(fixed[0]) if fixed else ():
-                    ten = (Part(fixed[0], goal_pair=pair),)
+                    ten = (Slice(fixed[0], goal_pair=pair),)
                     yield Cell(self.name, task, FIXED, parse_agent("bc"), ten)
                     for agent in agents if hidden else ():
                         yield Cell(self.name, task, FIXED, agent, ten, hidden)

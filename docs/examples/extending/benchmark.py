@@ -1,6 +1,6 @@
 """A benchmark: `--benchmark growth` asks how scores grow with the data, of every subset of a release."""
 
-from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Part, register_benchmark
+from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Slice, register_benchmark
 
 
 @register_benchmark("growth")
@@ -14,10 +14,10 @@ class Growth(Benchmark):
         for name, subset in data.release.subsets.items():
             for share in (0.1, 0.5, 1.0):
                 for agent in agents:
-                    yield Cell(self.name, subset.task, subset.setting, agent, (Part(name, share=share),))
+                    yield Cell(self.name, subset.task, subset.setting, agent, (Slice(name, share=share),))
 
     def reference(self, cell):  # what the report sets a score beside
         return "the same agent on all episodes"
 
     def is_reference(self, other, cell):
-        return other.agent == cell.agent and other.policy == (Part(cell.policy[0].subset),)
+        return other.agent == cell.agent and other.policy == (Slice(cell.policy[0].subset),)
