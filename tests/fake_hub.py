@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.dirfs import DirFileSystem
 
+from tests.web_server import give_files, serving
+
 
 class FakeHub:
     """One repository of data sets, the newest version of its files in `folder`.
@@ -24,6 +26,7 @@ class FakeHub:
     def __init__(self, root: Path, repository: str):
         self.root, self.folder = root, root / "datasets" / repository
         self.commits, self.tags, self.fail, self.asked = [], {}, None, []
+        self.endpoint = ""
 
     @property
     def files(self) -> dict[str, bytes]:
@@ -34,15 +37,36 @@ class FakeHub:
         assert repo_type == "dataset" and exist_ok
         self.folder.mkdir(parents=True, exist_ok=True)
 
-    def repo_info(self, repo_id, repo_type):
-        return types.SimpleNamespace(sha=str(len(self.commits)))
+    def repo_info(self, repo_id, repo_type, revision=None):
+        return types.SimpleNamespace(sha=revision or str(len(self.commits)))
 
-    def get_paths_info(self, repo_id, paths, repo_type):
+    def at(self, commit: str | None) -> Path:
+        """The folder with the files of a commit."""
+        return self.folder if commit in (None, str(len(self.commits))) else self.root / "commits" / commit
+
+    def find(self, path: str) -> Path | None:
+        """The file that a URL leads to: datasets/OWNER/NAME/resolve/COMMIT/PATH."""
+        found = re.fullmatch(r"datasets/[^/]+/[^/]+/resolve/([^/]+)/(.+)", path)
+        return found and self.at(found[1]) / found[2]
+
+    def _build_hf_headers(self):
+        return {"Authorization": "Bearer hf_secret"}
+
+    def get_paths_info(self, repo_id, paths, repo_type, revision=None):
         for path in paths:
-            if (self.folder / path).is_file():
-                data = (self.folder / path).read_bytes()
-                blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
-                yield types.SimpleNamespace(path=path, blob_id=blob, lfs=None)
+            if (self.at(revision) / path).is_file():
+                yield self._facts(path, (self.at(revision) / path).read_bytes())
+
+    def list_repo_tree(self, repo_id, path_in_repo, recursive, revision, repo_type):
+        assert recursive
+        root = self.at(revision)
+        for path in sorted((root / (path_in_repo or "")).rglob("*")):
+            name = path.relative_to(root).as_posix()
+            yield self._facts(name, path.read_bytes()) if path.is_file() else types.SimpleNamespace(path=name)
+
+    def _facts(self, path, data):
+        blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+        return types.SimpleNamespace(path=path, blob_id=blob, lfs=None, size=len(data))
 
     def hf_hub_download(self, repo_id, filename, repo_type, revision, local_dir):
         self.asked.append((filename, revision))
@@ -55,10 +79,11 @@ class FakeHub:
         assert exist_ok and revision == str(len(self.commits))
         self.tags.setdefault(tag, revision)
 
-    def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit):
+    def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit=None):
         if self.fail is not None and len(self.commits) == self.fail:
             raise ConnectionError("the line went dead, token=hf_secret123")
         if parent_commit in (None, str(len(self.commits))):
+            shutil.copytree(self.folder, self.root / "commits" / str(len(self.commits)))
             for operation in operations:
                 path = self.folder / operation.path_in_repo
                 if not hasattr(operation, "as_file"):
@@ -81,6 +106,9 @@ def fake_hub(root: Path, monkeypatch, repository: str = "me/tiny") -> FakeHub:
     def file_system(url, options):
         return DirFileSystem(str(root)), re.sub(r"@[^/]*", "", url.removeprefix("hf://")).rstrip("/")
 
+    hub.served = serving(give_files(hub.find))  # until the hub is forgotten
+    hub.endpoint = hub.served.__enter__().url
+    monkeypatch.setattr("dmcvb_gen.storage.hugging_face.new_api", lambda *_: hub)
     monkeypatch.setattr("dmcvb_gen.storage.hub.new_api", lambda: hub)
     monkeypatch.setattr("dmcvb_gen.storage.hub.file_system", file_system)
     return hub

@@ -25,13 +25,15 @@ from typing import Any
 import fsspec
 
 from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.storage.places import is_url
+from dmcvb_gen.storage.places import shown as public
 
 PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "hf": "huggingface_hub", "http": "aiohttp"}
 PACKAGES |= {"https": "aiohttp", "az": "adlfs", "abfs": "adlfs"}
 """Protocol -> the package on PyPI that brings its file system."""
 CLIENTS = (
     "aiobotocore aiohttp asyncio botocore fsspec gcsfs google httpcore httpx huggingface_hub requests s3fs ssl "
-    "urllib3 zarr numcodecs"
+    "urllib3 zarr numcodecs azure adlfs"
 ).split()
 """Packages whose exceptions come from storage."""
 REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "Unauthorized")
@@ -40,12 +42,6 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 BUCKET_PROTOCOLS = ("s3", "gs", "gcs", "az", "abfs", "hf")
-
-
-def is_url(path: str | Path) -> bool:
-    """Return True if a path is a URL rather than a folder ("file:..." counts as a URL)."""
-    text = str(path)
-    return "://" in text or text.startswith("file:")
 
 
 def check_no_options(folder: str | Path, options: Mapping[str, Any] | None) -> None:
@@ -81,12 +77,6 @@ def local_path(path: str | Path) -> Path:
         )
     check_place(str(path))
     return Path(path)
-
-
-def public(url: str) -> str:
-    """A URL without user, password, query and fragment, fit for logs and manifests."""
-    bare = re.sub(r"[?#].*$", "", url)
-    return re.sub(r"^([A-Za-z][\w+.-]*://)[^/@]*@", r"\1", bare)
 
 
 def file_system(url: str, options: dict[str, Any] | None = None) -> tuple[fsspec.AbstractFileSystem, str]:

@@ -1,0 +1,143 @@
+"""Places of releases: a folder or URL comes in, its parts come out, with secrets in fields of their own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
+
+from dmcvb_gen.errors import StoreError
+
+if TYPE_CHECKING:
+    from dmcvb_gen.storage.store import Store
+
+BUCKETS = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
+"""Protocol of object stores -> the package on PyPI that reaches them."""
+WEB = ("http", "https")
+_SCHEME = re.compile(r"([A-Za-z][\w+.-]+):(/*)")
+KNOWN = "a folder, file:, s3://, gs://, az://, http(s):// or hf://"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A folder or URL in its parts.
+
+    Attributes:
+      protocol: "file", "s3", "gs", "az", "http", "https" or "hf".
+      path: the folder; of URLs bucket or host, and what follows, without a "/" at the end.
+      login: (user, password) of a web server. query: of its URLs, with tokens.
+    """
+
+    protocol: str
+    path: str
+    login: tuple[str, str] | None = field(default=None, repr=False)
+    query: str = field(default="", repr=False)
+
+    @classmethod
+    def parse(cls, place: str | Path) -> Place:
+        """What a folder or URL names.
+
+        Raises:
+          StoreError: it is no folder and none of the URLs that can be read.
+        """
+        text = str(place)
+        if not text or not text.isprintable():
+            raise StoreError(f"{text[:80]!r} is no place; give {KNOWN}")
+        found = None if isinstance(place, Path) and not _SCHEME.match(text) else _SCHEME.match(text)
+        if found is None:
+            return cls("file", _folder(text))
+        protocol, rest = found[1].lower(), text[found.end() :]
+        if protocol in ("file", "local"):
+            return cls("file", _folder(text[len(protocol) + 1 :].removeprefix("//")))
+        if len(found[2]) != 2 and protocol in (*BUCKETS, *WEB, "hf", "s3a", "gcs", "abfs"):
+            meant = f"{protocol}://{_without_login(rest)[0]}"
+            raise StoreError(f"a URL of {protocol} needs two slashes; did you mean {shown(meant)}?")
+        if not found[2] and "://" not in rest:
+            return cls("file", _folder(text))  # a folder with a colon in its name
+        if not found[2] or protocol not in (*BUCKETS, *WEB, "hf"):
+            raise StoreError(f"{found[1]}:// is no place that releases can be at; give {KNOWN}")
+        return cls._web(protocol, rest) if protocol in WEB else cls._bucket(protocol, rest)
+
+    @classmethod
+    def _web(cls, protocol: str, rest: str) -> Place:
+        rest, login = _without_login(rest)
+        path, _, query = rest.partition("?")
+        if "#" in rest:
+            raise StoreError(f"{protocol}://{path.partition('#')[0]}#... has a #; write it as %23, or remove it")
+        if not path.split("/")[0]:
+            raise StoreError(f"{protocol}:// names no server; give {protocol}://SERVER/PATH")
+        user, _, password = login.partition(":")
+        return cls(protocol, path.rstrip("/"), (unquote(user), unquote(password)) if login else None, query)
+
+    @classmethod
+    def _bucket(cls, protocol: str, rest: str) -> Place:
+        bucket = rest.split("/")[0]
+        if "@" in bucket or ":" in bucket:
+            raise StoreError(
+                f"{protocol}://{_without_login(rest)[0]} was given with credentials; set them in the environment or "
+                "the provider's own configuration, and remove them from the URL"
+            )
+        if not bucket:
+            raise StoreError(f"{protocol}:// names no bucket; give {protocol}://BUCKET/NAME")
+        if "?versionId=" in rest:
+            raise StoreError(f"{protocol}://{rest.partition('?')[0]} names a version of an object; remove ?versionId")
+        return cls(protocol, rest.rstrip("/"))
+
+    def __str__(self) -> str:
+        return self.path if self.protocol == "file" else f"{self.protocol}://{self.path}"
+
+    def store(self, options: Mapping[str, Any]) -> Store:
+        """The store there, see `dmcvb_gen.storage.store.open_store`."""
+        if self.protocol == "file":
+            from dmcvb_gen.storage.folder import LocalStore
+
+            if options:
+                raise StoreError(f"--option has no effect: {self} is a folder, not a URL; remove it")
+            return LocalStore(Path(self.path))
+        if self.protocol == "hf":
+            from dmcvb_gen.storage.hugging_face import HubStore
+
+            return HubStore.at(self, options)
+        if self.protocol in WEB:
+            from dmcvb_gen.storage.web import HttpStore
+
+            return HttpStore.at(self, options)
+        from dmcvb_gen.storage.bucket import ObjectStore
+
+        return ObjectStore(self.protocol, self.path, options)
+
+
+def is_url(place: str | Path) -> bool:
+    """Return True for a URL, False for a folder of this machine ("file:..." counts as a URL)."""
+    return "://" in str(place) or str(place).startswith("file:")
+
+
+def shown(place: str | Path) -> str:
+    """A folder or URL for messages: without user, password and a web server's query."""
+    text = str(place)
+    found = _SCHEME.match(text)
+    if found is None or not found[2] or found[1].lower() in ("file", "local"):
+        return text
+    rest = _without_login(text[found.end() :])[0]
+    return found[0] + (re.sub(r"[?#].*", "", rest) if found[1].lower() in WEB else rest)
+
+
+def _without_login(rest: str) -> tuple[str, str]:
+    """What follows "://" without "user:password@", and that; passwords may hold "@" and "/"."""
+    first = rest.split("/")[0]
+    end = -1
+    if "@" in first:
+        end = rest.rindex("@", 0, len(first))
+    elif not re.fullmatch(r"[^:]*(:\d*)?|\[.*\](:\d*)?", first):  # no port follows the colon, but a password
+        end = rest.rfind("@")
+    return rest[end + 1 :], rest[: max(end, 0)]
+
+
+def _folder(text: str) -> str:
+    try:
+        return str(Path(text).expanduser())
+    except RuntimeError:
+        raise StoreError(f"{text}: there is no home folder here; write the folder out") from None

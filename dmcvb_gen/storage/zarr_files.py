@@ -1,0 +1,77 @@
+"""Files of a store as Zarr reads them: recorded keys come whole or raise, other keys are absent without a request."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterable, Mapping
+
+from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype
+
+from dmcvb_gen.storage.store import Store as Files
+
+
+class ZarrFiles(Store):
+    """A read-only Zarr store, see `dmcvb_gen.storage.store.Store.zarr_store`."""
+
+    supports_writes = supports_deletes = False
+    supports_listing = True
+
+    def __init__(self, store: Files, prefix: str, files: Mapping[str, int]):
+        super().__init__(read_only=True)
+        self.store, self.prefix, self.files = store, prefix.strip("/"), files
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, ZarrFiles)
+            and (self.store, self.prefix) == (other.store, other.prefix)
+            and self.files == other.files
+        )
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        size = self.files.get(key)
+        if size is None:
+            return None
+        start, end = _range(byte_range, size)
+        path = f"{self.prefix}/{key}" if self.prefix else key
+        return prototype.buffer.from_bytes(await asyncio.to_thread(self.store.read_range, path, start, end - start))
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+
+    async def exists(self, key: str) -> bool:
+        return key in self.files
+
+    async def set(self, key: str, value: Buffer) -> None:
+        raise ValueError("a release is never changed")
+
+    async def delete(self, key: str) -> None:
+        raise ValueError("a release is never changed")
+
+    async def list(self) -> AsyncIterator[str]:
+        for key in self.files:
+            yield key
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        for key in self.files:
+            if key.startswith(prefix):
+                yield key
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        folder = f"{prefix.strip('/')}/".lstrip("/")
+        for name in {key[len(folder) :].split("/")[0] for key in self.files if key.startswith(folder)}:
+            yield name
+
+
+def _range(part: ByteRequest | None, size: int) -> tuple[int, int]:
+    """First byte and the one after the last, within a file of `size` bytes."""
+    match part:
+        case RangeByteRequest(start, end):
+            return min(start, size), min(end, size)
+        case OffsetByteRequest(offset):
+            return min(offset, size), size
+        case SuffixByteRequest(suffix):
+            return max(size - suffix, 0), size
+    return 0, size

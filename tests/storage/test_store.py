@@ -1,0 +1,562 @@
+"""What every store does, whatever is behind it; a new implementation adds a class with a fixture."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import pickle
+import socket
+import subprocess
+import sys
+import threading
+import uuid
+
+import pytest
+
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.storage import folder as folder_module
+from dmcvb_gen.storage.places import Place, shown
+from dmcvb_gen.storage.store import ANY, NotThere, open_store
+from tests.fake_hub import fake_hub
+from tests.web_server import serving
+
+DEEP = "walker-walk/expert.zarr/pixels/c/0/0/0"
+ODD = "a [b]*::c#d?e%20f~/ü.json"
+
+
+def sha256(data):
+    return hashlib.sha256(data).hexdigest()
+
+
+class ReadTests:
+    """Inherit, and give fixtures: `store`, and `put(path, data)`, which puts files there behind its back."""
+
+    @pytest.mark.parametrize("path", ["manifest.json", DEEP, ODD])
+    @pytest.mark.parametrize("data", [b"", b"0123456789"])
+    def test_files_are_read_whole_and_in_parts(self, store, put, path, data):
+        put(path, data)
+        assert store.read(path, len(data)) == store.read(path, 10**9) == data
+        assert store.size(path) == len(data)
+        assert store.sha256(path, len(data)) == sha256(data)
+        assert store.read_range(path, 0, len(data)) == data
+        assert store.read_range(path, len(data) // 2, 0) == b""
+        if data:
+            assert store.read_range(path, 3, 4) == b"3456"
+
+    def test_pieces_join(self, store, put, monkeypatch):
+        monkeypatch.setattr("dmcvb_gen.storage.store.PIECE", 300)
+        put("a", data := bytes(range(256)) * 8)
+        assert store.read("a", 2048) == data and store.sha256("a", 2048) == sha256(data)
+
+    def test_more_bytes_than_allowed_are_an_error(self, store, put):
+        put("a/b", b"0123456789")
+        for read in (lambda: store.read("a/b", 9), lambda: store.sha256("a/b", 9)):
+            with pytest.raises(StoreError, match="a/b is larger than the 9 bytes"):
+                read()
+        for start, length in ((0, 11), (5, 6), (10, 1), (20, 1)):
+            with pytest.raises(StoreError, match="a/b"):
+                store.read_range("a/b", start, length)
+
+    def test_a_lost_file_is_an_error_and_never_zeros(self, store, put, tmp_path):
+        put("there", b"1")
+        assert store.size("a/b") is None
+        readers = {
+            "read": lambda: store.read("a/b", 10),
+            "below a file": lambda: store.read("there/b", 10),
+            "range": lambda: store.read_range("a/b", 0, 10),
+            "digest": lambda: store.sha256("a/b", 10),
+            "download": lambda: store.download("a/b", tmp_path / "x", 10, "0" * 64),
+        }
+        for read in readers.values():
+            with pytest.raises(NotThere, match="a/b is not there|there/b is not there"):
+                read()
+        assert not (tmp_path / "x").exists()
+
+    def test_paths_stay_below_the_root(self, store):
+        for path in ("", "../a", "a/../../b", "/etc/passwd", "a//b", "a/./b", "a\\b", "a\nb", "a\x1b[2J", "x" * 2000):
+            with pytest.raises(StoreError, match="is no path below a release") as caught:
+                store.read(path, 10)
+            assert str(caught.value).isprintable()
+
+    def test_a_download_is_kept_only_with_its_digest(self, store, put, tmp_path):
+        put("a", b"0123456789")
+        for size, digest in ((10, "0" * 64), (9, sha256(b"012345678")), (11, sha256(b"0123456789"))):
+            with pytest.raises(StoreError, match="a does not have the size or SHA-256"):
+                store.download("a", tmp_path / "new/a", size, digest)
+        assert list((tmp_path / "new").iterdir()) == []
+        for _ in range(2):
+            store.download("a", tmp_path / "new/a", 10, sha256(b"0123456789"))
+            assert [file.name for file in (tmp_path / "new").iterdir()] == ["a"]
+        assert (tmp_path / "new/a").read_bytes() == b"0123456789"
+
+    def test_zarr_reads_recorded_files_alone(self, store, put):
+        import numpy as np
+        import zarr
+
+        array = zarr.create_array({}, shape=(4,), chunks=(2,), dtype="u1", fill_value=7, compressors=None)
+        put("g/x/zarr.json", meta := array.store._store_dict["zarr.json"].to_bytes())
+        put("g/x/c/0", b"\x01\x02")
+        put("g/x/c/1", b"\x03\x04")
+        both = {"zarr.json": len(meta), "c/0": 2, "c/1": 2}
+        opened = [zarr.open_array(store.zarr_store("g/x", files), mode="r") for files in (both, {**both, "c/1": 3})]
+        np.testing.assert_array_equal(opened[0][:], [1, 2, 3, 4])
+        with pytest.raises(StoreError, match="g/x/c/1"):
+            opened[1][:]
+        partly = store.zarr_store("g/x", {"zarr.json": len(meta), "c/0": 2})
+        np.testing.assert_array_equal(zarr.open_array(partly, mode="r")[:], [1, 2, 7, 7])
+        lost = store.zarr_store("g/x", {"zarr.json": len(meta), "c/0": 2, "c/1": 2, "c/lost": 2})
+        np.testing.assert_array_equal(zarr.open_array(pickle.loads(pickle.dumps(lost)), mode="r")[:], [1, 2, 3, 4])
+        put("h/zarr.json", meta)
+        with pytest.raises(NotThere, match="h/c/0 is not there"):
+            zarr.open_array(store.zarr_store("h", {"zarr.json": len(meta), "c/0": 2}), mode="r")[:]
+
+    def test_it_pickles_equals_itself_and_reads_after_a_fork(self, store, put):
+        put("a", b"1")
+        other = pickle.loads(pickle.dumps(store))
+        assert other == store and hash(other) == hash(store) and other.read("a", 1) == store.read("a", 1) == b"1"
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            assert pool.apply_async(store.read, ("a", 1)).get(timeout=30) == b"1"
+
+    def test_nothing_private_is_shown(self, store):
+        assert "secret" not in f"{store!r} {store.place}"
+
+
+class StoreTests(ReadTests):
+    """Of a store that can be written."""
+
+    WRITERS = 6
+
+    @pytest.fixture
+    def put(self, store):
+        return store.create
+
+    def test_a_file_is_created_once(self, store, tmp_path):
+        local = tmp_path / "local"
+        local.write_bytes(b"from a file")
+        assert store.create("a/b", b"mine") and not store.create("a/b", b"yours") and not store.create("a/b", local)
+        assert store.read("a/b", 99) == b"mine"
+        assert store.create("a/c", local) and store.read("a/c", 99) == b"from a file" and local.exists()
+        assert store.create("a/d", local, move=True) and store.read("a/d", 99) == b"from a file"
+        local.write_bytes(b"x") if local.exists() and store.folder is None else None
+        assert store.list() == {"a/b": 4, "a/c": 11, "a/d": 11}
+
+    @pytest.mark.parametrize("expected", [None, ANY])
+    def test_of_many_who_write_at_once_one_is_whole(self, store, expected):
+        start, won, contents = threading.Barrier(self.WRITERS), [], [bytes([n]) * 5000 for n in range(self.WRITERS)]
+
+        def write(data):
+            start.wait()
+            if store.create("a", data) if expected is None else store.replace("a", data):
+                won.append(data)
+
+        threads = [threading.Thread(target=write, args=[data]) for data in contents]
+        [thread.start() for thread in threads]
+        [thread.join() for thread in threads]
+        there = store.read("a", 5000)
+        assert there in contents and (won == [there] if expected is None else len(won) == self.WRITERS)
+
+    def test_a_file_is_replaced_if_it_is_the_expected_one(self, store):
+        assert store.version("a") is None
+        assert store.replace("a", b"1", None) and not store.replace("a", b"2", None)
+        assert store.replace("a", b"1", None)  # the same bytes: as if by us, whose reply was lost
+        first = store.version("a")
+        assert store.replace("a", b"22", first) and not store.replace("a", b"333", first)
+        assert store.read("a", 9) == b"22" and store.version("a") not in (first, None)
+        assert store.replace("a", b"4444") and store.read("a", 9) == b"4444"
+        assert not store.replace("b", b"1", first) and store.size("b") is None
+
+    def test_of_many_who_replace_a_version_one_does(self, store):
+        store.create("a", b"old")
+        version, start, won = store.version("a"), threading.Barrier(self.WRITERS), []
+
+        def replace(number):
+            start.wait()
+            if store.replace("a", b"new %d" % number, version):
+                won.append(b"new %d" % number)
+
+        threads = [threading.Thread(target=replace, args=[number]) for number in range(self.WRITERS)]
+        [thread.start() for thread in threads]
+        [thread.join() for thread in threads]
+        assert won == [store.read("a", 99)]
+
+    def test_lists_have_sizes_and_no_hidden_files(self, store):
+        assert store.list() == store.list("a") == {}
+        for path in (DEEP, "manifest.json", "walker-walk/b", "walker-walker/c", ".hidden", "a/.hidden/b", ODD):
+            store.create(path, b"12")
+        assert store.list() == dict.fromkeys(
+            sorted([DEEP, "manifest.json", "walker-walk/b", "walker-walker/c", ODD]), 2
+        )
+        assert store.list("walker-walk") == {DEEP: 2, "walker-walk/b": 2}
+        assert store.list("walker-walk/") == store.list("walker-walk") and store.list("nothing") == {}
+
+    def test_what_is_deleted_can_be_created(self, store):
+        store.delete("a/b")
+        for _ in range(2):
+            assert store.create("a/b", b"1")
+            store.delete("a/b")
+            assert store.size("a/b") is None
+
+    def test_a_folder_is_published(self, store, tmp_path):
+        for number, path in enumerate(paths := ["b", DEEP, ODD, "c"]):
+            (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / path).write_bytes(bytes([number]) * 100)
+        told = []
+        store.begin()
+        store.create("b", b"another")
+        assert store.upload(tmp_path, paths, 2, told.append) == ["b"] and sum(told) == 4
+        assert store.upload(tmp_path, paths) == paths and store.read(DEEP, 100) == b"\1" * 100
+        assert store.finish({"README.md": b"1", "manifest.json": b"2"}, None)
+        assert not store.finish({"README.md": b"1", "manifest.json": b"3"}, None)
+        assert store.finish({"manifest.json": b"3"}, store.version("manifest.json"))
+        store.tag("v1.0.0", "the first version")
+        assert store.read("manifest.json", 9) == b"3" and store.read("README.md", 9) == b"1"
+
+
+class TestFolder(StoreTests):
+    @pytest.fixture
+    def store(self, tmp_path):
+        return open_store(tmp_path / "r [1] *::x#y?z ~")
+
+    def test_a_killed_writer_leaves_nothing_that_counts(self, store):
+        code = (
+            "import os, sys\nfrom dmcvb_gen.storage.store import open_store\n"
+            "os.fsync = lambda handle: os.kill(os.getpid(), 9)\n"
+            "getattr(open_store(sys.argv[1]), sys.argv[2])('a/b', b'new')"
+        )
+        store.create("a/c", b"1")
+        for how in ("create", "replace"):
+            assert subprocess.run([sys.executable, "-c", code, store.place, how]).returncode == -9
+            assert store.size("a/b") is None and store.list() == {"a/c": 1}
+        assert store.create("a/b", b"mine") and store.replace("a/b", b"2")
+        assert sorted(path.name for path in (store.folder / "a").iterdir()) == ["b", "c"]
+
+    @pytest.mark.parametrize("kind", ["fifo", "link", "device", "socket", "folder", "linked folder"])
+    def test_what_is_no_regular_file_is_refused_at_once(self, store, tmp_path, kind, monkeypatch):
+        store.create("there", b"1")
+        outside = tmp_path / "outside"
+        outside.mkdir()
+        (outside / "b").write_bytes(b"secret")
+        path = store.folder / "a"
+        {
+            "fifo": lambda: os.mkfifo(path),
+            "link": lambda: path.symlink_to(outside / "b"),
+            "device": lambda: path.symlink_to("/dev/zero"),
+            "socket": lambda: (monkeypatch.chdir(store.folder), socket.socket(socket.AF_UNIX).bind("a")),
+            "folder": lambda: path.mkdir(),
+            "linked folder": lambda: path.symlink_to(outside),
+        }[kind]()
+        name = "a/b" if kind == "linked folder" else "a"
+        for read in (store.read, store.sha256):
+            with pytest.raises(StoreError, match="not a regular file|is a link") as caught:
+                read(name, 100)
+            assert not isinstance(caught.value, NotThere)
+        with pytest.raises(StoreError, match="not a regular file|is a link"):
+            store.size(name)
+        assert store.list() == {"there": 1}
+        if kind == "linked folder":
+            for write in (store.create, store.replace):
+                with pytest.raises(StoreError, match="is a link"):
+                    write("a/new", b"1")
+            assert [file.name for file in outside.iterdir()] == ["b"]
+        else:
+            assert kind == "folder" or not store.create("a", b"1")
+
+    def test_no_room_leaves_what_was_there(self, store, monkeypatch):
+        def full(handle):
+            raise OSError(28, "No space left on device")
+
+        store.create("a", b"1")
+        with monkeypatch.context() as patch:
+            patch.setattr("os.fsync", full)
+            for write in (lambda: store.replace("a", b"2"), lambda: store.create("b", b"2")):
+                with pytest.raises(StoreError, match="no room to write to .*make room"):
+                    write()
+        assert store.read("a", 9) == b"1" and {path.name for path in store.folder.iterdir()} <= {"a", ".lock"}
+
+    def test_the_root_itself_may_be_a_link(self, store, tmp_path):
+        store.create("a", b"1")
+        (tmp_path / "other").symlink_to(store.folder)
+        assert open_store(tmp_path / "other").read("a", 1) == b"1"
+
+    def test_names_begin_with_the_home_folder(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("HOME", str(tmp_path))
+        assert open_store("~/r").folder == open_store("file:~/r").folder == tmp_path / "r"
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr("pwd.getpwuid", lambda user: (_ for _ in ()).throw(KeyError(user)))
+        with pytest.raises(StoreError, match="there is no home folder here"):
+            open_store("~/r")
+
+
+class TestFolderWithoutLinks(StoreTests):
+    """A disk that knows neither hard links nor unnamed files."""
+
+    @pytest.fixture
+    def store(self, tmp_path, monkeypatch):
+        def no_link(*_, **__):
+            raise PermissionError(1, "Operation not permitted")
+
+        monkeypatch.setattr("os.link", no_link)
+        return open_store(f"file://{tmp_path}/r")
+
+
+@pytest.fixture(scope="module")
+def moto():
+    pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    yield "http://{}:{}".format(*server.get_host_and_port())
+    server.stop()
+
+
+class TestS3(StoreTests):
+    OPTIONS = {"key": "someone", "secret": "a/very-secret", "client_kwargs": {"use_ssl": False}}
+
+    @pytest.fixture
+    def store(self, moto):
+        import s3fs
+
+        options = {**self.OPTIONS, "endpoint_url": moto}
+        s3fs.S3FileSystem(**options).makedirs("contract", exist_ok=True)
+        return open_store(f"s3://contract/{uuid.uuid4().hex}/r [1] *::x#y?z ~", options)
+
+    def test_a_bucket_that_is_not_there_is_said(self, store):
+        with pytest.raises(StoreError, match="create the bucket first"):
+            open_store("s3://no-such-bucket/x", store.options).create("a", b"1")
+        with pytest.raises(NotThere, match="s3://no-such-bucket/x/a is not there"):
+            open_store("s3://no-such-bucket/x", store.options).read("a", 1)
+
+    @pytest.mark.parametrize("status, code", [(200, ""), (501, "NotImplemented")])
+    def test_a_store_that_ignores_or_refuses_conditions_is_refused_in_a_line(self, status, code):
+        def answer(request):
+            request.rfile.read(int(request.headers.get("Content-Length", 0)))
+            body = f"<Error><Code>{code}</Code><Message>A header you provided</Message></Error>" if code else ""
+            request.give(body.encode(), status, ETag='"1"')
+
+        with serving(answer) as server:
+            store = open_store("s3://bucket/x", {**self.OPTIONS, "endpoint_url": server.url})
+            with pytest.raises(StoreError, match="does not support conditional writes"):
+                store.create("a", b"1")
+            assert len(server.asked) <= 2
+
+
+class TestWeb(ReadTests):
+    @pytest.fixture
+    def folder(self, tmp_path):
+        (tmp_path / "served/r").mkdir(parents=True)
+        return tmp_path / "served/r"
+
+    @pytest.fixture
+    def store(self, folder):
+        with serving(folder.parent) as server:
+            url = f"{server.url.replace('://', '://me:a%2Fsecret@')}/r?sig=secret"
+            yield open_store(url, {"headers": {"X-Token": "secret"}})
+
+    @pytest.fixture
+    def put(self, folder):
+        def put(path, data):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_bytes(data)
+
+        return put
+
+    def test_login_query_and_headers_are_sent(self, folder):
+        (folder / "a").write_bytes(b"1")
+        with serving(folder.parent) as server:
+            url = server.url.replace("://", "://me:a%2Fb@")
+            open_store(f"{url}/r?sig=1", {"headers": {"X-Token": "2"}}).read("a", 1)
+        [(_, path, headers)] = server.asked
+        assert path == "/r/a?sig=1" and headers["X-Token"] == "2" and headers["Authorization"] == "Basic bWU6YS9i"
+
+    def test_it_can_only_be_read(self, store):
+        assert not store.writable
+        for write in (store.create, store.replace):
+            with pytest.raises(StoreError, match="can only be read"):
+                write("a", b"1")
+        with pytest.raises(StoreError, match="gives no list"):
+            store.list()
+
+
+def endless(request, status=200, **headers):
+    request.send_response(status)
+    for name, value in headers.items():
+        request.send_header(name.replace("_", "-"), value)
+    request.end_headers()
+    while True:
+        request.wfile.write(b"x" * 65536)
+
+
+def cut(request):
+    request.give(b"x" * 10, Content_Length="1000")
+    request.close_connection = True
+
+
+ATTACKS = {
+    "endless body": endless,
+    "endless body of a part": lambda request: endless(request, 206, Content_Range="bytes 0-99/100"),
+    "another part": lambda request: request.give(b"x" * 100, 206, Content_Range="bytes 5-104/1000"),
+    "false length": lambda request: endless(request, Content_Length=str(10**12)),
+    "cut off": cut,
+    "compressed": lambda request: request.give(b"\x1f\x8b" + b"x" * 200, Content_Encoding="gzip"),
+    "in a circle": lambda request: request.give(b"", 302, Location="/again"),
+    "broken": lambda request: request.give(b"\x1b[2J", 418),
+    "refused": lambda request: request.give(b"no", 403),
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_hostile_server_gives_a_line_and_takes_no_memory(attack, tmp_path):
+    import tracemalloc
+
+    with serving(ATTACKS[attack]) as server:
+        store = open_store(f"{server.url}/r?sig=secret-sig")
+        tracemalloc.start()
+        for read in (
+            lambda: store.read("a", 100),
+            lambda: store.sha256("a", 100),
+            lambda: store.download("a", tmp_path / "a", 100, sha256(b"x" * 100)),
+            lambda: store.read_range("a", 5, 1000),
+        ):
+            with pytest.raises(StoreError) as caught:
+                read()
+            line = str(caught.value)
+            assert line.isprintable() and "secret" not in line and server.url in line
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+        tracemalloc.stop()
+
+
+def test_a_server_without_ranges_is_not_taken_for_damage():
+    with serving(lambda request: request.give(b"0123456789")) as server:
+        store = open_store(server.url)
+        assert store.read("a", 10) == b"0123456789" and store.read_range("a", 0, 10) == b"0123456789"
+        with pytest.raises(StoreError, match=f"server of {server.url} does not serve parts of files; fetch the"):
+            store.read_range("a", 5, 5)
+
+
+class TestHub(ReadTests):
+    @pytest.fixture
+    def hub(self, tmp_path, monkeypatch):
+        return fake_hub(tmp_path / "hub", monkeypatch)
+
+    @pytest.fixture
+    def store(self, hub):
+        store = open_store("hf://datasets/me/tiny/data", {"token": "hf_secret"})
+        store.begin()
+        return store
+
+    @pytest.fixture
+    def put(self, store, tmp_path):
+        def put(path, data):
+            (tmp_path / "put" / path).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / "put" / path).write_bytes(data)
+            store.upload(tmp_path / "put", [path])
+
+        return put
+
+    def test_a_release_is_a_few_commits_and_files_are_never_replaced(self, store, hub, tmp_path):
+        paths = [f"f{number}" for number in range(100)]
+        for path in paths:
+            (tmp_path / path).write_bytes(path.encode())
+        assert store.upload(tmp_path, paths) == [] and len(hub.commits) == 2
+        (tmp_path / "f1").write_bytes(b"another")
+        assert store.upload(tmp_path, paths) == paths and len(hub.commits) == 2
+        assert store.finish({"README.md": b"1", "manifest.json": b"2"}, None)
+        assert store.list() == {**{path: len(path) for path in paths}, "README.md": 1, "manifest.json": 1}
+        store.tag("v1.0.0", "the first version")
+        assert hub.tags == {"data-v1.0.0": "3"}
+
+    def test_of_two_who_finish_one_does(self, store, hub, monkeypatch):
+        other = open_store(store.place)
+        version = store.version("manifest.json")
+        assert other.finish({"manifest.json": b"of another"}, None)
+        assert not store.finish({"manifest.json": b"mine"}, version)
+        assert store.finish({"manifest.json": b"of another"}, version)  # the same bytes
+        head = store._head
+        monkeypatch.setattr(type(store), "_head", lambda self: str(int(head()) - 1))  # a commit comes between
+        with pytest.raises(StoreError, match="a commit has happened since"):
+            store.finish({"manifest.json": b"mine"})
+        assert hub.files["data/manifest.json"] == b"of another"
+
+    def test_what_is_read_is_of_one_commit(self, store, put):
+        put("a", b"1")
+        reader = open_store("hf://datasets/me/tiny/data")
+        assert reader.read("a", 1) == b"1"
+        assert store.finish({"a": b"2"})
+        assert reader.read("a", 1) == pickle.loads(pickle.dumps(reader)).read("a", 1) == b"1"
+        assert open_store("hf://datasets/me/tiny/data").read("a", 1) == b"2"
+        assert open_store("hf://datasets/me/tiny@1/data").read("a", 1) == b"1"
+
+    def test_single_files_are_not_committed(self, store):
+        for write in (store.create, store.replace):
+            with pytest.raises(StoreError, match="takes files in commits; write the release to a folder"):
+                write("a", b"1")
+        with pytest.raises(StoreError, match="remove @v1"):
+            open_store("hf://datasets/me/tiny@v1").begin()
+
+
+REFUSED = {
+    "s3://": "names no bucket",
+    "s3:bucket/x": "did you mean s3://bucket/x",
+    "s3:/bucket/x": "did you mean s3://bucket/x",
+    "nothing://x": "no place that releases can be at",
+    "simplecache::http://me:secret@host/x": "no place that releases can be at",
+    "s3://key:secret@bucket/x": "set them in the environment",
+    "s3://key:se/secret@bucket/x": "set them in the environment",
+    "s3://bucket/x?versionId=3": "remove .versionId",
+    "http://": "names no server",
+    "https://me:secret@host/x#part": "write it as %23",
+    "hf://spaces/me/x": "is not hf://datasets/OWNER/NAME",
+    "hf://datasets/me": "is not hf://datasets/OWNER/NAME",
+    "": "is no place",
+    "a\x1b[2Jb": "is no place",
+}
+
+
+@pytest.mark.parametrize("place", REFUSED)
+def test_places_that_lead_nowhere_are_refused(place):
+    with pytest.raises(StoreError, match=REFUSED[place]) as caught:
+        open_store(place)
+    assert str(caught.value).isprintable() and "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "place, options, words",
+    [
+        (".", {"x": 1}, "--option has no effect: . is a folder"),
+        ("file:/tmp/x", {"x": 1}, "--option has no effect: /tmp/x is a folder"),
+        ("http://x/y", {"key": 1}, "Known: headers"),
+        ("hf://datasets/a/b", {"key": 1}, "Known: endpoint, token"),
+    ],
+)
+def test_options_without_an_effect_are_refused(place, options, words):
+    with pytest.raises(DmcvbError, match=words):
+        open_store(place, options)
+
+
+PLACES = {
+    "http://me:pw@host:80/a/b?sig=1": "http://host:80/a/b",
+    "https://me:p@ss@host/a@b": "https://host/a@b",
+    "https://me:p/w@host/a": "https://host/a",
+    "https://host/a@b": "https://host/a@b",
+    "https://[::1]:80/a@b": "https://[::1]:80/a@b",
+    "s3://bucket/a#b?c [d]*::e": "s3://bucket/a#b?c [d]*::e",
+    "hf://datasets/a/b@v1/c": "hf://datasets/a/b@v1/c",
+    "/tmp/a#b?c": "/tmp/a#b?c",
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_places_are_shown_without_secrets(place):
+    assert str(Place.parse(place)) == shown(place) == open_store(place).place == PLACES[place]
+
+
+def test_a_package_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    with pytest.raises(StoreError, match="pip install gcsfs"):
+        open_store("gs://bucket/x").read("a", 1)
+
+
+def test_the_disk_without_links_really_has_none(tmp_path, monkeypatch):
+    """The class above would prove nothing if links were made all the same."""
+    monkeypatch.setattr(folder_module.os, "link", lambda *_, **__: (_ for _ in ()).throw(PermissionError(1, "no")))
+    assert open_store(tmp_path).create("a", b"1") and (tmp_path / ".lock").exists()
