@@ -12,8 +12,8 @@ from typing import Any
 import fsspec
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.storage.interface import ANY, Store
 from dmcvb_gen.storage.places import BUCKETS
-from dmcvb_gen.storage.store import ANY, Store
 
 PROBED = 2**20
 """Bytes of the largest file that is sent twice to see whether the store heeds conditions."""

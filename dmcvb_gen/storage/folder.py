@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.storage.store import ANY, PIECE, Store
+from dmcvb_gen.storage.interface import ANY, PIECE, Store
 
 LOCK = ".lock"
 """File that is locked to replace a file, and to create one where the disk knows no links."""

@@ -11,8 +11,8 @@ from typing import Any
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.parallel import ProgressCallback, ignore
+from dmcvb_gen.storage.interface import ANY, Store
 from dmcvb_gen.storage.places import Place
-from dmcvb_gen.storage.store import ANY, Store
 from dmcvb_gen.storage.web import HttpStore
 
 BATCH = 90

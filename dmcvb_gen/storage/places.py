@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from dmcvb_gen.errors import StoreError
-
-if TYPE_CHECKING:
-    from dmcvb_gen.storage.store import Store
 
 BUCKETS = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
 """Protocol of object stores -> the package on PyPI that reaches them."""
@@ -88,26 +83,6 @@ class Place:
 
     def __str__(self) -> str:
         return self.path if self.protocol == "file" else f"{self.protocol}://{self.path}"
-
-    def store(self, options: Mapping[str, Any]) -> Store:
-        """The store there, see `dmcvb_gen.storage.store.open_store`."""
-        if self.protocol == "file":
-            from dmcvb_gen.storage.folder import LocalStore
-
-            if options:
-                raise StoreError(f"--option has no effect: {self} is a folder, not a URL; remove it")
-            return LocalStore(Path(self.path))
-        if self.protocol == "hf":
-            from dmcvb_gen.storage.hugging_face import HubStore
-
-            return HubStore.at(self, options)
-        if self.protocol in WEB:
-            from dmcvb_gen.storage.web import HttpStore
-
-            return HttpStore.at(self, options)
-        from dmcvb_gen.storage.bucket import ObjectStore
-
-        return ObjectStore(self.protocol, self.path, options)
 
 
 def is_url(place: str | Path) -> bool:

@@ -12,8 +12,8 @@ from typing import Any
 from urllib.parse import quote
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.storage.interface import PIECE, Store
 from dmcvb_gen.storage.places import Place
-from dmcvb_gen.storage.store import PIECE, Store
 
 TIMEOUT = (10, 60)
 """Seconds to connect, and between two packets."""
@@ -114,8 +114,7 @@ def _body(answer: Any, limit: int) -> Iterator[bytes]:
 def _session(process: int) -> Any:
     """Connections of a process; a fork makes its own."""
     import requests
-    from requests.adapters import HTTPAdapter
-    from urllib3.util import Retry
+    from requests.adapters import HTTPAdapter, Retry
 
     again = Retry(TRIES, backoff_factor=0.2, status_forcelist=(429, 500, 502, 503, 504), raise_on_status=False)
     session = requests.Session()

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Iterable, Mapping
+from typing import Protocol
 
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from dmcvb_gen.storage.store import Store as Files
+
+class Files(Protocol):
+    """What a store has of it."""
+
+    def read_range(self, path: str, start: int, length: int) -> bytes: ...
 
 
 class ZarrFiles(Store):
-    """A read-only Zarr store, see `dmcvb_gen.storage.store.Store.zarr_store`."""
+    """A read-only Zarr store, see `dmcvb_gen.storage.interface.Store.zarr_store`."""
 
     supports_writes = supports_deletes = False
     supports_listing = True

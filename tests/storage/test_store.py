@@ -45,7 +45,7 @@ class ReadTests:
             assert store.read_range(path, 3, 4) == b"3456"
 
     def test_pieces_join(self, store, put, monkeypatch):
-        monkeypatch.setattr("dmcvb_gen.storage.store.PIECE", 300)
+        monkeypatch.setattr("dmcvb_gen.storage.interface.PIECE", 300)
         put("a", data := bytes(range(256)) * 8)
         assert store.read("a", 2048) == data and store.sha256("a", 2048) == sha256(data)
 
