@@ -1,4 +1,4 @@
-"""Frames and core-minutes until a policy reaches 95 % of the paper's expert: a row of docs/speedrun.md.
+"""Frames and core-minutes until a policy reaches 95 % of the paper's expert: a row of docs/results.md.
 
     python scripts/speedrun.py walker-walk --seed 0
 
