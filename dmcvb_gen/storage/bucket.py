@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -144,9 +145,8 @@ class ObjectStore(Store):
         elif self.protocol == "s3":
             system.pipe_file(full, data, IfMatch=expected)
         elif self.protocol == "az":
-            from azure.core import MatchConditions
-
-            system.pipe_file(full, data, etag=expected, match_condition=MatchConditions.IfNotModified)
+            conditions = importlib.import_module("azure.core").MatchConditions  # comes with adlfs
+            system.pipe_file(full, data, etag=expected, match_condition=conditions.IfNotModified)
         else:
             bucket, key, _ = system.split_path(full)
             place = f"{system._location}/upload/storage/v1/b/{bucket}/o"
