@@ -1,22 +1,34 @@
-"""README and docs: every block of code runs, in the order of its page, and the site builds without a warning."""
+"""README and docs: the blocks of all pages run as a reader runs them, and the site builds without a warning.
+
+Pages run in the order of the site, in one folder, with one bucket. A single page runs too: `-k light`.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
+import tomllib
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import yaml
 
 from dmcvb_gen.cli import COMMANDS
+from dmcvb_gen.version import __version__
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SITE = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
+NAMES = [name for section in SITE["nav"] for names in section.values() for name in names]
+MADE = {"index.md": ROOT / "README.md", "cli/index.md": None}
+"""Pages of the site that are made -> the file that they are made from."""
+PAGES = [page for name in NAMES if (page := MADE.get(name, ROOT / "docs" / name))]
 BLOCK = re.compile(r'^```(\w*)(?: title="([^"]+)")?[^\n]*\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+SNIPPET = '--8<-- "{}"\n'
 RUN = {"bash", "python"}
 SHOWN = {"text", "yaml", "toml", "console", ""}
 """What is not run: layouts and formulas, and set-up that needs another machine (console)."""
@@ -38,42 +50,43 @@ def blocks(page: Path) -> list[Block]:
     return [Block(*found.groups(), text[: found.start()].count("\n") + 1) for found in BLOCK.finditer(text)]
 
 
-@pytest.fixture
-def bucket(monkeypatch):
-    """An S3 server with a bucket named "bucket", as the pages' commands expect one."""
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory):
+    """A reader's folder and environment, with an S3 server that has a bucket named "bucket"."""
     from moto.server import ThreadedMotoServer
 
     server = ThreadedMotoServer(port=0, verbose=False)
     server.start()
     address = "http://{}:{}".format(*server.get_host_and_port())
-    for name, value in {
-        "AWS_ENDPOINT_URL": address,
-        "AWS_ACCESS_KEY_ID": "docs",
-        "AWS_SECRET_ACCESS_KEY": "docs",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }.items():
-        monkeypatch.setenv(name, value)
-    import boto3
-
-    # The server's objects outlive it in this process; each page finds an empty bucket.
-    urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
-    boto3.client("s3").create_bucket(Bucket="bucket")
-    yield address
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    keys = {"AWS_ACCESS_KEY_ID": "docs", "AWS_SECRET_ACCESS_KEY": "docs", "AWS_DEFAULT_REGION": "us-east-1"}
+    urllib.request.urlopen(urllib.request.Request(f"{address}/bucket", method="PUT")).close()
+    yield tmp_path_factory.mktemp("reader"), os.environ | keys | {"AWS_ENDPOINT_URL": address, "PATH": path}
     urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
     server.stop()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_block_of_a_page_runs(page, tmp_path, bucket):
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+def test_every_block_of_a_page_runs_after_the_pages_before_it(page, reader):
+    folder, environment = reader
     for block in blocks(page):
         if block.language not in RUN or block.file:  # files have tests of their own
             continue
         start = ["bash", "-euo", "pipefail", "-c"] if block.language == "bash" else [sys.executable, "-c"]
-        done = subprocess.run([*start, block.code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        done = subprocess.run([*start, block.code], cwd=folder, env=environment, capture_output=True, text=True)
         told = f"{page.name}:{block.line}\n{block.code}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
         assert done.returncode == 0, told
+
+
+def test_every_page_is_in_the_site():
+    assert {page.stem for page in PAGES} == {"README", *(path.stem for path in (ROOT / "docs").glob("*.md"))}
+
+
+def test_pages_stay_short():
+    """A tired reader finishes them: 1,500 words a page, but for the tables of results."""
+    long = {page.name: len(page.read_text().split()) for page in PAGES if page.stem != "results"}
+    assert {name: words for name, words in long.items() if words > 1500} == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -86,10 +99,11 @@ def test_what_a_page_does_not_run_is_set_up_or_layout(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_file_that_a_page_shows_is_the_one_in_the_repository(page):
+def test_a_file_that_a_page_shows_is_included_from_the_repository(page):
     for block in blocks(page):
         if block.file:
-            assert block.code == (ROOT / block.file).read_text(), f"{page.name}:{block.line}: copy {block.file}"
+            assert block.code == SNIPPET.format(block.file), f"{page.name}:{block.line}"
+            assert (ROOT / block.file).is_file()
 
 
 def test_the_pages_show_every_example():
@@ -107,6 +121,8 @@ def test_the_site_builds_without_a_warning_and_shows_every_command(tmp_path):
     )
     assert done.returncode == 0, done.stderr[-3000:]
     site = tmp_path / "site"
+    assert not [path for path in site.rglob("*") if path.stat().st_size > 2_000_000]
+    assert "class LinearBC" in re.sub("<[^>]+>", "", (site / "extending/index.html").read_text())  # files are included
     pages = {path.parent.name: path.read_text() for path in (site / "cli").rglob("index.html")}
     assert set(COMMANDS) <= set(pages)
     assert not any("Sentinel" in page or "UNSET" in page for page in pages.values())
@@ -115,11 +131,22 @@ def test_the_site_builds_without_a_warning_and_shows_every_command(tmp_path):
     assert "max_steps" in (site / "reading/index.html").read_text()  # of the environments
 
 
-def test_links_and_pictures_are_there_where_the_site_is_not_built():
-    """Who reads the pages in the repository finds all but the commands' own pages, which are made of the code."""
+def test_links_and_pictures_work_in_the_repository():
+    """Readers of the repository find all but the commands' own pages, which are made of the code."""
     cards = [ROOT / "dataset_cards/README.md"]
     for page in [*PAGES, ROOT / "CONTRIBUTING.md", *cards]:
         targets = re.findall(r"!?\[[^\]]*\]\(([^)\s#]+)", BLOCK.sub("", page.read_text()))
         made = [target for target in targets if target.startswith(("http", "cli/"))]
         for target in set(targets) - set(made):
             assert (page.parent / target).exists(), f"{page.name} shows {target}"
+
+
+def test_the_citation_has_the_project_s_own_facts():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (cited["version"], cited["license"]) == (__version__, project["license"])
+    assert cited["repository-code"] == project["urls"]["Repository"]
+    assert cited["preferred-citation"]["url"] == project["urls"]["Paper"]
+    digest = json.loads((ROOT / "dataset_cards/dmcvb-v1/manifest.json").read_text())["digest"]
+    assert digest in (ROOT / "README.md").read_text()
+    assert f"sha256:{digest}" in [identifier["value"] for identifier in cited["identifiers"]]

@@ -1,14 +1,30 @@
-"""Pages that the site makes from the code: one for each command, and their index."""
+"""Pages that the site makes: its first page from README.md, one for each command, and their index."""
 
 from __future__ import annotations
 
 import html
 import inspect
+import re
+import tomllib
+from pathlib import Path
 
 import click
 import mkdocs_gen_files
 
 from dmcvb_gen.cli import COMMANDS, main
+
+ROOT = Path(__file__).parents[2]
+
+
+def home_page() -> str:
+    """README.md, whose links to docs/ are links of the site and whose other links lead to the repository."""
+    repository = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Repository"]
+
+    def target(link: re.Match) -> str:
+        path = link[1]
+        return f"]({path.removeprefix('docs/')}" if path.startswith("docs/") else f"]({repository}/blob/main/{path}"
+
+    return re.sub(r"\]\((?!https?:)([^)]+)", target, (ROOT / "README.md").read_text())
 
 
 def cell(text: str) -> str:
@@ -42,6 +58,8 @@ def command_page(name: str, command: click.Command) -> str:
 
 
 def write_pages() -> None:
+    with mkdocs_gen_files.open("index.md", "w") as index:
+        index.write(home_page())
     group = click.Context(main, info_name="dmcvb-gen")
     lines = ["# Commands", ""]
     for name in main.list_commands(group):
