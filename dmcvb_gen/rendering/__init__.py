@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import functools
 import importlib
-import logging
 import pkgutil
 from collections.abc import Callable
 from importlib import metadata
 
-from dmcvb_gen.errors import RenderingError, UnknownNameError
+from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.rendering.base import Renderer
-from dmcvb_gen.spec import task_folder
 from dmcvb_gen.tasks.base import Task
 
 ENTRY_POINTS = "dmcvb_gen.renderers"
-_log = logging.getLogger(__name__)
 
 
 def _loader(module: str) -> Callable[[], type[Renderer]]:
@@ -29,7 +26,11 @@ def _loader(module: str) -> Callable[[], type[Renderer]]:
 @functools.cache
 def _table() -> dict[str, Callable[[], type[Renderer]]]:
     """Renderer -> what gives its class; nothing is imported before it is asked for."""
-    own = {found.name: _loader(found.name) for found in pkgutil.iter_modules(__path__) if found.name != "base"}
+    own = {
+        found.name: _loader(found.name)
+        for found in pkgutil.iter_modules(__path__)
+        if found.name not in ("base", "choice")
+    }
     return {point.name: point.load for point in metadata.entry_points(group=ENTRY_POINTS)} | own
 
 
@@ -78,16 +79,10 @@ def available_renderers() -> dict[str, str | None]:
 
 
 def default_renderer(task: Task) -> str:
-    """The renderer that paints a task on a CPU unless another one is asked for.
+    """See `choice.default_renderer`, which imports both renderers."""
+    from dmcvb_gen.rendering import choice
 
-    It is native if that paints the task, else opengl.
-    """
-    try:
-        renderer_class("native").check_task(task)
-    except RenderingError as error:
-        _log.warning("%s is painted by opengl: %s", task_folder(task.id), error)
-        return "opengl"
-    return "native"
+    return choice.default_renderer(task)
 
 
 __all__ = [

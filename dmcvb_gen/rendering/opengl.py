@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import ctypes.util
 import functools
+import importlib
 import os
 import subprocess
 import sys
@@ -29,26 +30,48 @@ from dmcvb_gen.tasks.cameras import camera_ids, matrices
 RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 SKY_WIDTH = 800
 """Texels a side of a background on the sky (the skybox's own width)."""
+_REPLACED = ("mat_rgba", "geom_matid", "geom_rgba")
+"""Fields of the model that labels replace, frame by frame."""
 MAX_GEOMS = 20_000
 """Shapes of a picture, at most; MuJoCo leaves out the others. A maze of 31 x 31 cells can have 1,026."""
-_PROBE = "from mujoco.egl import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+"""MuJoCo's ways to off-screen OpenGL, and the library that each needs; the first one that starts is taken."""
+_PROBE = "from mujoco.{0} import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
 
 
 @functools.cache
+def _started() -> tuple[str | None, str]:
+    """The way to OpenGL that starts here, or None and why none does. A failure can abort, so a process tries it."""
+    asked, reasons = os.environ.get("PYOPENGL_PLATFORM"), []
+    for way, library in _LIBRARIES.items():
+        if asked not in (None, way) or ctypes.util.find_library(library) is None:
+            continue
+        variables = {"PYOPENGL_PLATFORM": way, "MUJOCO_GL": way}
+        command = [sys.executable, "-c", _PROBE.format(way)]
+        run = subprocess.run(command, capture_output=True, text=True, env=os.environ | variables)
+        if run.returncode == 0:
+            return way, ""
+        reasons.append(f"{library} does not start ({(run.stderr.strip().splitlines() or ['no message'])[-1]})")
+    return None, "; ".join(reasons) or "libEGL is missing"
+
+
 def unavailable() -> str | None:
-    """Why EGL cannot start here (and the cure), or None. Tried in a process of its own: a failure can abort."""
-    if ctypes.util.find_library("EGL") is None:
-        return "libEGL is missing; install it (Debian: apt-get install libegl1 libgl1)"
-    run = subprocess.run(
-        [sys.executable, "-c", _PROBE],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYOPENGL_PLATFORM": "egl", "MUJOCO_GL": "egl"},
-    )
-    if run.returncode:
-        last = (run.stderr.strip().splitlines() or ["no message"])[-1]
-        return f"EGL does not start ({last}); install libegl1 and libgl1 (Debian)"
-    return None
+    """Why OpenGL cannot start here (and the cure), or None."""
+    way, reason = _started()
+    return None if way else f"{reason}; install libegl1 and libgl1 (Debian: apt-get install libegl1 libgl1)"
+
+
+def _gl_context(size: int) -> Any:
+    """An off-screen OpenGL context.
+
+    Raises:
+      RenderingError: none starts here.
+    """
+    if reason := unavailable():
+        raise RenderingError(f"renderer 'opengl' cannot start here: {reason}")
+    way, _ = _started()
+    os.environ.setdefault("PYOPENGL_PLATFORM", str(way))
+    return importlib.import_module(f"mujoco.{way}").GLContext(size, size)
 
 
 class OpenglRenderer(Renderer):
@@ -62,12 +85,7 @@ class OpenglRenderer(Renderer):
 
     def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
         check_size(size)
-        reason = unavailable()
-        if reason:
-            raise RenderingError(f"renderer 'opengl' cannot start here: {reason}")
-        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-        from mujoco.egl import GLContext
-
+        self._gl = _gl_context(size)
         self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
         self._backgrounds = backgrounds
         self._model = copy.deepcopy(task.picture_model)  # materials and textures change frame by frame
@@ -87,8 +105,9 @@ class OpenglRenderer(Renderer):
             material = self._model.geom_matid[geom]
             if self.floor_alpha < 1 and material >= 0 and self._model.mat_texid[material, RGB_ROLE] >= 0:
                 self._model.mat_rgba[material, 3] = self.floor_alpha
+        self._own_colors = task.material_colors.astype(np.float32)
+        self._own_values = {name: getattr(self._model, name).copy() for name in _REPLACED}
         self._data = mujoco.MjData(self._model)
-        self._gl = GLContext(size, size)
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -163,21 +182,26 @@ class OpenglRenderer(Renderer):
         return {"depth": depth, "segmentation": segmentation}
 
     def _pose(self, physics, exogenous, frame, hide_goal):
+        """Set the frame's state, then the model as its episode has it, then what its labels say."""
         model, data = self._model, self._data
         rows = np.asarray(physics, np.float64)[None]
-        mujoco.mj_setState(model, data, rows[0, : mujoco.mj_stateSize(model, PHYSICS_SPEC)], PHYSICS_SPEC)
+        for name, values in self._own_values.items():
+            getattr(model, name)[:] = values
         for name, columns, values in self.task.split_entries(rows):
             getattr(model, name).reshape(-1)[columns] = values[0]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_camlight(model, data)
-        mujoco.mj_tendon(model, data)
+            if name == "hfield_data":
+                for field in range(model.nhfield):
+                    mujoco.mjr_uploadHField(model, self._context, field)
+        mujoco.mj_setState(model, data, rows[0, : mujoco.mj_stateSize(model, PHYSICS_SPEC)], PHYSICS_SPEC)
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
+            stage(model, data)
         if exogenous.light_shift is not None:
             lamps, shift = (data.light_xpos[None], data.light_xdir[None]), exogenous.light_shift[frame : frame + 1]
             data.light_xpos[:], data.light_xdir[:] = (part[0] for part in moved_lamps(model, *lamps, shift))
-        model.mat_rgba[:, :3] = exogenous.material_rgb[frame]
-        model.geom_matid[:] = geom_materials(self.task, int(exogenous.style[frame]))
-        model.geom_rgba[:] = self.task.model.geom_rgba
+        recolored = np.flatnonzero((exogenous.material_rgb[frame] != self._own_colors).any(axis=1))
+        model.mat_rgba[recolored, :3] = exogenous.material_rgb[frame, recolored]
+        if exogenous.style[frame] >= 0:
+            model.geom_matid[:] = geom_materials(self.task, int(exogenous.style[frame]))
         if hide_goal:
             model.geom_rgba[list(self.task.goal_geoms)] = 0
         self._show_background(int(exogenous.background_video[frame]), int(exogenous.background_frame[frame]))
@@ -186,8 +210,8 @@ class OpenglRenderer(Renderer):
         """Put a video frame on the sky: a square texture, which MuJoCo repeats on the six faces."""
         if self._sky < 0 and video >= 0:
             raise RenderingError(
-                f"{self.task.id} has no sky for 'opengl' to show a video on; use --renderer native, or add a texture "
-                'of type="skybox" to its model'
+                f'{self.task.id} has no sky to show a video on; add a texture of type="skybox" to its model, or leave '
+                "the background out of what varies"
             )
         if self._sky < 0 or (video, frame) == self._shown:
             return

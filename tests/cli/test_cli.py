@@ -177,10 +177,10 @@ def test_an_out_that_cannot_be_written_is_said(tmp_path):
 def test_a_missing_gl_library_names_the_cure(monkeypatch, tmp_path):
     from dmcvb_gen.rendering import opengl
 
-    opengl.unavailable.cache_clear()
+    opengl._started.cache_clear()
     monkeypatch.setattr(opengl.ctypes.util, "find_library", lambda name: None)
     result = run(*SMALL, "--renderer", "opengl", "--out", tmp_path / "x")
-    opengl.unavailable.cache_clear()
+    opengl._started.cache_clear()
     assert result.exit_code == 2 and "libegl1" in result.output
 
 

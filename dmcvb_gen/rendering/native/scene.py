@@ -25,6 +25,16 @@ SHOWN_GROUPS = 3
 """MuJoCo shows the geom groups 0, 1 and 2."""
 SKY_DISTANCE = 0.7
 """MuJoCo draws the sky on an upright cylinder around the eye, of this share of the largest depth."""
+LOOKS = (
+    *(f"geom_{name}" for name in ("type", "size", "rgba", "matid", "group", "dataid")),
+    *(f"site_{name}" for name in ("type", "size", "rgba", "matid", "group")),
+    *(f"tendon_{name}" for name in ("width", "rgba", "matid", "group")),
+    *(f"cam_{name}" for name in ("fovy", "projection", "sensorsize", "intrinsic")),
+    *(f"light_{name}" for name in ("type", "active", "castshadow", "cutoff", "exponent", "attenuation")),
+    *(f"light_{name}" for name in ("ambient", "diffuse", "specular", "bulbradius", "intensity", "range")),
+    *("mat_", "vis.", "stat."),
+)
+"""Beginnings of the names of the model's fields that are read once, so that no episode may have its own."""
 _OWN_COLOR = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 """A geom of this color takes its material's."""
 _MAX_GRID = 200
@@ -139,7 +149,7 @@ def scene_of(task: Task) -> Scene:
     first, second = len(numbers) - len(sites) - len(cords), len(numbers) - len(cords)
     sites, ends = sites[seen[(seen >= first) & (seen < second)] - first], ends[seen[seen >= second] - second]
     _refuse_what_is_not_painted(task, material, kind, size, alpha[seen])
-    shiny = _of_materials(model.mat_reflectance, material) * (kind == PLANE)
+    shiny = _of_materials(model.mat_reflectance, material) * (kind == PLANE) * (material >= 0)
     mirror = int(np.flatnonzero(shiny)[0]) if shiny.any() else -1
     lamps = np.flatnonzero(model.light_active)
     planes = np.flatnonzero(kind == PLANE)
@@ -270,9 +280,20 @@ def _refuse_what_is_not_painted(
     others = [_KIND_NAMES.get(number, "unknown") for number in np.unique(kind).tolist() if number not in _PAINTED]
     textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
     textured = (kind != PLANE) & (material >= 0) & (textures >= 0)
+    angular = (textures >= 0) & (material >= 0) & ~np.isin(kind, [SPHERE, ELLIPSOID])
+    skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    channels = model.tex_nchannel[np.concatenate([textures[textures >= 0], skies])]
+    changed = [name for name in task.model_entries if name.startswith(LOOKS)]
     faults = {
         f"geoms of type {', '.join(others)}": bool(others),
         "a skin": model.nskin > 0,
+        "a flex": model.nflex > 0,
+        f"{', '.join(changed)} of its own in each episode": bool(changed),
+        "a cube texture on a plane, a box, a cylinder or a capsule": bool(model.tex_type[textures[angular]].any()),
+        "a texture that is not RGB": bool((channels != 3).any()),
+        "mirrors that are no planes": bool(
+            _of_materials(model.mat_reflectance, material)[(kind != PLANE) & (material >= 0)].any()
+        ),
         "an orthographic camera, or one with a sensor's size": any(_is_special(model, i) for i in camera_ids(task)),
         "bodies with a texture that is no cube": bool((model.tex_type[textures[textured]] == 0).any()),
         f"more than {MAX_GEOMS} geoms": len(kind) > MAX_GEOMS,

@@ -184,10 +184,8 @@ class Textures:
     def _faces(self, index: int, faces: int) -> list[np.ndarray]:
         model = self._model
         height, width, channels = (int(a[index]) for a in (model.tex_height, model.tex_width, model.tex_nchannel))
-        if channels not in (3, 4):
-            raise RenderingError(f"texture {model.texture(index).name!r} is not RGB; use --renderer opengl")
         address = int(model.tex_adr[index])
-        data = model.tex_data[address : address + height * width * channels].reshape(height, width, channels)[..., :3]
+        data = model.tex_data[address : address + height * width * channels].reshape(height, width, channels)
         if faces == 1:
             return [data]
         return [data] * 6 if height == width else [data[face * width : (face + 1) * width] for face in range(6)]
