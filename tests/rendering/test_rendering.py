@@ -217,7 +217,7 @@ def test_opengl_draws_more_than_a_thousand_shapes_and_refuses_a_video_without_a_
             halves = [half.mean() for side in (shown, shown.T) for half in (side[:100], side[100:])]
             assert min(halves) > 0.8 * max(halves) > 0
         else:
-            with pytest.raises(RenderingError, match="has no sky for 'opengl'"):
+            with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):
                 renderer.render(physics, labels)
     renderer.close()
 
