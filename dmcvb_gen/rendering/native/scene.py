@@ -279,8 +279,9 @@ def _refuse_what_is_not_painted(
     lights = np.flatnonzero(model.light_active)
     others = [_KIND_NAMES.get(number, "unknown") for number in np.unique(kind).tolist() if number not in _PAINTED]
     textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
-    textured = (kind != PLANE) & (material >= 0) & (textures >= 0)
-    angular = (textures >= 0) & (material >= 0) & ~np.isin(kind, [SPHERE, ELLIPSOID])
+    textures = np.where(material >= 0, textures, -1)
+    textured = (kind != PLANE) & (textures >= 0)
+    angular = (textures >= 0) & ~np.isin(kind, [SPHERE, ELLIPSOID])
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     channels = model.tex_nchannel[np.concatenate([textures[textures >= 0], skies])]
     changed = [name for name in task.model_entries if name.startswith(LOOKS)]
