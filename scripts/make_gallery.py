@@ -148,10 +148,8 @@ def main() -> None:
             return
         (work / "gallery.yaml").write_text(yaml.safe_dump(RECIPE))
         command("rollout", "--recipe", work / "gallery.yaml", "--out", work / "all")
-        for task in TASKS:
-            moving(work / "all", f"{task}/*/*", task)
-        for task in MAZES:
-            moving(work / "all", f"{task}/*/*", task, "--scale", 1)
+        for task in (*TASKS, *MAZES):
+            moving(work / "all", f"{task}/*/*", task, "--scale", 2)
         sheet = ["--only", "ant-maze-easy7x7a/*/visible", "--episodes", 1, "--out", work / "sheet"]
         command("preview", work / "all", *sheet)
         shutil.copy(work / "sheet/contact_sheet.png", ROOT / "docs/gallery/ant-maze.png")
