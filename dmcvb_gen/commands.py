@@ -232,11 +232,12 @@ def repaint(
     Raises:
       DmcvbError: nothing fits, a shard is damaged, or `out` cannot be used.
     """
+    from dmcvb_gen.distractors.registry import typed_setting
     from dmcvb_gen.generate.repaint import Repainting
     from dmcvb_gen.generate.repaint import repaint as run
     from dmcvb_gen.loaders.release import open_for_reading
 
-    look = (distractor, difficulty, size, renderer, samples, _videos(backgrounds), split)
+    look = (distractor and typed_setting(distractor), difficulty, size, renderer, samples, _videos(backgrounds), split)
     with progress_bar(progress, " frames") as bar:
         run(Repainting(release, out, as_names(only), *look, tuple(dict.fromkeys(as_names(labels))), name), workers, bar)
     return open_for_reading(str(out))

@@ -1,6 +1,6 @@
-"""Code of your own: "<module>:<function>" names a function, of a task or of a behaviour policy.
+"""Code of your own: "<module>:<name>" names a task's or behaviour policy's function, or a distractor's class.
 
-The function's code runs, so a name that was read from a file is refused: only names that a person gave to `allow` (the
+The code runs, so a name that was read from a file is refused: only names that a person gave to `allow` (the
 command line does, for what is typed there) or in an environment variable are run.
 """
 
@@ -19,6 +19,7 @@ from dmcvb_gen.errors import DmcvbError
 
 TASKS = "DMCVB_GEN_TASKS"
 BEHAVIOURS = "DMCVB_GEN_BEHAVIOURS"
+DISTRACTORS = "DMCVB_GEN_DISTRACTORS"
 """Environment variables with the names whose code may run, joined by commas; worker processes inherit them."""
 
 _OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -56,29 +57,29 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
     """Let the code of these names run in this process and its children; other names are left out.
 
     Args:
-      variable: `TASKS` or `BEHAVIOURS`.
+      variable: `TASKS`, `BEHAVIOURS` or `DISTRACTORS`.
     """
     own = [name for name in names if is_own(name)]
     if own:
-        os.environ[variable] = ",".join(dict.fromkeys([*_allowed(variable), *own]))
+        os.environ[variable] = ",".join(dict.fromkeys([*allowed(variable), *own]))
 
 
-def _allowed(variable: str) -> list[str]:
+def allowed(variable: str) -> list[str]:
     """The names in an environment variable; people write a space after a comma, or a comma at the end."""
     return [name for part in os.environ.get(variable, "").split(",") if (name := part.strip())]
 
 
 def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
-    """The function "<module>:<function>"; its module is imported from the path or the current folder.
+    """The function or class "<module>:<name>"; its module is imported from the path or the current folder.
 
     Args:
       variable: the environment variable that lets it run.
-      kind: word for messages: "task" or "behaviour".
+      kind: word for messages: "task", "behaviour" or "distractor".
 
     Raises:
       DmcvbError: its code may not run, or cannot be found.
     """
-    if name not in _allowed(variable):
+    if name not in allowed(variable):
         raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={name}")
     module, _, function = name.partition(":")
     if os.getcwd() not in sys.path:

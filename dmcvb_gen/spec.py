@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.own_code import DISTRACTORS, allowed
 
 LOCOMOTION, ANT_MAZE = "locomotion", "ant-maze"
 FAMILIES = (LOCOMOTION, ANT_MAZE)
@@ -146,7 +147,7 @@ def task_folder(task_id: str) -> str:
 
 
 @dataclass(frozen=True)
-class Distractor:
+class DistractorSetting:
     """A kind of distractor at a difficulty (paper, section 3.1); "medium" is left out of its `name`.
 
     Attributes:
@@ -212,7 +213,7 @@ class Distractor:
         return None if found is None else int(found)
 
     @classmethod
-    def parse(cls, name: str) -> Distractor:
+    def parse(cls, name: str) -> DistractorSetting:
         """The distractor of a name such as "dynamic", "dynamic_medium", "static_easy" or "dynamic_0.35".
 
         Raises:
@@ -310,14 +311,20 @@ def _canonical(difficulty: str) -> str:
 
 
 def distractor_kinds() -> tuple[str, ...]:
-    """All kinds of distractors: DMC-VB's, then those that users registered or whose packages are installed."""
+    """All kinds of distractors: DMC-VB's, then those that users registered or named, then those of packages."""
     from importlib import metadata  # slow to import, and `--help` needs no distractors
 
     installed = [point.name for point in metadata.entry_points(group=DISTRACTOR_ENTRY_POINTS)]
-    return tuple(dict.fromkeys([*DISTRACTOR_KINDS, *sorted(own_distractors), *installed]))
+    named = [kind_of(name) for name in allowed(DISTRACTORS)]
+    return tuple(dict.fromkeys([*DISTRACTOR_KINDS, *sorted(own_distractors), *named, *installed]))
 
 
-def parse_setting(task_id: str, setting: str) -> tuple[Distractor, GoalMode | None]:
+def kind_of(name: str) -> str:
+    """The kind of a user's own distractor "<module>:<Class>": its class's name in lower case."""
+    return name.partition(":")[2].lower()
+
+
+def parse_setting(task_id: str, setting: str) -> tuple[DistractorSetting, GoalMode | None]:
     """The distractor and the goal mode that a task's setting stands for ("dynamic_medium", "hidden").
 
     Mazes vary in style and have no other distractors; locomotion tasks have no goal mode.
@@ -326,10 +333,10 @@ def parse_setting(task_id: str, setting: str) -> tuple[Distractor, GoalMode | No
       UnknownNameError: the task has no such setting.
     """
     if not is_maze(task_id):
-        return Distractor.parse(setting), None
+        return DistractorSetting.parse(setting), None
     if setting not in GOAL_MODES:
         raise UnknownNameError(f"goal setting of {task_id}", setting, GOAL_MODES)
-    return Distractor(), GoalMode(setting)
+    return DistractorSetting(), GoalMode(setting)
 
 
 # -- subsets --------------------------------------------------------------------------------------
@@ -348,7 +355,7 @@ class SubsetSpec:
 
     task: str
     level: Level
-    distractor: Distractor = Distractor()
+    distractor: DistractorSetting = DistractorSetting()
     goal: GoalMode | None = None
 
     @classmethod

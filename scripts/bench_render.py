@@ -15,14 +15,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from dmcvb_gen.distractors import Distractor, floor_alpha_for, load_backgrounds, sample_distractors  # noqa: E402
+from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors  # noqa: E402
 from dmcvb_gen.errors import RenderingError  # noqa: E402
 from dmcvb_gen.rendering import make_renderer  # noqa: E402
 from dmcvb_gen.seeding import episode_stream  # noqa: E402
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task  # noqa: E402
 
 
-def frames_of(task_id: str, setting: Distractor, episodes: int, steps: int):
+def frames_of(task_id: str, setting: DistractorSetting, episodes: int, steps: int):
     """Physics (frame, physics) and labels of short random episodes."""
     task = get_task(task_id)
     batch = task.batch(episodes)
@@ -62,7 +62,7 @@ def main() -> None:
     sheet = []
     for task_id in options.task:
         for name in ["none"] if task_id.startswith("ant-maze") else options.settings:
-            setting = Distractor.parse(name)
+            setting = DistractorSetting.parse(name)
             task, physics, labels = frames_of(task_id, setting, 8, options.frames // 8)
             some = np.arange(0, len(physics), 8)
             common = dict(backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting))

@@ -25,7 +25,7 @@ from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_ord
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, Distractor
+from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, DistractorSetting
 from dmcvb_gen.tasks import get_task
 
 STANDARD_ERRORS = 4.0
@@ -125,7 +125,9 @@ def check_labels(subset: Subset) -> Iterator[Issue]:
         yield Issue("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
 
 
-def _label_problems(setting: Distractor, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray):
+def _label_problems(
+    setting: DistractorSetting, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray
+):
     """((step,) bool where it is wrong, what is) of one episode of a setting.
 
     Args:

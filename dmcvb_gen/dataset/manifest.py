@@ -14,7 +14,7 @@ import pydantic
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.files import write_json as write_json_atomically
-from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, LOCOMOTION, Distractor, GoalMode, SubsetSpec, is_maze
+from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec, is_maze
 from dmcvb_gen.storage.remote import storage_errors
 from dmcvb_gen.version import __version__
 
@@ -158,7 +158,7 @@ class SubsetRecord(_Model):
         return SubsetSpec.parse(self.task, self.level, self.setting)
 
     @property
-    def distractor(self) -> Distractor:
+    def distractor(self) -> DistractorSetting:
         """The distractor of its images; "none" for mazes."""
         return self.spec.distractor
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dmcvb_gen.distractor_state import LABEL_DTYPES, DistractorState
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
-from dmcvb_gen.distractors.base import KINDS, SCALES, Distractor, DistractorPart, Scene, floor_alpha_for
+from dmcvb_gen.distractors.base import KINDS, SCALES, Distractor, DistractorSetting, Scene, floor_alpha_for
 from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of, register_distractor
 from dmcvb_gen.tasks.base import Task
 
@@ -30,7 +30,7 @@ class DistractorSampler:
     def __init__(
         self,
         task: Task,
-        setting: Distractor,
+        setting: DistractorSetting,
         frames: int,
         generators: Mapping[str, Sequence[np.random.Generator]],
         backgrounds: Backgrounds | None,
@@ -77,7 +77,7 @@ class DistractorSampler:
 
 def sample_distractors(
     task: Task,
-    setting: Distractor,
+    setting: DistractorSetting,
     physics: np.ndarray,
     generators: Mapping[str, Sequence[np.random.Generator]],
     backgrounds: Backgrounds | None = None,
@@ -104,7 +104,7 @@ __all__ = [
     "KINDS",
     "SCALES",
     "Backgrounds",
-    "DistractorPart",
+    "Distractor",
     "Distractor",
     "DistractorSampler",
     "Scene",

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
 TICKS_A_FRAME = 10
@@ -24,7 +24,7 @@ def ping_pong(start: int, direction: int, moves: np.ndarray, length: int) -> np.
 
 
 def background_walk(
-    lengths: Sequence[int], setting: Distractor, frames: int, generators: Sequence[np.random.Generator]
+    lengths: Sequence[int], setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw videos, start frames and directions.
 
@@ -46,7 +46,7 @@ def background_walk(
     return video, index
 
 
-class Background(DistractorPart):
+class Background(Distractor):
     """A video on the sky, from a start frame in a direction; -1 for the model's own sky."""
 
     kinds = ("static", "dynamic")

@@ -97,7 +97,7 @@ def load_backgrounds(source: str | Path = "builtin", split: str = "train", video
     Args:
       source: "builtin" or a folder.
       split: "train" or "val".
-      videos: take only the first so many (what `Distractor.videos` has in play); None: all.
+      videos: take only the first so many (what `DistractorSetting.videos` has in play); None: all.
 
     Raises:
       BackgroundError: no such folder, nothing in it, or a video that cannot be read or is cut short (named).

@@ -12,10 +12,10 @@ import numpy as np
 from dmcvb_gen.distractors.backgrounds import Backgrounds
 from dmcvb_gen.spec import DIFFICULTY_SCALES as SCALES
 from dmcvb_gen.spec import DISTRACTOR_KINDS as KINDS
-from dmcvb_gen.spec import Distractor
+from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks.base import Task
 
-__all__ = ["KINDS", "SCALES", "Distractor", "DistractorPart", "Scene", "floor_alpha_for"]
+__all__ = ["KINDS", "SCALES", "Distractor", "Distractor", "Scene", "floor_alpha_for"]
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class Scene:
     """
 
     task: Task
-    setting: Distractor
+    setting: DistractorSetting
     episodes: int
     frames: int
     backgrounds: Backgrounds | None
     split: str = "train"
 
 
-class DistractorPart(abc.ABC):
+class Distractor(abc.ABC):
     """One distractor. An instance holds what it drew for the episodes of a scene.
 
     Random walks need their stream alone; a label that follows the agent is completed in `labels`.
@@ -87,7 +87,7 @@ class DistractorPart(abc.ABC):
         raise NotImplementedError
 
 
-def floor_alpha_for(task: Task, setting: Distractor) -> float:
+def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:
     """Opacity of the ground plane: under distractors the background shows through humanoid's floor.
 
     Walker and cheetah 1.0, reacher 0.0, otherwise 0.3 (Distracting Control Suite); untouched if no background is shown.

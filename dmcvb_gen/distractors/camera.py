@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
 
@@ -60,7 +60,7 @@ def _cartesian(radius: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.n
     return flat * cos_azimuth, flat * sin_azimuth, radius * cos_polar
 
 
-def camera_range(offset: np.ndarray, setting: Distractor) -> CameraRange:
+def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
     """The ranges around a nominal camera.
 
     The camera stays above the agent's center of mass and on its side of the plane y = 0, in front of the scenery. A
@@ -82,7 +82,7 @@ def camera_range(offset: np.ndarray, setting: Distractor) -> CameraRange:
 
 
 def camera_walk(
-    bounds: CameraRange, setting: Distractor, frames: int, generators: Sequence[np.random.Generator]
+    bounds: CameraRange, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the camera's walk, relative to the agent.
 
@@ -173,7 +173,7 @@ def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
     return np.stack([cos * right + sin * up, cos * up - sin * right, back], axis=-1)
 
 
-class Camera(DistractorPart):
+class Camera(Distractor):
     """One camera around the agent; without it, the cameras of the task's views."""
 
     kinds = ("static", "dynamic")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import Distractor, DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.spec import ALL_PARTS, CUE
 from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
@@ -18,7 +18,7 @@ STEP_STD = 0.03
 
 
 def color_walk(
-    own: np.ndarray, setting: Distractor, frames: int, generators: Sequence[np.random.Generator]
+    own: np.ndarray, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
 ) -> np.ndarray:
     """Draw the colors of all materials.
 
@@ -51,7 +51,7 @@ def check_colors_are_seen(task: Task) -> None:
         raise DmcvbError(f"{task.id} has no materials, so its colors cannot vary; give its geoms materials")
 
 
-class Color(DistractorPart):
+class Color(Distractor):
     """A color for every material; those that no geom or site shows keep the model's."""
 
     kinds = ("static", "dynamic")

@@ -10,14 +10,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, Scene
 from dmcvb_gen.distractors.color import check_colors_are_seen
 
 SHADE = 0.15
 """Added to or taken from every channel of every material that is seen."""
 
 
-class Cue(DistractorPart):
+class Cue(Distractor):
     """Colors a shade lighter or darker, by the sign of the last action's first number, at a correlation."""
 
     kinds = ("dynamic",)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, Scene
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 
@@ -17,7 +17,7 @@ STEP_STD = 0.05
 """Standard deviation of a tick's step, as a share of the largest shift."""
 
 
-class Light(DistractorPart):
+class Light(Distractor):
     """One walk for all lamps of the model, which starts uniform in its range and stops at its ends."""
 
     kinds = ("dynamic",)

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, Scene
 from dmcvb_gen.tasks.cameras import camera_ids
 
 SHARE = 0.1
 """Standard deviation of the shift along each axis, times s, as a share of the nominal camera's distance."""
 
 
-class Shake(DistractorPart):
+class Shake(Distractor):
     """Shifts of the camera, independent from frame to frame; it keeps its direction."""
 
     kinds = ("dynamic",)

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import DistractorPart, Scene
+from dmcvb_gen.distractors.base import Distractor, Scene
 
 
 def _draw(rng: np.random.Generator, choices: Sequence[int]) -> int:
     return choices[int(rng.integers(len(choices)))]
 
 
-class Style(DistractorPart):
+class Style(Distractor):
     """A style of the split for each episode, then one of its looks; -1 for tasks that have no styles."""
 
     kinds = ()  # a task's styles vary under every setting

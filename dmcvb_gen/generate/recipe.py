@@ -33,7 +33,7 @@ from dmcvb_gen.spec import (
     GOAL_MODES,
     LOCOMOTION,
     VISIBLE,
-    Distractor,
+    DistractorSetting,
     SubsetSpec,
     distractor_kinds,
     is_maze,
@@ -223,7 +223,7 @@ def narrow(
     for field, given in wanted.items():
         known = {value for pattern in recipe.subsets for value in getattr(pattern, field)}
         if field == "settings":
-            known |= {Distractor.parse(value).name for value in known - set(GOAL_MODES)}
+            known |= {DistractorSetting.parse(value).name for value in known - set(GOAL_MODES)}
         for value in given:
             if value not in known:
                 raise UnknownNameError(f"{field[:-1]} of recipe {recipe.name}", value, known)
@@ -244,7 +244,7 @@ def narrow(
 
 def _canonical(setting: str) -> str:
     """ "dynamic_medium" -> "dynamic"; what is no distractor stays."""
-    return Distractor.parse(setting).name if setting.split("_")[0] in distractor_kinds() else setting
+    return DistractorSetting.parse(setting).name if setting.split("_")[0] in distractor_kinds() else setting
 
 
 SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps")

@@ -33,7 +33,7 @@ from dmcvb_gen.generate.render import (
 from dmcvb_gen.generate.target import Target
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
-from dmcvb_gen.spec import Distractor, is_maze, select
+from dmcvb_gen.spec import DistractorSetting, is_maze, select
 from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 
@@ -222,9 +222,9 @@ def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None)
         return subset.setting
     if is_maze(subset.task):
         raise RecipeError(f"{subset.name} varies in style, not by distractor; remove --distractor or use --only")
-    old = Distractor.parse(subset.setting)
-    given = Distractor.parse(distractor) if distractor else old
-    return Distractor(given.kind, difficulty or given.difficulty).name
+    old = DistractorSetting.parse(subset.setting)
+    given = DistractorSetting.parse(distractor) if distractor else old
+    return DistractorSetting(given.kind, difficulty or given.difficulty).name
 
 
 def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Repainting) -> Manifest:

@@ -17,7 +17,7 @@ from dmcvb_gen.spec import (
     ANT_MAZE,
     DIFFICULTY_SCALES,
     FIXED,
-    Distractor,
+    DistractorSetting,
     Level,
     MazeName,
     difficulty_of,
@@ -60,6 +60,10 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
       DmcvbError: an unknown name, a value that is wrong, or an option that would have no effect.
     """
     given = {name: as_names(value) if name in _SEVERAL else value for name, value in given.items()}
+    if "distractors" in given:
+        from dmcvb_gen.distractors.registry import typed_setting  # which needs MuJoCo
+
+        given["distractors"] = tuple(map(typed_setting, given["distractors"]))
     tasks = (*tasks, *(_layout_task(layout) for layout in given.get("layouts", ())))
     allow(tasks)  # a person typed these names, so their code may run
     if not tasks and not recipe:
@@ -116,7 +120,9 @@ def _changed_recipe(recipe: Recipe, tasks: Sequence[str], given: Mapping[str, An
     for name, instead in _NOT_WITH_RECIPE.items():
         if name in given:
             raise RecipeError(f"--recipe takes no {instead} instead")
-    settings = [Distractor.parse(name).name for name in given.get("distractors", ())] + list(given.get("goals", ()))
+    settings = [DistractorSetting.parse(name).name for name in given.get("distractors", ())] + list(
+        given.get("goals", ())
+    )
     if tasks or given.get("levels") or settings:
         recipe = narrow(recipe, tasks, given.get("levels", ()), settings)
     changes = {name: given[name] for name in _OVERRIDES & given.keys()} | _sources(given)
@@ -157,7 +163,7 @@ def _recipe_from_options(tasks: Sequence[str], given: Mapping[str, Any]) -> Reci
     else:
         difficulty = _difficulty(given)
         settings = tuple(
-            name if "_" in name or name == "none" else Distractor(name, difficulty).name for name in distractors
+            name if "_" in name or name == "none" else DistractorSetting(name, difficulty).name for name in distractors
         )
     subset_fields = {name: given.get(name) for name in ("steps", "episodes_per_shard", "max_steps")}
     subset_fields["episodes"] = given.get("episodes") or (None if given.get("steps") else EPISODES)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.distractors import Distractor, DistractorSampler, floor_alpha_for, load_backgrounds
+from dmcvb_gen.distractors import DistractorSampler, DistractorSetting, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, UnknownNameError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look
@@ -99,7 +99,7 @@ class Scene:
         # Mazes always differ in style, and in whether the goal is seen.
         spec = SubsetSpec.parse(self.task, "random", VISIBLE if maze and self.distractor == "none" else self.distractor)
         if self.difficulty and not maze:
-            return replace(spec, distractor=Distractor(spec.distractor.kind, self.difficulty))
+            return replace(spec, distractor=DistractorSetting(spec.distractor.kind, self.difficulty))
         return spec
 
     def check(self) -> None:
@@ -144,7 +144,7 @@ class Scene:
             raise DmcvbError(f"goal_pair is {self.goal_pair}; give 0 to {self.fixed_goals - 1}, as fixed_goals says")
         if spec.distractor.kind == "none":
             # An exported data set names the difficulty that every setting has by default.
-            unused = {"difficulty": (None, Distractor("none").difficulty), "backgrounds": (Scene.backgrounds,)}
+            unused = {"difficulty": (None, DistractorSetting("none").difficulty), "backgrounds": (Scene.backgrounds,)}
             for name, unchanged in unused.items():
                 if getattr(self, name) not in unchanged:
                     shown = f"{self.task} {self.distractor}"

@@ -23,7 +23,7 @@ from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
 from dmcvb_gen.dataset.manifest import Manifest
 from dmcvb_gen.dataset.schema import stored_name
 from dmcvb_gen.distractors import background, camera, color, cue, light, shake
-from dmcvb_gen.distractors.base import KINDS, Distractor
+from dmcvb_gen.distractors.base import KINDS, DistractorSetting
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import folder_in_the_making, remove_partial, replacing, write_text
@@ -343,7 +343,7 @@ def _of_other_length(subsets: Sequence[Mapping[str, Any]]) -> str:
 
 def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
     """Rows (setting, scale, camera, colors, background) of the table of distractors; none for mazes alone."""
-    settings: dict[str, Distractor] = {}
+    settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
         if record.goal_mode is None:
             settings.setdefault(record.setting, record.distractor)

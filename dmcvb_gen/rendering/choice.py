@@ -7,7 +7,7 @@ import logging
 
 import numpy as np
 
-from dmcvb_gen.distractors import Distractor, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.rendering.native import NativeRenderer
@@ -57,7 +57,7 @@ def default_renderer(task: Task) -> str:
 def disagreement(task: Task) -> tuple[float, float]:
     """How far native is from MuJoCo's renderer: of the worst picture on average, and in the worst block of any."""
     physics = _moments(task)
-    labels = sample_distractors(task, Distractor(), physics[None], {"style": [np.random.default_rng(0)]}).flat()
+    labels = sample_distractors(task, DistractorSetting(), physics[None], {"style": [np.random.default_rng(0)]}).flat()
     pictures = []
     for renderer in (NativeRenderer(task, SIZE), OpenglRenderer(task, SIZE)):
         pictures.append(renderer.render(physics, labels).astype(float))

@@ -6,7 +6,7 @@ import pytest
 
 from dmcvb_gen import spec
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.spec import Distractor, GoalMode, Level, MazeName, SubsetSpec
+from dmcvb_gen.spec import DistractorSetting, GoalMode, Level, MazeName, SubsetSpec
 from dmcvb_gen.tasks import get_task, task_ids
 from dmcvb_gen.text import pluralize
 
@@ -41,9 +41,9 @@ def test_subsets_have_one_name(parts, name):
 
 def test_a_subset_has_a_distractor_and_a_goal_mode():
     walker = SubsetSpec.parse("walker-walk", "expert", "static_hard")
-    assert (walker.level, walker.distractor, walker.goal) == (Level.EXPERT, Distractor("static", "hard"), None)
+    assert (walker.level, walker.distractor, walker.goal) == (Level.EXPERT, DistractorSetting("static", "hard"), None)
     maze = SubsetSpec.parse("ant-maze-empty7x7", "random", "hidden")
-    assert (maze.distractor, maze.goal, maze.setting) == (Distractor(), GoalMode.HIDDEN, "hidden")
+    assert (maze.distractor, maze.goal, maze.setting) == (DistractorSetting(), GoalMode.HIDDEN, "hidden")
 
 
 @pytest.mark.parametrize(

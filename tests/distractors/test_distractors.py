@@ -5,11 +5,14 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ks_2samp, kstest
 
-from dmcvb_gen.distractors import Distractor, load_backgrounds, sample_distractors
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset import open_release
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
@@ -39,7 +42,7 @@ def generators(episodes, seed=0):
 def labels(task, setting, physics, episodes=None, seed=0):
     episodes = range(len(physics)) if episodes is None else episodes
     backgrounds = load_backgrounds("builtin", "train")
-    return sample_distractors(task, Distractor.parse(setting), physics, generators(episodes, seed), backgrounds)
+    return sample_distractors(task, DistractorSetting.parse(setting), physics, generators(episodes, seed), backgrounds)
 
 
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
@@ -82,7 +85,7 @@ def test_dynamic_stays_in_its_ranges(task_id, difficulty, scale):
 def test_the_range_is_around_every_nominal_camera(task_id, difficulty):
     task = get_task(task_id)
     offset = task.model.cam_poscom0[camera_ids(task)[0]]
-    setting = Distractor("dynamic", difficulty)
+    setting = DistractorSetting("dynamic", difficulty)
     bounds, nominal = camera_range(offset, setting), spherical(offset)
     assert (bounds.low <= bounds.high).all()
     assert (np.abs(np.stack([bounds.low, bounds.high]) - nominal)[:, 1:] <= np.pi / 2 * setting.scale + 1e-9).all()
@@ -126,7 +129,7 @@ def test_static_varies_between_episodes_and_never_within_one():
 
 
 def test_roll_has_the_steps_and_limits_it_should():
-    setting = Distractor("dynamic", "hard")
+    setting = DistractorSetting("dynamic", "hard")
     rngs = [np.random.default_rng(i) for i in range(3000)]
     bounds = camera_range(np.array([0.0, -4.0, 2.0]), setting)
     _, roll = camera_walk(bounds, setting, 3, rngs)
@@ -142,7 +145,7 @@ def test_roll_has_the_steps_and_limits_it_should():
 
 
 def test_camera_speeds_are_those_of_a_capped_random_walk():
-    setting, count = Distractor("dynamic", "medium"), 2000
+    setting, count = DistractorSetting("dynamic", "medium"), 2000
     anywhere = CameraRange(np.array([1e-3, 0.0, -np.pi]), np.array([1e3, np.pi, np.pi]), 3.0, 1.0)
     offset, _ = camera_walk(anywhere, setting, 16, [np.random.default_rng(i) for i in range(count)])
     steps = np.linalg.norm(np.diff(offset, axis=1), axis=-1)
@@ -160,7 +163,7 @@ def test_camera_speeds_are_those_of_a_capped_random_walk():
 
 
 def test_the_camera_does_not_stick_to_the_ends_of_its_ranges():
-    setting = Distractor("dynamic", "medium")
+    setting = DistractorSetting("dynamic", "medium")
     bounds = camera_range(np.array([0.0, -2.0, 1.2]), setting)
     offset, roll = camera_walk(bounds, setting, 501, [np.random.default_rng(i) for i in range(40)])
     place = spherical(offset)
@@ -239,4 +242,46 @@ def test_look_at_without_roll_keeps_the_horizon_level():
 @pytest.mark.parametrize("name", ["dynamik", "static_extreme"])
 def test_an_unknown_setting_is_refused(name):
     with pytest.raises(UnknownNameError, match="Known"):
-        Distractor.parse(name)
+        DistractorSetting.parse(name)
+
+
+OWN = """
+import numpy as np
+from dmcvb_gen.distractors import Distractor
+
+class Dusk(Distractor):
+    kinds, stream, names = ("dusk",), "color", ("material_rgb",)
+
+    def __init__(self, scene, generators):
+        self._dark = (1 - scene.setting.scale) * scene.task.material_colors
+
+    def labels(self, physics, frames):
+        return {"material_rgb": np.broadcast_to(self._dark, (*physics.shape[:-1], *self._dark.shape))}
+
+class Other:
+    kinds = ("other",)
+"""
+
+
+def test_a_class_of_a_file_in_this_folder_is_a_distractor(tmp_path, monkeypatch):
+    (tmp_path / "dusk_file.py").write_text(OWN)
+    monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        return CliRunner().invoke(main, list(map(str, arguments)))
+
+    made = ("rollout", "walker-walk", "--episodes", 1, "--max-steps", 2, "--size", 16, "--distractor")
+    result = run(*made, "dusk_file:Dusk_hard", "--out", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    [subset] = open_release(tmp_path / "r").subsets.values()
+    assert subset.setting == "dusk_hard"
+    task = get_task("walker-walk")
+    found = labels(task, "dusk_hard", physics_of(task, 1, 2)).material_rgb
+    np.testing.assert_allclose(found, np.broadcast_to(0.7 * task.material_colors, found.shape), 1e-6)
+    for name, told in (
+        ("dusk_file:Nothing", "cannot find distractor"),
+        ("dusk_file:Other", "is no distractor 'other'"),
+    ):
+        result = run(*made, name, "--out", tmp_path / "none")
+        assert result.exit_code == 2 and told in result.output and result.output.count("\n") == 1, result.output

@@ -18,7 +18,7 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.opengl import unavailable
-from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, FURTHER_PARTS, LIGHT, SHAKE, Distractor, difficulty_of
+from dmcvb_gen.spec import DIFFICULTIES, DISTRACTOR_PARTS, FURTHER_PARTS, LIGHT, SHAKE, DistractorSetting, difficulty_of
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.cameras import seen_materials
 from tests.distractors.test_distractors import labels, physics_of
@@ -34,9 +34,9 @@ SCALES = st.integers(1, 1000).map(lambda thousandths: thousandths / 1000)
     st.none() | SCALES,
 )
 def test_a_name_says_all_and_has_one_spelling(scale, parts, videos, rho):
-    setting = Distractor("dynamic", difficulty_of(scale, parts, videos, rho))
+    setting = DistractorSetting("dynamic", difficulty_of(scale, parts, videos, rho))
     assert setting.scale_of("cue") == (rho or 0)
-    assert Distractor.parse(setting.name) == setting
+    assert DistractorSetting.parse(setting.name) == setting
     for part in DISTRACTOR_PARTS:
         assert setting.varies(part) == (part in parts or not parts)
     assert setting.varies(SHAKE) == (SHAKE in parts)
@@ -48,10 +48,12 @@ def test_a_name_says_all_and_has_one_spelling(scale, parts, videos, rho):
 
 def test_words_are_points_on_the_dial():
     for word, scale in (("easy", 0.1), ("medium", 0.2), ("hard", 0.3)):
-        assert difficulty_of(scale) == word and Distractor.parse(f"static_{scale}") == Distractor("static", word)
-        assert Distractor("static", word).scale_of("camera") == Distractor("static", word).scale == scale
-    assert Distractor.parse("dynamic_camera0.2-color0.2-background8").name == "dynamic"
-    assert [Distractor("dynamic", text).videos for text in ("0.05", "0.15", "0.25", "0.9")] == [4, 8, None, None]
+        assert difficulty_of(scale) == word and DistractorSetting.parse(f"static_{scale}") == DistractorSetting(
+            "static", word
+        )
+        assert DistractorSetting("static", word).scale_of("camera") == DistractorSetting("static", word).scale == scale
+    assert DistractorSetting.parse("dynamic_camera0.2-color0.2-background8").name == "dynamic"
+    assert [DistractorSetting("dynamic", text).videos for text in ("0.05", "0.15", "0.25", "0.9")] == [4, 8, None, None]
 
 
 @pytest.mark.parametrize(
@@ -59,13 +61,13 @@ def test_words_are_points_on_the_dial():
 )
 def test_numbers_out_of_range_are_refused(difficulty):
     with pytest.raises(DmcvbError):
-        Distractor("dynamic", difficulty)
+        DistractorSetting("dynamic", difficulty)
 
 
 @pytest.mark.parametrize("difficulty", ["harsh", "camera-camera", "sky0.1", "camera-", "0.1-color", ""])
 def test_other_words_are_refused_with_those_there_are(difficulty):
     with pytest.raises(UnknownNameError, match="easy"):
-        Distractor("dynamic", difficulty)
+        DistractorSetting("dynamic", difficulty)
 
 
 @pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "cartpole-swingup"])
@@ -101,7 +103,7 @@ def test_the_renderers_agree_on_moved_lamps(task_id):
     """Finger's lamp is directional, the others are spots."""
     if unavailable():
         pytest.skip(unavailable())
-    task, setting = get_task(task_id), Distractor.parse("dynamic_light0.5")
+    task, setting = get_task(task_id), DistractorSetting.parse("dynamic_light0.5")
     physics = physics_of(task)[:, ::20]
     frames, lit = physics.reshape(-1, physics.shape[-1]), labels(task, "dynamic_light0.5", physics).flat()
     still = labels(task, "none", physics).flat()
@@ -253,7 +255,7 @@ def test_environments_show_the_cue_of_the_actions_that_are_taken_there():
 )
 def test_cues_that_there_cannot_be_are_refused(name):
     with pytest.raises(DmcvbError):
-        Distractor.parse(name)
+        DistractorSetting.parse(name)
 
 
 def test_all_words_are_known_to_the_dial():

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.distractors import Distractor, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.generate.engine import paint
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.policies.bundled import bundled_policies
@@ -102,7 +102,7 @@ def frames(task, seed, count):
     batch.reset([np.random.default_rng([seed, i]) for i in range(count)])
     physics = batch.physics()
     generators = {"style": [np.random.default_rng(i) for i in range(count)]}
-    return physics, sample_distractors(task, Distractor(), physics[:, None], generators)[:, 0]
+    return physics, sample_distractors(task, DistractorSetting(), physics[:, None], generators)[:, 0]
 
 
 @pytest.mark.parametrize("name", ["native", "opengl"])
@@ -138,7 +138,7 @@ def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(nam
     assert run.terminated.any()  # the goal is reached in one of them, so the ant is far from it and beside it
     physics, length = run.physics[:, :201], run.length
     generators = {"style": [np.random.default_rng(i) for i in range(3)]}
-    labels = sample_distractors(task, Distractor(), filled(physics, length), generators)
+    labels = sample_distractors(task, DistractorSetting(), filled(physics, length), generators)
     renderer, asked = make_renderer(name, task, 32), []
     render = renderer.render
 
@@ -183,8 +183,8 @@ def test_styles_of_data_and_of_evaluation_are_apart():
     task = get_task("ant-maze-empty7x7")
     physics = np.repeat(task.batch(1).physics()[None], 200, axis=0)
     generators = {"style": [np.random.default_rng(i) for i in range(200)]}
-    train = sample_distractors(task, Distractor(), physics, generators, split="train").style
-    val = sample_distractors(task, Distractor(), physics, generators, split="val").style
+    train = sample_distractors(task, DistractorSetting(), physics, generators, split="train").style
+    val = sample_distractors(task, DistractorSetting(), physics, generators, split="val").style
     assert set(np.unique(train) // 100) == {2, 3, 4, 5} and set(np.unique(val) // 100) == {1}
     assert set(np.unique(train)) <= {look for style in (2, 3, 4, 5) for look in task.looks(style)}
     styles = np.unique(train[:, 0] // 100, return_counts=True)[1]

@@ -10,7 +10,7 @@ from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import save_policy
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.spec import Distractor
+from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks import get_task
 
 TINY = ["--episodes", "1", "--max-steps", "3", "--size", "16"]
@@ -47,7 +47,7 @@ def test_a_recipe_has_the_tasks_counts_sizes_and_scales_that_were_published(name
     assert recipe.name == name and recipe.size == size and "Not equal to theirs:" in recipe.description
     assert {request.task for request in requests} == tasks
     assert {request.episodes * request.max_steps for request in requests} == {steps}
-    assert {Distractor.parse(request.setting).scale for request in requests} == scales
+    assert {DistractorSetting.parse(request.setting).scale for request in requests} == scales
 
 
 @pytest.mark.slow

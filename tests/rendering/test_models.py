@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dmcvb_gen.distractors import Distractor, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering import choice, default_renderer, make_renderer, opengl
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
@@ -123,7 +123,7 @@ def task_of(tmp_path, xml, steps=8, **options):
 
 
 def labels_of(task, physics):
-    return sample_distractors(task, Distractor(), physics[None], {"style": [None]}).flat()
+    return sample_distractors(task, DistractorSetting(), physics[None], {"style": [None]}).flat()
 
 
 def drawn(name, task, physics, labels):

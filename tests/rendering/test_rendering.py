@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dmcvb_gen.distractors import Distractor, floor_alpha_for, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import DmcvbError, RenderingError, UnknownNameError
 from dmcvb_gen.rendering import available_renderers, default_renderer, make_renderer
 from dmcvb_gen.rendering.opengl import unavailable
@@ -19,7 +19,7 @@ FRAMES = 12
 
 
 def frames_of(task_id, setting_name, count=FRAMES):
-    task, setting = get_task(task_id), Distractor.parse(setting_name)
+    task, setting = get_task(task_id), DistractorSetting.parse(setting_name)
     batch = task.batch(2)
     batch.reset([np.random.default_rng(i) for i in range(2)])
     rng, rows = np.random.default_rng(3), []
@@ -211,7 +211,7 @@ def test_opengl_draws_more_than_a_thousand_shapes_and_refuses_a_video_without_a_
     generators = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
     renderer = make_renderer("opengl", task, 200, backgrounds=load_backgrounds())
     for kind in ("none", "dynamic"):
-        labels = sample_distractors(task, Distractor(kind), physics[None], generators, load_backgrounds()).flat()
+        labels = sample_distractors(task, DistractorSetting(kind), physics[None], generators, load_backgrounds()).flat()
         if kind == "none":
             shown = renderer.render(physics, labels)[0, 0].any(axis=-1)
             halves = [half.mean() for side in (shown, shown.T) for half in (side[:100], side[100:])]
@@ -233,4 +233,4 @@ def test_a_model_without_materials_cannot_vary_its_colors(tmp_path, difficulty):
     task = plain_task(tmp_path, PLAIN)
     generators = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
     with pytest.raises(DmcvbError, match="has no materials, so its colors cannot vary"):
-        sample_distractors(task, Distractor("dynamic", difficulty), task.batch(1).physics()[None], generators)
+        sample_distractors(task, DistractorSetting("dynamic", difficulty), task.batch(1).physics()[None], generators)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from dmcvb_gen.distractors import DistractorPart, register_distractor
+from dmcvb_gen.distractors import Distractor, register_distractor
 
 
 @register_distractor
-class Grey(DistractorPart):
+class Grey(Distractor):
     """Every material has the same grey, uniform within s of the middle."""
 
     kinds = ("grey",)  # settings that vary it: grey, grey_easy, grey_hard
