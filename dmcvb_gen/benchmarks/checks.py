@@ -223,7 +223,7 @@ def check_structure(
     tick = _Longer(tick, again - (len(wanted | others) - again))
     with open_pool(workers, tick=tick) as pool:
         verified = verify(release.path, backgrounds, tick, pool, names=release.subsets)
-        findings, warnings = [f for f in verified.findings if f.subset not in others], []
+        findings, warnings = [f for f in verified.findings if f.subset not in others], [*verified.unchecked]
         unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
         readable = [subset for name, subset in release.subsets.items() if name not in unreadable]
         for found, odd in in_order(_check_subset, readable, pool):

@@ -25,7 +25,7 @@ def verify(release, as_json, **options):
     At a URL nothing is downloaded: manifest, index and commit records are checked, and a sample of files by digest.
 
     Exit codes: 0: sound and complete. 1: a check failed. 2: bad usage. 3: sound, but a part is missing (a rollout that
-    is not finished, or a part that was fetched).
+    is not finished, or a part that was fetched) or could not be checked here.
 
     \b
     dmcvb-gen verify releases/demo
@@ -33,6 +33,7 @@ def verify(release, as_json, **options):
     result = commands.verify(release, **options)
     facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest, "checked": result.checked}
     facts |= {"findings": [dataclasses.asdict(finding) for finding in result.findings], "incomplete": result.incomplete}
+    facts |= {"unchecked": [dataclasses.asdict(issue) for issue in result.unchecked]}
     code = 1 if not result.sound else 0 if result.complete else 3
     answer(as_json, facts, *_verified(release, result), code=code)
 
@@ -42,6 +43,7 @@ def _verified(path, result):
     yield from (f"FAIL {finding}" for finding in result.findings[:50])
     if len(result.findings) > 50:
         yield f"... and {len(result.findings) - 50} more"
+    yield from (f"NOT CHECKED {issue.subset}: {issue.message}" for issue in result.unchecked)
     named = {name: counts for name, counts in result.incomplete.items() if counts[0] or len(result.incomplete) <= 10}
     yield from (f"{name}: {here:,} of {planned:,} episodes" for name, (here, planned) in named.items())
     if absent := len(result.incomplete) - len(named):
@@ -54,6 +56,8 @@ def _verified(path, result):
         verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
         verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
+    elif result.sound and result.unchecked:
+        verdict = f"sound as far as it was checked; {pluralize(len(result.unchecked), 'subsets')} not checked"
     yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; values were checked of {checked}"
     if result.digest:
         yield f"digest {'of what is here ' if result.incomplete else ''}{result.digest}"

@@ -78,6 +78,7 @@ class EpisodeShape:
       action_size, state_size, physics_size: entries of one step.
       materials: materials whose colors are labels.
       max_steps: transitions at which the time limit ends an episode.
+      attributes: what is stored with the arrays of these names, beside the fields of states.
     """
 
     views: tuple[str, ...]
@@ -88,6 +89,7 @@ class EpisodeShape:
     physics_size: int
     materials: int
     max_steps: int
+    attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, task: Any) -> EpisodeShape:
@@ -101,6 +103,7 @@ class EpisodeShape:
             physics_size=task.physics_size,
             materials=len(task.material_colors),
             max_steps=task.max_steps,
+            attributes=task.array_attributes,
         )
 
     @property
@@ -136,14 +139,14 @@ def array_specs(
     """
     both = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
     names = both if pictures is None else pictures
-    fields = {name: list(part) for name, part in shape.state_fields.items()}
+    fields, given = {name: list(part) for name, part in shape.state_fields.items()}, shape.attributes
     specs = [picture_spec(name, size) for name in names]
     specs += [
         ArraySpec("state", "float32", (shape.state_size,), ("state_dim",), attributes={"fields": fields}),
-        ArraySpec("action", "float32", (shape.action_size,), ("action_dim",)),
+        ArraySpec("action", "float32", (shape.action_size,), ("action_dim",), attributes=given.get("action", {})),
         ArraySpec("reward", "float32"),
         ArraySpec("discount", "float32"),
-        ArraySpec("physics", "float64", (shape.physics_size,), ("physics_dim",)),
+        ArraySpec("physics", "float64", (shape.physics_size,), ("physics_dim",), attributes=given.get("physics", {})),
         *_label_specs(shape, varying),
         ArraySpec("length", "int32", steps=False),
         ArraySpec("terminated", "bool", steps=False),

@@ -162,6 +162,11 @@ def stream_names(manifest: Manifest, record: SubsetRecord) -> tuple[str, ...]:
     return trajectory_names(manifest.recipe_of(record.name).get("trajectories", "shared"), record)
 
 
+def streams_of(manifest: Manifest, record: SubsetRecord) -> tuple[int, tuple[str, ...]]:
+    """Seed and names of the random streams of a subset's episodes."""
+    return manifest.recipe_of(record.name).get("seed", 0), stream_names(manifest, record)
+
+
 def recipe_of(manifest: Manifest, subset: str) -> Recipe:
     """The recipe that a subset was made by: the manifest's first, or the one that added it."""
     return make_recipe(manifest.recipe_of(subset), "the manifest's recipe")

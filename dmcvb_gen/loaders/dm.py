@@ -44,7 +44,8 @@ class DmEnv(dm_env.Environment):
         return {name: _spec(name, space) for name, space in spaces.items()}
 
     def action_spec(self) -> specs.BoundedArray:
-        return specs.BoundedArray(self._env.spaces()[1].shape, np.float32, -1.0, 1.0, name="action")
+        space = self._env.spaces()[1]
+        return specs.BoundedArray(space.shape, np.float32, space.low, space.high, name="action")
 
     def close(self) -> None:
         self._env.close()

@@ -218,7 +218,7 @@ class _Stage:
         for modality in map(get_modality, self.modalities):
             values, (low, high) = (self.size, self.size, len(self.pictures.views), *modality.shape), modality.bounds
             observation[modality.name] = spaces.Box(low, high, values, np.dtype(modality.dtype).type)
-        return spaces.Dict(observation), spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        return spaces.Dict(observation), spaces.Box(self.task.action_low, self.task.action_high, dtype=np.float32)
 
     def info(self) -> dict[str, np.ndarray]:
         """Of mazes under "fixed", the pair of start and goal in each place, (place,) int."""
@@ -277,11 +277,11 @@ class _Stage:
         Raises:
           DmcvbError: the actions have another shape, or are not finite numbers.
         """
-        clipped = np.clip(self._checked(actions, active), -1, 1)
+        clipped = np.clip(self._checked(actions, active), self.task.action_low, self.task.action_high)
         result, self.action[active] = self.batch.step(clipped, active), clipped[active]
         self.state = result.state
         self.frame[active] += 1
-        truncated = active & (self.frame >= self.max_steps) & ~result.terminated
+        truncated = active & (result.truncated | (self.frame >= self.max_steps)) & ~result.terminated
         return result.reward, result.terminated, truncated
 
     def _checked(self, actions: ArrayLike, active: np.ndarray) -> np.ndarray:
@@ -296,7 +296,7 @@ class _Stage:
             given, expected = (actions.shape[1:], wanted[1:]) if alone else (actions.shape, wanted)
             raise DmcvbError(f"the action has shape {given}; {self.task.id} takes shape {expected}")
         if not np.isfinite(actions[active]).all():
-            raise DmcvbError("the action holds NaN or infinite values; give finite numbers in [-1, 1]")
+            raise DmcvbError("the action holds NaN or infinite values; give finite numbers in action_space")
         return actions
 
 
@@ -311,8 +311,8 @@ class DistractedEnv(gymnasium.Env):
     """One episode at a time.
 
     Observations are {"pixels": (size, size, 3 * views) uint8, "state": (state,) float32}; an action (action,) in
-    [-1, 1] is held for two control steps, whose rewards are summed (an episode earns at most 1000). The seed of
-    `reset` decides initial states, distractors and all episodes after it.
+    the task's bounds, [-1, 1] for most, is held for two control steps, whose rewards are summed (an episode earns at
+    most 1000). The seed of `reset` decides initial states, distractors and all episodes after it.
 
     Args:
       task: its name, see `Scene`.
@@ -401,18 +401,40 @@ class DistractedVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict]:
-        """Start all episodes; an int seeds place i with seed + i, as Gymnasium's own vector environments do."""
+        """Start all episodes; an int seeds place i with seed + i, as Gymnasium's own vector environments do.
+
+        Args:
+          options: {"reset_mask": (place,) bool} starts the episodes of these places alone.
+
+        Raises:
+          DmcvbError: the mask has another shape or kind, or nothing was reset before.
+        """
+        chosen = self._chosen(options)
         if seed is not None or self._seeds is None:
             given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
             given = [None] * self.num_envs if given is None else list(given)
             if len(given) != self.num_envs:
                 raise DmcvbError(f"{len(given)} seeds are given for {self.num_envs} environments; give one for each")
             draws = [gymnasium.utils.seeding.np_random(value)[0] for value in given]
-            self._seeds = [int(rng.integers(2**63)) for rng in draws]
-            self._stage.started[:] = 0
-        self._stage.start(range(self.num_envs), self._seeds)
-        self._ended[:] = False
+            drawn = [int(rng.integers(2**63)) for rng in draws]
+            pairs = enumerate(zip(drawn, self._seeds or drawn, strict=True))
+            self._seeds = [new if place in chosen else old for place, (new, old) in pairs]
+            self._stage.started[chosen] = 0
+        self._stage.start(chosen, [self._seeds[place] for place in chosen])
+        self._ended[chosen] = False
         return self._stage.observe(), self._info()
+
+    def _chosen(self, options: dict[str, Any] | None) -> list[int]:
+        """The places that a reset is about."""
+        if options is None or "reset_mask" not in options:
+            return list(range(self.num_envs))
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            given = f"{mask.dtype} of shape {mask.shape}, {int(mask.astype(bool).sum())} of it true"
+            raise DmcvbError(f"reset_mask is {given}; give ({self.num_envs},) bool that is true for one place or more")
+        if self._seeds is None and not mask.all():
+            raise DmcvbError("reset_mask before the first reset; call reset() for all places first")
+        return np.flatnonzero(mask).tolist()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict]:
         if self._seeds is None:

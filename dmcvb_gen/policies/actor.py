@@ -79,7 +79,10 @@ class Policy:
       header: its origin; None for uniform random actions.
       weights: name -> float32, see `header.weight_shapes`.
       digest: SHA-256 of its file ("random" for uniform random actions).
+      unit: True if its actions lie in [-1, 1], whatever the task's bounds; they are scaled (`Task.from_unit`).
     """
+
+    unit = True
 
     def __init__(self, header: PolicyHeader, weights: Mapping[str, np.ndarray], digest: str):
         self.header, self.weights, self.digest = header, dict(weights), digest

@@ -2,7 +2,7 @@
 
 ::
 
-    def behaviour(observations, generator):  # (n, observation) float32 in; (n, action) in [-1, 1] out
+    def behaviour(observations, generator):  # (n, observation) float32 in; (n, action) out, in the task's bounds
         return generator.uniform(-1, 1, size=(len(observations), 6))
 
 Data from such code are marked: they are not regenerable without it. Its source file's digest stands in the manifest.
@@ -48,6 +48,8 @@ class RowGenerator:
 class OwnPolicy(Policy):
     """A behaviour policy that is a function of the user's; the function draws its own noise, if it wants any."""
 
+    unit = False
+
     def __init__(self, name: str, function: Callable[..., Any], task: Task, digest: str):
         header = PolicyHeader(
             task=task.id,
@@ -60,7 +62,7 @@ class OwnPolicy(Policy):
             training={"behaviour": name, "source_sha256": digest, "note": MARK},
         )
         super().__init__(header, {}, digest)
-        self._name, self._function = name, function
+        self._name, self._function, self._bounds = name, function, (task.action_low, task.action_high)
 
     def act(self, observation, generators=None, deterministic=False):
         asked = (len(observation), self.header.action_size)
@@ -75,8 +77,10 @@ class OwnPolicy(Policy):
                 f"of shape {asked}; return one row of {asked[1]} actions an observation"
             )
         if not np.isfinite(action).all():
-            raise PolicyFileError(f"behaviour {self._name} gave actions that are not finite; return numbers in [-1, 1]")
-        return np.clip(action, -1, 1).astype(np.float32)
+            raise PolicyFileError(
+                f"behaviour {self._name} gave actions that are not finite; return numbers in the task's bounds"
+            )
+        return np.clip(action.astype(np.float32), *self._bounds)
 
 
 def own_policy(name: str, task: Task) -> OwnPolicy:

@@ -15,7 +15,7 @@ import numpy as np
 
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.seeding import episode_seed, episode_stream
-from dmcvb_gen.tasks.base import EpisodeBatch, Task
+from dmcvb_gen.tasks.base import EpisodeBatch, EpisodeError, Task
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class Simulation:
     Attributes:
       episodes: (episode,) indices in the subset.
       state: (episode, row, state) float32; one row more than the longest episode may have steps.
-      action: (episode, row, action) float32, zero in the last row.
+      action: (episode, row, action) float32 in the task's own bounds, zero in the last row.
       reward, discount: (episode, row) float32, likewise.
       physics: (episode, row, physics) float64.
       length: (episode,) int32, transitions.
-      terminated: (episode,) bool, ended by the task.
+      terminated: (episode,) bool, ended by the task; the others were cut off, by it or by the time limit.
       seed: (episode,) uint64, label of the episode's streams.
       behaviour: (episode,) int16, index of the policy.
       goal_pair: (episode,) int16, index of the fixed start and goal, -1 if they are random.
@@ -66,20 +66,21 @@ def _actions(
     generators: Sequence[np.random.Generator],
     observations: np.ndarray,
     active: np.ndarray,
-    action_size: int,
+    task: Task,
     deterministic: bool,
 ) -> np.ndarray:
     """Actions of a batch of episodes, each from its own policy; zeros once an episode is over.
 
     Returns:
-      (size, action) float32.
+      (size, action) float32, in the task's own bounds.
     """
-    actions = np.zeros((len(observations), action_size), np.float32)
+    actions = np.zeros((len(observations), task.action_size), np.float32)
     for index in np.unique(assigned).tolist():
         rows = np.flatnonzero(active & (assigned == index))
         if len(rows):
             streams = [generators[int(row)] for row in rows]
-            actions[rows] = policies[index].act(observations[rows], streams, deterministic)
+            given = policies[index].act(observations[rows], streams, deterministic)
+            actions[rows] = task.from_unit(given) if policies[index].unit else given
     return actions
 
 
@@ -124,6 +125,9 @@ def simulate(
       deterministic: mean actions; False draws samples (uniform random actions are always drawn).
       goal_pairs, episodes_per_goal: fixed (start, goal) cells of a maze; episode i takes pair i // episodes_per_goal.
       max_steps: agent steps at which an episode ends, if not the task's time limit.
+
+    Raises:
+      EpisodeError: an episode diverged, or a user's own task failed in it.
     """
     chosen, limit = np.asarray(episodes, int), max_steps or task.max_steps
     starts, noise = (
@@ -137,10 +141,34 @@ def simulate(
     started = time.perf_counter()
     batch = task.batch(len(chosen), threads)
     pairs = None if goal_pairs is None else [goal_pairs[k] for k in out.goal_pair.tolist()]
-    state = batch.reset(starts) if pairs is None else batch.reset_fixed(starts, pairs)
-    out.seconds["physics"] += time.perf_counter() - started
-    _step_to_the_end(batch, state, policies, noise, deterministic, out)
+    try:
+        state = batch.reset(starts) if pairs is None else batch.reset_fixed(starts, pairs)
+        out.seconds["physics"] += time.perf_counter() - started
+        _step_to_the_end(batch, state, policies, noise, deterministic, out)
+    except EpisodeError as error:
+        raise error.of_episode(int(chosen[error.place])) from error
     return out
+
+
+class Replay(Policy):
+    """Gives the actions of a stored episode again, one a call."""
+
+    unit = False
+
+    def __init__(self, actions: np.ndarray):
+        self._left = iter(actions)
+
+    def act(self, observation, generators=None, deterministic=False):
+        return next(self._left)[None]
+
+
+def replay(task: Task, actions: np.ndarray, episode: int, seed: int, names: tuple[str, ...]) -> Simulation:
+    """An episode simulated again from its streams and its stored actions; see `simulate`.
+
+    Args:
+      actions: (step, action) float32.
+    """
+    return simulate(task, [Replay(actions)], [episode], seed, names, max_steps=len(actions))
 
 
 def _step_to_the_end(
@@ -157,24 +185,25 @@ def _step_to_the_end(
       state: (size, state) of the first observations.
       noise: one generator an episode, of its drawn actions.
     """
-    limit, action_size = out.state.shape[1] - 1, batch.task.action_size
+    limit = out.state.shape[1] - 1
     active = np.ones(len(state), bool)
+    over = np.zeros(len(state), bool)
     for step in range(limit + 1):
         out.state[active, step] = state[active]
         out.physics[active, step] = batch.physics()[active]
-        active &= ~out.terminated
+        active &= ~over
         if step == limit or not active.any():
             break
         started = time.perf_counter()
         seen = batch.behaviour_observation()
-        actions = _actions(policies, out.behaviour, noise, seen, active, action_size, deterministic)
+        actions = _actions(policies, out.behaviour, noise, seen, active, batch.task, deterministic)
         acted = time.perf_counter()
         result = batch.step(actions, active)
         out.seconds["policy"] += acted - started
         out.seconds["physics"] += time.perf_counter() - acted
-        state, ended = result.state, result.terminated
+        state, over = result.state, result.terminated | result.truncated
         out.action[active, step] = actions[active]
         out.reward[active, step] = result.reward[active]
-        out.discount[active, step] = np.where(ended[active], 0.0, 1.0)
-        out.terminated[ended] = True
-        out.length[ended] = step + 1
+        out.discount[active, step] = result.discount[active]
+        out.terminated[result.terminated] = True
+        out.length[over] = step + 1

@@ -18,6 +18,7 @@ from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.modalities import modality_of, stored_in
 from dmcvb_gen.generate.render import modality_of_frames, renderer_for
+from dmcvb_gen.policies.simulate import replay
 from dmcvb_gen.release.import_tfds import imported_specs
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.rendering.base import Renderer
@@ -27,16 +28,21 @@ SAMPLE_EPISODES, SAMPLE_STEPS, SAMPLE_FRAMES = 8, 12, 6
 """How much of each subset is simulated and painted again."""
 REWARD_TOLERANCE, STATE_TOLERANCE = 1e-4, 1e-3
 """Largest difference that another CPU or library version may cause in one step; on the same machine it is 0."""
+SUDDEN = 1e3
+"""Growth of a difference in one step from which on it is no rounding that has grown."""
 PIXEL_TOLERANCE = 2.0
 """Mean absolute difference of a repainted frame, grey levels of 255; on the same machine it is 0."""
 LABEL_TOLERANCE, LABEL_SHARE = 1e-3, 0.02
 """Difference from which on a value of a depth or another modality counts, and the share of such that is too much."""
 
 
-def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
+def check_contents(
+    subset: Subset, streams: tuple[int, tuple[str, ...]], backgrounds: str | None = None
+) -> Iterator[Issue]:
     """All that can be checked of a subset.
 
     Args:
+      streams: seed and names of its episodes' random streams, see `generate.jobs.streams_of`.
       backgrounds: present place of the manifest's videos, if they moved.
 
     Raises:
@@ -46,7 +52,7 @@ def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[I
     yield from found
     if any(finding.check in ("shapes", "lengths") for finding in found) or subset.record.imported:
         return  # no values to go by, or nothing to simulate or paint from
-    yield from check_physics(subset)
+    yield from check_replays(subset, *streams) if get_task(subset.task).replayed else check_physics(subset)
     if subset.pixel_arrays:
         yield from check_pixels(subset, backgrounds)
 
@@ -80,9 +86,10 @@ def check_values(subset: Subset) -> Iterator[Issue]:
             bad = ~np.isfinite(values[name].reshape(len(values[name]), -1)).all(axis=1)
             if bad.any():
                 yield Issue("finite", subset.name, f"{name} is not finite", episode, int(bad.argmax()))
-        if np.abs(values["action"]).max() > 1:
-            step = int(np.abs(values["action"]).max(axis=1).argmax())
-            yield Issue("actions", subset.name, "an action is outside [-1, 1]", episode, step)
+        outside = (values["action"] < task.action_low) | (values["action"] > task.action_high)
+        if outside[:length].any():
+            message = "an action is outside of the task's bounds"
+            yield Issue("actions", subset.name, message, episode, int(outside.any(axis=1).argmax()))
         total = float(values["reward"].astype(np.float64).sum())
         if not abs(total - float(values["return"])) <= 1e-6 * max(1.0, abs(total)):
             yield Issue(
@@ -94,7 +101,7 @@ def check_values(subset: Subset) -> Iterator[Issue]:
             yield Issue("returns", subset.name, f"return {total:.2f} is outside {low:g}..{high:g}", episode)
         if (
             bool(values["terminated"]) != (values["discount"][-1] == 0)
-            or (length < subset.record.max_steps) > values["terminated"]
+            or (length < subset.record.max_steps and not task.replayed) > values["terminated"]
         ):
             yield Issue("lengths", subset.name, "length, discount and terminated do not agree", episode)
         key = values["state"].tobytes() + values["action"].tobytes()
@@ -122,7 +129,7 @@ def check_physics(subset: Subset) -> Iterator[Issue]:
                     yield Issue("states", subset.name, f"physics gives a state {gap:.3g} away", episode, int(step))
             result = batch.step(values["action"][steps])
             after = batch.set_physics(values["physics"][steps + 1])
-            for row, step in enumerate([] if task.unstored_reward else steps):
+            for row, step in enumerate(steps):
                 gap = abs(result.reward[row] - values["reward"][step])
                 if not gap <= REWARD_TOLERANCE:
                     yield Issue(
@@ -135,6 +142,37 @@ def check_physics(subset: Subset) -> Iterator[Issue]:
                 gap = np.abs(result.state[row] - after[row])[known].max()
                 if not gap <= STATE_TOLERANCE * 10:
                     yield Issue("physics", subset.name, f"the action leads {gap:.3g} away", episode, int(step))
+
+
+def check_replays(subset: Subset, seed: int, names: tuple[str, ...]) -> Iterator[Issue]:
+    """Sampled episodes simulated again from their streams and stored actions: every row is the stored one.
+
+    On another processor a last bit may differ, and grow from step to step: what follows is not compared. A difference
+    that comes at once is a finding.
+    """
+    task = get_task(subset.task)
+    for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
+        episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+        values = subset.episode(episode, ["state", "action", "reward", "physics"])
+        made = replay(task, values["action"][:length], episode, seed, names)
+        if made.length[0] != length:
+            message = f"ends after {length} steps, the same actions end it after {made.length[0]}"
+            yield Issue("lengths", subset.name, message, episode)
+            continue
+        rows, until = {"states": (made.state, "state"), "rewards": (made.reward, "reward")}, length + 1
+        rows = {"physics": (made.physics, "physics")} | rows
+        for check, (again, name) in rows.items():
+            stored = values[name][:until]
+            gaps = np.abs(again[0, : len(stored)] - stored) / (1 + np.abs(stored))
+            gaps = gaps.reshape(len(stored), -1).max(axis=1)
+            wrong = np.flatnonzero(~(gaps <= STATE_TOLERANCE))
+            if not len(wrong):
+                continue
+            step = int(wrong[0])
+            if step and gaps[step - 1] > STATE_TOLERANCE / SUDDEN:
+                until = step
+                continue
+            yield Issue(check, subset.name, f"{name} is {gaps[step]:.3g} away from dm_control's", episode, step)
 
 
 def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:

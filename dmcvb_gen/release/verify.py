@@ -51,6 +51,7 @@ class Verification:
       incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
       digest: the release's root digest, None while it is made (and of version 1).
       finished: True if its digests were written once everything was there.
+      unchecked: what could not be looked at on this machine, and why; nothing is known to be damaged there.
     """
 
     checked: dict[str, int]
@@ -58,6 +59,7 @@ class Verification:
     incomplete: dict[str, tuple[int, int]] = field(default_factory=dict)
     digest: str | None = None
     finished: bool = True
+    unchecked: tuple[Issue, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -66,8 +68,8 @@ class Verification:
 
     @property
     def complete(self) -> bool:
-        """True if everything that belongs to the release is here."""
-        return self.finished and not self.incomplete
+        """True if everything that belongs to the release is here, and was checked."""
+        return self.finished and not self.incomplete and not self.unchecked
 
 
 # -- bytes ----------------------------------------------------------------------------------------
@@ -243,26 +245,34 @@ def verify(
         counts["subsets"] += 1
         counts["episodes"] += len(subset.episodes)
         counts["steps"] += subset.steps
-    works = [(subset, backgrounds) for subset in chosen]
+    works = [(subset, release.manifest, backgrounds) for subset in chosen]
     for found in in_order(_check_subset, works, workers, tick):
         findings += found
     incomplete = {name: count for name, count in release.shortfalls.items() if name not in damaged}
     manifest = release.manifest
     finished = manifest.complete and (manifest.digest is not None or manifest.schema_version == 1)
-    return Verification(counts, tuple(findings), incomplete, release.manifest.digest, finished)
+    unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
+    faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
+    return Verification(counts, faults, incomplete, release.manifest.digest, finished, unchecked)
 
 
-def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> list[Issue]:
-    subset, backgrounds = work
+def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallback) -> list[Issue]:
+    subset, manifest, backgrounds = work
     tick(subset.name)
     try:
+        from dmcvb_gen.generate.jobs import streams_of
         from dmcvb_gen.release import contents
+        from dmcvb_gen.tasks import get_task
     except ModuleNotFoundError as error:
         # Whoever only reads has no simulator; bytes are checked all the same, and this says what was not.
         log.warning("values, physics and images of %s were not checked: %s is not installed", subset.name, error.name)
         return []
     try:
-        return list(contents.check_contents(subset, backgrounds))
+        get_task(subset.task)
+    except DmcvbError as error:  # code of somebody else, which is not here or does not run here
+        return [Issue(UNCHECKED, subset.name, f"values, physics and images cannot be checked here: {error}")]
+    try:
+        return list(contents.check_contents(subset, streams_of(manifest, subset.record), backgrounds))
     except (RenderingError, BackgroundError, UnknownNameError, ImportError) as error:  # what this machine lacks
         return [Issue(UNCHECKED, subset.name, f"values, physics or images cannot be checked here: {error}")]
     except DmcvbError as error:

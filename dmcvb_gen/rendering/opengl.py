@@ -24,7 +24,7 @@ from PIL import Image
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials, moved_lamps
-from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
+from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
 RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
@@ -184,15 +184,13 @@ class OpenglRenderer(Renderer):
     def _pose(self, physics, exogenous, frame, hide_goal):
         """Set the frame's state, then the model as its episode has it, then what its labels say."""
         model, data = self._model, self._data
-        rows = np.asarray(physics, np.float64)[None]
+        row, spec = np.asarray(physics, np.float64), self.task.physics_spec
         for name, values in self._own_values.items():
             getattr(model, name)[:] = values
-        for name, columns, values in self.task.split_entries(rows):
-            getattr(model, name).reshape(-1)[columns] = values[0]
-            if name == "hfield_data":
-                for field in range(model.nhfield):
-                    mujoco.mjr_uploadHField(model, self._context, field)
-        mujoco.mj_setState(model, data, rows[0, : mujoco.mj_stateSize(model, PHYSICS_SPEC)], PHYSICS_SPEC)
+        self.task.apply_entries(model, row)
+        for field in range(model.nhfield if "hfield_data" in self.task.model_entries else 0):
+            mujoco.mjr_uploadHField(model, self._context, field)
+        mujoco.mj_setState(model, data, row[: mujoco.mj_stateSize(model, spec)], spec)
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
             stage(model, data)
         if exogenous.light_shift is not None:

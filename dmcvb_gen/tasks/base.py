@@ -1,7 +1,8 @@
 """Base of all tasks: a MuJoCo model, a state with named fields, a reward; simulated as a batch of episodes.
 
-A `Task` is the description (one per task id, shared freely). `Task.batch` makes an `EpisodeBatch`:
-`size` episodes side by side on `mujoco.batch.Batch`, stepped together. Tasks know nothing of pixels.
+A `Task` is the description (one per task id, shared freely). `Task.batch` makes an `EpisodeBatch` of `size` episodes
+side by side. Those of DMC-VB's own tasks are each a `PhysicsBatch`: one `mujoco.batch.Batch`, stepped together. Every
+other task is stepped by dm_control (see `environment`). Tasks know nothing of pixels.
 
 One agent step is `ACTION_REPEAT` control steps with the same action; their rewards are summed
 (paper, section 3.2). Step t of an episode holds the state before action t and the reward that it earned.
@@ -11,8 +12,10 @@ from __future__ import annotations
 
 import abc
 import math
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,7 +35,8 @@ PHYSICS_SPEC = int(
     | mujoco.mjtState.mjSTATE_MOCAP_QUAT
 )
 """The `mjtState` bits of the stored `physics`: all that decides what the simulation does next and how
-it looks. The solver's warm start is in, so that a step redone from a stored state gives the same bits."""
+it looks, of DMC-VB's own tasks. The solver's warm start is in, so that a step redone from a stored state gives the same
+bits."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,39 @@ class StepResult:
       state: (size, state) float64, the states after the step.
       reward: (size,) float64, summed over the control steps.
       terminated: (size,) bool, the task ended by itself (never by the time limit).
+      truncated: (size,) bool, the task cut the episode off: what follows would have had a value.
+      discount: (size,) float64, the product of the control steps' discounts; 0 where the task ended.
     """
 
     state: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
+    truncated: np.ndarray
+    discount: np.ndarray
+
+
+class EpisodeError(DmcvbError):
+    """An episode that cannot go on: the simulation diverged, or a user's own code failed.
+
+    Args:
+      task_id: the task.
+      place: index in the batch.
+      step: agent steps that were made before.
+      reason: what happened, and what to do.
+      episode: index in the subset, if it is known.
+    """
+
+    def __init__(self, task_id: str, place: int, step: int, reason: str, episode: int | None = None):
+        super().__init__(task_id, place, step, reason, episode)
+        self.task_id, self.place, self.step, self.reason, self.episode = self.args
+
+    def __str__(self) -> str:
+        which = "" if self.episode is None else f"episode {self.episode}, "
+        return f"task {self.task_id}, {which}step {self.step}: {self.reason}"
+
+    def of_episode(self, episode: int) -> EpisodeError:
+        """The same error, with the episode's index in its subset."""
+        return EpisodeError(self.task_id, self.place, self.step, self.reason, episode)
 
 
 class Task(abc.ABC):
@@ -85,8 +117,10 @@ class Task(abc.ABC):
 
     unstored_fields: tuple[str, ...] = ()
     """Fields of the state that a physics state alone does not give."""
-    unstored_reward: bool = False
-    """True if the reward needs more than physics states and actions."""
+    replayed: bool = False
+    """True if a stored episode is checked by replaying its actions from its start, False if by single steps."""
+    physics_spec: int = PHYSICS_SPEC
+    """The `mjtState` bits that each row of the stored `physics` begins with."""
 
     floor_alpha: float = 0.3
     """Opacity of the ground plane under distractors (Distracting Control Suite)."""
@@ -117,8 +151,37 @@ class Task(abc.ABC):
 
     @property
     def action_size(self) -> int:
-        """Actions are float32 (action_size,) in [-1, 1]."""
+        """Actions are float32 (action_size,) between `action_low` and `action_high`."""
         return self.model.nu
+
+    @property
+    def action_low(self) -> np.ndarray:
+        """(action,) float32: the least action that the task takes."""
+        return np.full(self.action_size, -1, np.float32)
+
+    @property
+    def action_high(self) -> np.ndarray:
+        """(action,) float32: the largest action that the task takes."""
+        return np.full(self.action_size, 1, np.float32)
+
+    def from_unit(self, actions: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1], (..., action), as a policy gives them, scaled to the task's own bounds."""
+        low, high = self.action_low, self.action_high
+        if (low == -1).all() and (high == 1).all():
+            return actions
+        return np.clip(low + (actions + 1) / 2 * (high - low), low, high).astype(actions.dtype)
+
+    def to_unit(self, actions: np.ndarray) -> np.ndarray:
+        """Actions in the task's own bounds, (..., action), scaled to [-1, 1]: the inverse of `from_unit`."""
+        low, high = self.action_low, self.action_high
+        if (low == -1).all() and (high == 1).all():
+            return actions
+        return np.clip((actions - low) / (high - low) * 2 - 1, -1, 1).astype(actions.dtype)
+
+    @property
+    def array_attributes(self) -> dict[str, dict[str, Any]]:
+        """What is stored with the arrays of a subset, by name; nothing of DMC-VB's own tasks, which are all alike."""
+        return {}
 
     @property
     def state_size(self) -> int:
@@ -139,15 +202,25 @@ class Task(abc.ABC):
 
     @property
     def physics_size(self) -> int:
-        """Length of a stored physics state (float64): `PHYSICS_SPEC`, then the values of `model_entries`."""
-        return mujoco.mj_stateSize(self.model, PHYSICS_SPEC) + sum(map(len, self.model_entries.values()))
+        """Length of a stored physics state (float64): `physics_spec`, then the values of `model_entries`."""
+        return mujoco.mj_stateSize(self.model, self.physics_spec) + sum(map(len, self.model_entries.values()))
 
     def split_entries(self, physics: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         """Fields of `model_entries`, their flat indices, and their values (frame, index) in (frame, physics) rows."""
-        first = mujoco.mj_stateSize(self.model, PHYSICS_SPEC)
+        first = mujoco.mj_stateSize(self.model, self.physics_spec)
         for name, columns in self.model_entries.items():
             yield name, columns, physics[:, first : first + len(columns)]
             first += len(columns)
+
+    def apply_entries(self, model: mujoco.MjModel, row: np.ndarray) -> None:
+        """Put the model entries of a (physics,) row into a model of the caller's own."""
+        for name, columns, values in self.split_entries(row[None]):
+            owner, field = field_owner(model, name)
+            value = getattr(owner, field)
+            if isinstance(value, np.ndarray):
+                value.reshape(-1)[columns] = values[0]
+            else:
+                setattr(owner, field, type(value)(values[0, 0]))
 
     @property
     def control_timestep(self) -> float:
@@ -159,43 +232,59 @@ class Task(abc.ABC):
         """`size` episodes side by side, stepped on `threads` threads (the result does not depend on them)."""
 
 
+def field_owner(model: mujoco.MjModel, name: str) -> tuple[Any, str]:
+    """The object that holds a field of a model, "geom_size" or "opt.gravity", and the field's name in it."""
+    owner, _, field = name.rpartition(".")
+    return (operator.attrgetter(owner)(model) if owner else model), field
+
+
 class EpisodeBatch(abc.ABC):
-    """`size` episodes of one task, simulated together. A simulation never influences its neighbors.
+    """`size` episodes of one task, simulated together. A simulation never influences its neighbors."""
 
-    Built on a persistent `mujoco.batch.Batch` stepped with `mjSTAGE_VEL`, which makes positions,
-    velocities and sensors current after each control step as dm_control does.
-    """
-
-    def __init__(self, task: Task, size: int, threads: int = 1):
+    def __init__(self, task: Task, size: int):
         self.task = task
         self.size = size
-        self.sims = Batch(task.model, size, nthread=threads, persistent=True)
-        self._ctrl = self.sims.bind("ctrl")
         self._all = np.arange(size)
 
-    # -- what a task must say ---------------------------------------------------------------
-
     @abc.abstractmethod
-    def _initialize(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        """Set the initial physics state of the simulations `ids`, one generator each; end with `_refresh`."""
+    def _start(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Start new episodes in the simulations `ids`, one generator each."""
 
     @abc.abstractmethod
     def state(self) -> np.ndarray:
         """(size, state) float64: the current states, fields as in `task.state_fields`."""
 
+    @abc.abstractmethod
+    def physics(self) -> np.ndarray:
+        """(size, physics) float64: the states to set back into MuJoCo (`task.physics_spec`), then model entries."""
+
+    @abc.abstractmethod
+    def set_physics(self, physics: np.ndarray, ids: np.ndarray | Sequence[int] | None = None) -> np.ndarray:
+        """Put simulations into stored physics states; gives all states (size, state).
+
+        Args:
+          physics: (len(ids), physics) float64.
+        """
+
+    @abc.abstractmethod
+    def step(self, actions: np.ndarray, active: np.ndarray | None = None) -> StepResult:
+        """One agent step.
+
+        Args:
+          actions: (size, action) in the task's bounds; MuJoCo clips them to the control limits as in dm_control.
+          active: (size,) bool, the simulations to step; the others stay as they are and earn nothing.
+            All by default.
+
+        An episode that terminates at its first control step is frozen for the second: its state stays
+        what it was at the end and it earns nothing more (as an action-repeat wrapper that breaks).
+
+        Raises:
+          EpisodeError: a simulation diverged, or a user's own task failed or gave what is no finite number.
+        """
+
     def behaviour_observation(self) -> np.ndarray:
         """(size, behaviour_size) float32: what behaviour policies see, `task.observation`; the state by default."""
         return self.state().astype(np.float32)
-
-    @abc.abstractmethod
-    def _control_reward(self) -> np.ndarray:
-        """(size,) float64: the reward of the control step just taken."""
-
-    def _control_terminated(self) -> np.ndarray:
-        """(size,) bool: whether the control step just taken ended the episode."""
-        return np.zeros(self.size, bool)
-
-    # -- what callers use -------------------------------------------------------------------
 
     def reset(
         self, generators: Sequence[np.random.Generator], ids: np.ndarray | Sequence[int] | None = None
@@ -213,8 +302,7 @@ class EpisodeBatch(abc.ABC):
         if len(generators) != len(ids):
             raise ValueError(f"{len(ids)} simulations to reset, {len(generators)} generators given")
         if len(ids):
-            self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
-            self._initialize(ids, generators)
+            self._start(ids, generators)
         return self.state()
 
     def reset_fixed(
@@ -230,27 +318,64 @@ class EpisodeBatch(abc.ABC):
         """
         raise DmcvbError(f"{self.task.id} has no cells to start at; give an ant-maze task")
 
-    def step(self, actions: np.ndarray, active: np.ndarray | None = None) -> StepResult:
-        """One agent step.
-
-        Args:
-          actions: (size, action), clipped to [-1, 1] by MuJoCo's control limits as in dm_control.
-          active: (size,) bool, the simulations to step; the others stay as they are and earn nothing.
-            All by default.
-
-        An episode that terminates at its first control step is frozen for the second: its state stays
-        what it was at the end and it earns nothing more (as an action-repeat wrapper that breaks).
+    def _check_actions(self, actions: np.ndarray) -> np.ndarray:
+        """The actions as float64.
 
         Raises:
-          DmcvbError: the task gave a reward that is not finite.
+          ValueError: they have another shape.
         """
-        actions = np.asarray(actions, np.float64)
-        if actions.shape != self._ctrl.shape:
-            raise ValueError(f"actions have shape {actions.shape}, expected {self._ctrl.shape}")
+        actions, expected = np.asarray(actions, np.float64), (self.size, self.task.action_size)
+        if actions.shape != expected:
+            raise ValueError(f"actions have shape {actions.shape}, expected {expected}")
+        return actions
+
+
+class PhysicsBatch(EpisodeBatch):
+    """Episodes of one of DMC-VB's own tasks, written for a whole batch.
+
+    Built on a persistent `mujoco.batch.Batch` stepped with `mjSTAGE_VEL`, which makes positions,
+    velocities and sensors current after each control step as dm_control does.
+    """
+
+    def __init__(self, task: Task, size: int, threads: int = 1):
+        super().__init__(task, size)
+        self.sims = Batch(task.model, size, nthread=threads, persistent=True)
+        self._ctrl = self.sims.bind("ctrl")
+        self._steps = np.zeros(size, int)
+
+    # -- what a task must say ---------------------------------------------------------------
+
+    @abc.abstractmethod
+    def _initialize(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Set the initial physics state of the simulations `ids`, one generator each; end with `_refresh`."""
+
+    @abc.abstractmethod
+    def _control_reward(self) -> np.ndarray:
+        """(size,) float64: the reward of the control step just taken."""
+
+    def _control_terminated(self) -> np.ndarray:
+        """(size,) bool: whether the control step just taken ended the episode."""
+        return np.zeros(self.size, bool)
+
+    # -- what callers use -------------------------------------------------------------------
+
+    def _start(self, ids, generators):
+        self._clear(ids)
+        self._initialize(ids, generators)
+
+    def _clear(self, ids: np.ndarray) -> None:
+        """Put simulations into the model's own pose, with nothing computed yet."""
+        self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.sims.warning[ids] = 0
+        self._steps[ids] = 0
+
+    def step(self, actions, active=None):
+        actions = self._check_actions(actions)
         moving = np.ones(self.size, bool) if active is None else np.array(active, bool)
         self._ctrl[moving] = actions[moving]
         reward = np.zeros(self.size)
         terminated = np.zeros(self.size, bool)
+        stepped = np.flatnonzero(moving)
         for _ in range(ACTION_REPEAT):
             if not moving.any():
                 break
@@ -259,10 +384,18 @@ class EpisodeBatch(abc.ABC):
             ended = self._control_terminated() & moving
             terminated |= ended
             moving &= ~ended
-        if not np.isfinite(reward).all():  # from a user's own task
-            wrong = reward[~np.isfinite(reward)][0]
-            raise DmcvbError(f"task {self.task.id} gave the reward {wrong}; its reward must be a finite number")
-        return StepResult(self.state(), reward, terminated)
+        if self.sims.warning[..., 1].any():
+            self._refuse_divergence(stepped)
+        self._steps[stepped] += 1
+        nothing = np.zeros(self.size, bool)
+        return StepResult(self.state(), reward, terminated, nothing, np.where(terminated, 0.0, 1.0))
+
+    def _refuse_divergence(self, ids: np.ndarray) -> None:
+        """Raise EpisodeError if MuJoCo warned of one of these simulations, whose state then means nothing."""
+        counts = self.sims.warning[..., 1]
+        for sim in ids[counts[ids].any(axis=1)].tolist():
+            names = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(counts[sim])]
+            raise EpisodeError(self.task.id, sim, int(self._steps[sim]), diverged(names))
 
     def _advance(self, ids: np.ndarray | None) -> None:
         self.sims.step(ids=ids, nstep=self.task.substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
@@ -271,18 +404,12 @@ class EpisodeBatch(abc.ABC):
         """Make derived fields current after a write to the state."""
         self.sims.forward(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
 
-    def physics(self) -> np.ndarray:
-        """(size, physics) float64: the states to set back into MuJoCo (`PHYSICS_SPEC`)."""
+    def physics(self):
         return self.sims.state[:, self._physics_columns].copy()
 
-    def set_physics(self, physics: np.ndarray, ids: np.ndarray | Sequence[int] | None = None) -> np.ndarray:
-        """Put simulations into stored physics states; gives all states (size, state).
-
-        Args:
-          physics: (len(ids), physics) float64.
-        """
+    def set_physics(self, physics, ids=None):
         ids = self._all if ids is None else np.asarray(ids, int)
-        self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._clear(ids)
         self.sims.state[np.ix_(ids, self._physics_columns)] = physics
         self._refresh(ids)
         return self.state()
@@ -295,8 +422,13 @@ class EpisodeBatch(abc.ABC):
         return self._columns
 
 
-def physics_columns(model: mujoco.MjModel) -> np.ndarray:
-    """Indices of the `PHYSICS_SPEC` components inside a state vector of `mjSTATE_INTEGRATION`."""
+def diverged(warnings: Sequence[str]) -> str:
+    """The reason of an `EpisodeError` for MuJoCo's warnings."""
+    return f"the simulation diverged ({', '.join(warnings)}); make its model stable, or its actions smaller"
+
+
+def physics_columns(model: mujoco.MjModel, spec: int = PHYSICS_SPEC) -> np.ndarray:
+    """Indices of the components of `spec` inside a state vector of `mjSTATE_INTEGRATION`."""
     columns: list[int] = []
     offset = 0
     for bit in range(32):
@@ -304,7 +436,7 @@ def physics_columns(model: mujoco.MjModel) -> np.ndarray:
         if not component & int(mujoco.mjtState.mjSTATE_INTEGRATION):
             continue
         size = mujoco.mj_stateSize(model, component)
-        if component & PHYSICS_SPEC:
+        if component & spec:
             columns.extend(range(offset, offset + size))
         offset += size
     return np.array(columns, int)

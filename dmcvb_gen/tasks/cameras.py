@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -9,7 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
+from mujoco.batch import MODEL_FIELDS, Batch
 
 from dmcvb_gen.tasks.base import Task, physics_columns
 
@@ -23,7 +24,7 @@ class _KeptBatch:
     """A task's simulations for kinematics: made once, as many as the largest call needs (up to `CHUNK`)."""
 
     def __init__(self, task: Task):
-        self._task, self._columns = task, physics_columns(task.model)
+        self._task, self._columns = task, physics_columns(task.model, task.physics_spec)
         self._lock = threading.Lock()  # the simulations are one caller's until it has copied its poses
         self._size = 0
         self._batch: Any = None
@@ -39,7 +40,8 @@ class _KeptBatch:
                 rows = physics[first : first + count]
                 self._batch.state[np.ix_(ids, self._columns)] = rows[:, : len(self._columns)]
                 for name, columns, values in self._task.split_entries(rows):
-                    self._entries[name].reshape(self._size, -1)[np.ix_(ids, columns)] = values
+                    if name in self._entries:
+                        self._entries[name].reshape(self._size, -1)[np.ix_(ids, columns)] = values
                 self._batch.forward(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_POS))
                 for name in fields:
                     out[name][first : first + count] = self._bound[name][:count]
@@ -48,11 +50,23 @@ class _KeptBatch:
     def _make(self, size: int, fields: Sequence[str]) -> None:
         if size > self._size or self._batch is None:
             self._size = 1 << max(size - 1, 0).bit_length()
-            self._batch, self._bound = Batch(self._task.model, self._size, nthread=1), dict.fromkeys(self._bound)
-            self._entries = {name: self._batch.expand(name) for name in self._task.model_entries}
+            self._batch, self._bound = (
+                Batch(_awake(self._task.model), self._size, nthread=1),
+                dict.fromkeys(self._bound),
+            )
+            moving = (name for name in self._task.model_entries if name in MODEL_FIELDS)  # others move nothing
+            self._entries = {name: self._batch.expand(name) for name in moving}
         for name in {*self._bound, *fields}:
             if self._bound.get(name) is None:
                 self._bound[name] = self._batch.bind(name)
+
+
+def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A model whose bodies never sleep: simulations that share memory cannot, and poses do not depend on it."""
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        model = copy.deepcopy(model)
+        model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    return model
 
 
 _kept: OrderedDict[Task, _KeptBatch] = OrderedDict()

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.tasks.base import EpisodeBatch, Task, tolerance
+from dmcvb_gen.tasks.base import PhysicsBatch, Task, tolerance
 
 EPISODE_STEPS = 500
 """Agent steps an episode: 1000 control steps at action repeat 2 (paper, section 3.1)."""
@@ -41,18 +41,18 @@ class LocomotionTask(Task):
     """A suite task of 1000 control steps that only the clock ends."""
 
     domain: str
-    batch_class: type[EpisodeBatch]
+    batch_class: type[PhysicsBatch]
     max_steps = evaluation_steps = EPISODE_STEPS
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
         return _suite_model(self.domain)
 
-    def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
+    def batch(self, size: int, threads: int = 1) -> PhysicsBatch:
         return self.batch_class(self, size, threads)
 
 
-def _randomize_joints(batch: EpisodeBatch, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+def _randomize_joints(batch: PhysicsBatch, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
     """Limited joints uniform in their range, free hinges in [-pi, pi], free bodies turned at random.
 
     The free joint's quaternion is drawn from the unit cube and normalized, as dm_control does.
@@ -76,7 +76,7 @@ WALKER_STAND_HEIGHT = 1.2  # torso height (m) above which standing is fully rewa
 WALKER_SPEED = 1.0  # horizontal speed (m/s) above which walking is fully rewarded
 
 
-class WalkerBatch(EpisodeBatch):
+class WalkerBatch(PhysicsBatch):
     def __init__(self, task, size, threads=1):
         super().__init__(task, size, threads)
         self._xmat, self._xpos = self.sims.bind("xmat"), self.sims.bind("xpos")
@@ -134,7 +134,7 @@ CHEETAH_SPEED = 10.0  # m/s, fully rewarded
 CHEETAH_SETTLING_STEPS = 200  # physics steps that let the cheetah fall before the episode starts
 
 
-class CheetahBatch(EpisodeBatch):
+class CheetahBatch(PhysicsBatch):
     def __init__(self, task, size, threads=1):
         super().__init__(task, size, threads)
         self._qpos, self._qvel = self.sims.bind("qpos"), self.sims.bind("qvel")
@@ -179,7 +179,7 @@ HUMANOID_STAND_HEIGHT = 1.4  # head height (m) above which standing is fully rew
 HUMANOID_SPEED = 1.0  # m/s, fully rewarded
 
 
-class HumanoidBatch(EpisodeBatch):
+class HumanoidBatch(PhysicsBatch):
     def __init__(self, task, size, threads=1):
         super().__init__(task, size, threads)
         bind, model = self.sims.bind, task.model

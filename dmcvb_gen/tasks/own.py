@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.own_code import TASKS, find_function
-from dmcvb_gen.tasks.suite import SuiteTask, import_suite
+from dmcvb_gen.tasks.environment import EnvironmentTask
+from dmcvb_gen.tasks.suite import import_suite
 
 
-def own_task(task_id: str) -> SuiteTask:
+def own_task(task_id: str) -> EnvironmentTask:
     """The task of a function "<module>:<function>".
 
     Raises:
@@ -21,7 +22,7 @@ def own_task(task_id: str) -> SuiteTask:
     """
     import_suite()  # before the task imports it, to hide its warnings
     make = find_function(task_id, TASKS, "task")
-    return SuiteTask(task_id, make)
+    return EnvironmentTask(task_id, make)
 
 
 def mjcf_environment(

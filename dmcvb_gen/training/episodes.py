@@ -12,7 +12,7 @@ import torch
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.task import SPAWN_NOISE
-from dmcvb_gen.tasks.base import PHYSICS_SPEC, Task
+from dmcvb_gen.tasks.base import StepResult, Task
 from dmcvb_gen.training.runs import Run
 
 HURRY = 0.1
@@ -48,7 +48,7 @@ def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndar
         mujoco.mj_resetData(task.model, data)
         data.qpos[7:] += rng.normal(0, 0.05, task.model.nq - 7)
         data.qvel[:] = rng.normal(0, 0.05, task.model.nv)
-        mujoco.mj_getState(task.model, data, row, PHYSICS_SPEC)
+        mujoco.mj_getState(task.model, data, row, task.physics_spec)
     return rows
 
 
@@ -104,13 +104,13 @@ class Episodes:
             self.batch.sink(sunken, self._rng.uniform(-SPAWN_NOISE, -SPAWN_NOISE / 2, len(sunken)))
         return self.batch.behaviour_observation()
 
-    def ending(self, terminated: np.ndarray) -> np.ndarray:
+    def ending(self, result: StepResult) -> np.ndarray:
         """(size,) bool: which episodes the task, or the limit, ends with the step just made."""
-        return terminated | (self.elapsed + 1 >= self._limit)
+        return result.terminated | result.truncated | (self.elapsed + 1 >= self._limit)
 
-    def restart_ended(self, observation: np.ndarray, terminated: np.ndarray) -> np.ndarray:
+    def restart_ended(self, observation: np.ndarray, result: StepResult) -> np.ndarray:
         """Count a step; begin anew if the task, or the limit, ended an episode."""
-        ended = np.flatnonzero(self.ending(terminated))
+        ended = np.flatnonzero(self.ending(result))
         self.elapsed += 1
         if len(ended):
             observation = self.start(ended)

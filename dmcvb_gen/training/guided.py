@@ -156,7 +156,7 @@ class GuidedRun(Run):
         while self.step < config.steps:
             result = episodes.batch.step(learner.act(observation))
             self.step += settings.simulations
-            observation = episodes.restart_ended(episodes.batch.behaviour_observation(), result.terminated)
+            observation = episodes.restart_ended(episodes.batch.behaviour_observation(), result)
             learner.learn(self.step)
             tick(settings.simulations)
             if self.step >= min(next_evaluation, config.steps):

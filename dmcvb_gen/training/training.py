@@ -157,13 +157,13 @@ class ReplayLoop:
         self.learner.norm.update(observation)
         action = self._action()
         before = batch.path_length() if settings.progress else 0.0
-        result = batch.step(action)
+        result = batch.step(self.run.task.from_unit(action))
         reward = result.reward
         if settings.progress:
             reward = reward + settings.progress * (before - batch.path_length())
         if self._shaping:
             reward = reward + settings.shaping * self._shaping(result.state)
-        reached, ended = batch.behaviour_observation(), self.episodes.ending(result.terminated)
+        reached, ended = batch.behaviour_observation(), self.episodes.ending(result)
         self.learner.returns.update(reward, ended)
         self.buffer.add(
             observation=observation,
@@ -174,7 +174,7 @@ class ReplayLoop:
             ended=ended,
         )
         self.run.step += settings.simulations
-        self.observation = self.episodes.restart_ended(reached, result.terminated)
+        self.observation = self.episodes.restart_ended(reached, result)
 
     def learn(self) -> None:
         """Make the updates that are due after the steps so far."""

@@ -24,7 +24,8 @@ def _spaces(task: Task) -> tuple[spaces.Box, spaces.Box]:
 class TaskVecEnv(VecEnv):
     """`size` episodes side by side, each restarted when it ends.
 
-    Observations are (size, behaviour_size) float32, rewards (size,) float32 summed over the control steps.
+    Observations are (size, behaviour_size) float32, actions in [-1, 1] are scaled to the task's bounds, rewards are
+    (size,) float32 summed over the control steps.
     At an episode's end `infos[i]["terminal_observation"]` is its last observation (the one returned belongs to
     the next episode), and `infos[i]["TimeLimit.truncated"]` is true if only the time limit ended it, so that
     a learner bootstraps there and nowhere else. `infos[i]["episode"]` has its return "r" and length "l".
@@ -66,11 +67,11 @@ class TaskVecEnv(VecEnv):
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        result = self.batch.step(self._actions)
+        result = self.batch.step(self.task.from_unit(self._actions))
         observation = self.batch.behaviour_observation()
         self._length += 1
         self._return += result.reward
-        truncated = (self._length >= self.task.max_steps) & ~result.terminated
+        truncated = (result.truncated | (self._length >= self.task.max_steps)) & ~result.terminated
         done = result.terminated | truncated
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(cut)} for cut in truncated]
         ended = np.flatnonzero(done)

@@ -353,3 +353,21 @@ def test_wrong_steps_are_refused_in_a_line(task):
         env.step(np.zeros(size))
     env.reset()
     assert env.step(np.zeros(size))[3]
+
+
+def test_a_vector_environment_restarts_the_places_of_its_reset_mask_alone():
+    env = data_layout(gymnasium.make_vec("dmcvb_gen/walker-walk-none-v0", num_envs=3, size=16, max_steps=3), stack=2)
+    env.reset(seed=5)
+    for _ in range(2):
+        before = env.step(np.zeros(env.action_space.shape, np.float32))[0]
+    mask = np.array([False, True, False])
+    after, _ = env.reset(seed=[1, 2, 3], options={"reset_mask": mask})
+    fresh, _ = gymnasium.make("dmcvb_gen/walker-walk-none-v0", size=16, max_steps=3).reset(seed=2)
+    for name in after:
+        np.testing.assert_array_equal(after[name][~mask], before[name][~mask])
+    np.testing.assert_array_equal(after["state"][1], fresh["state"])
+    ends = env.step(np.zeros(env.action_space.shape, np.float32))[3]
+    assert ends.tolist() == [True, False, True]
+    for wrong in (np.zeros(3, bool), np.ones(2, bool), np.ones(3, int)):
+        with pytest.raises(DmcvbError, match="reset_mask is .*; give .3,. bool"):
+            env.reset(options={"reset_mask": wrong})

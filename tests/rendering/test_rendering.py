@@ -11,8 +11,8 @@ from dmcvb_gen.rendering import available_renderers, default_renderer, make_rend
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
-from dmcvb_gen.tasks.suite import SuiteTask
 
 needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
 FRAMES = 12
@@ -201,7 +201,7 @@ PLAIN = f"""<mujoco><worldbody><camera name="top" pos=".9 .9 3"/>{WALLS}
 
 def plain_task(tmp_path, xml):
     (tmp_path / "plain.xml").write_text(xml)
-    return SuiteTask("plain-task", lambda: mjcf_environment(tmp_path / "plain.xml", lambda physics: 0.0))
+    return EnvironmentTask("plain-task", lambda: mjcf_environment(tmp_path / "plain.xml", lambda physics: 0.0))
 
 
 @needs_opengl

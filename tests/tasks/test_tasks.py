@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import copy
+import shutil
 import sys
 
 import mujoco
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from dm_control import suite
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.own_code import TASKS as ALLOWED
@@ -18,8 +22,9 @@ from dmcvb_gen.own_code import allow
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, REGISTRY, get_task, register_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
-from dmcvb_gen.tasks.suite import REFUSED, SuiteTask
-from tests.conftest import roll_out
+from dmcvb_gen.tasks.environment import EnvironmentTask
+from dmcvb_gen.tasks.suite import REFUSED
+from tests.conftest import rewrite, roll_out
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
 """Largest difference of an observation; physics states are always equal. Humanoid's limb positions are one matrix
@@ -95,41 +100,47 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind):
         if name not in LOCOMOTION_TASKS
     ],
 )
-def test_a_task_of_the_suite_agrees_with_dm_control_step_by_step(task_id):
-    task = get_task(task_id)
-    batch = task.batch(SIMULATIONS)
-    state = batch.reset([np.random.default_rng(seed) for seed in range(SIMULATIONS)])
-    names, rows = task_id.split("-", 1), batch.physics()
-    environments = [suite.load(*names, task_kwargs={"random": 0}) for _ in range(SIMULATIONS)]
-    for i, environment in enumerate(environments):
-        environment.reset()
-        physics = environment.physics
-        for name, columns, values in task.split_entries(rows):
-            getattr(physics.model.ptr, name).reshape(-1)[columns] = values[i]
-        size = mujoco.mj_stateSize(task.model, PHYSICS_SPEC)
-        mujoco.mj_setState(physics.model.ptr, physics.data.ptr, rows[i, :size], PHYSICS_SPEC)
-        physics.after_reset()
-        theirs = environment.task.get_observation(physics)
-        assert {name: np.size(part) for name, part in theirs.items()} == task.state_fields
-        np.testing.assert_allclose(state[i], np.concatenate([np.ravel(part) for part in theirs.values()]), atol=1e-6)
-    rng = np.random.default_rng(7)
-    for _ in range(15):
-        action = rng.uniform(-1, 1, (SIMULATIONS, task.action_size)).astype(np.float32)
-        result = batch.step(action)
-        for i, environment in enumerate(environments):
-            steps = [environment.step(action[i]) for _ in range(ACTION_REPEAT)]
-            theirs = np.concatenate([np.ravel(part) for part in steps[-1].observation.values()])
-            np.testing.assert_allclose(result.state[i], theirs, rtol=0, atol=1e-6)
-            assert abs(result.reward[i] - sum(step.reward for step in steps)) <= 1e-6
-    other = task.batch(SIMULATIONS)
-    known = np.ones(task.state_size, bool)
-    for name in task.unstored_fields:
-        known[task.state_slices[name]] = False
-    np.testing.assert_array_equal(other.set_physics(batch.physics())[:, known], result.state[:, known])
-    action = rng.uniform(-1, 1, action.shape)
-    one, two = batch.step(action), other.step(action)
-    np.testing.assert_array_equal(one.state, two.state)
-    np.testing.assert_array_equal(one.reward, two.reward)
+def test_a_task_of_the_suite_is_dm_controls_step_by_step(task_id):
+    task, (domain, name) = get_task(task_id), task_id.split("-", 1)
+    batch, rng = task.batch(SIMULATIONS), np.random.default_rng(7)
+    for episode in range(2):  # the second one in the same environments
+        seeds = [10 * episode + sim for sim in range(SIMULATIONS)]
+        state = batch.reset([np.random.default_rng(seed) for seed in seeds])
+        drawn = [np.random.MT19937(int(np.random.default_rng(seed).integers(2**63))) for seed in seeds]
+        environments = [suite.load(domain, name, {"random": 0}) for _ in drawn]  # from which lqr draws its model
+        for environment, bits in zip(environments, drawn, strict=True):
+            environment.task.random.set_state(np.random.RandomState(bits).get_state())
+        steps, reward = [environment.reset() for environment in environments], np.zeros(SIMULATIONS)
+        for _ in range(8):
+            for sim, environment in enumerate(environments):
+                theirs = steps[sim].observation
+                assert {key: np.size(part) for key, part in theirs.items()} == task.state_fields
+                np.testing.assert_array_equal(state[sim], np.concatenate([np.ravel(part) for part in theirs.values()]))
+                row, model = batch.physics()[sim], copy.deepcopy(task.model)
+                full = environment.physics.get_state(mujoco.mjtState.mjSTATE_INTEGRATION)
+                np.testing.assert_array_equal(row[: len(full)], full)
+                task.apply_entries(model, row)
+                for field in ("geom_pos", "geom_size", "geom_rgba", "site_pos", "body_pos", "dof_damping", "mat_rgba"):
+                    ours, wanted = getattr(model, field), getattr(environment.physics.model, field)
+                    np.testing.assert_array_equal(ours, wanted)
+            action = task.from_unit(rng.uniform(-1, 1, (SIMULATIONS, task.action_size)).astype(np.float32))
+            for sim, environment in enumerate(environments):
+                spec = environment.action_spec()
+                assert (spec.minimum <= action[sim]).all() and (action[sim] <= spec.maximum).all()
+                pair = [environment.step(action[sim].astype(float)) for _ in range(ACTION_REPEAT)]
+                steps[sim], reward[sim] = pair[-1], pair[0].reward + pair[1].reward
+            result = batch.step(action)
+            state = result.state
+            np.testing.assert_array_equal(result.reward, reward)
+
+
+def test_actions_reach_the_bounds_of_quadruped_and_no_further():
+    task = get_task("quadruped-walk")
+    low, high = (task.from_unit(np.full((1, task.action_size), value, np.float32))[0] for value in (-1, 1))
+    spec = suite.load("quadruped", "walk").action_spec()
+    np.testing.assert_allclose([low, high], [spec.minimum, spec.maximum], rtol=1e-6)
+    assert (low >= spec.minimum).all() and (high <= spec.maximum).all() and high.max() > 1
+    np.testing.assert_allclose(task.to_unit(task.from_unit(np.full((1, 12), 0.25, np.float32))), 0.25, atol=1e-6)
 
 
 def test_episodes_of_a_suite_task_depend_on_their_own_streams_alone():
@@ -144,7 +155,8 @@ def test_episodes_of_a_suite_task_depend_on_their_own_streams_alone():
         return batch.physics()
 
     np.testing.assert_array_equal(run([0, 1, 2], 2)[:1], run([0], 1))
-    assert len(np.unique(run([0, 1, 2], 1)[:, -1])) == 3  # each has its own target
+    targets = [values for name, _, values in task.split_entries(run([0, 1, 2], 1)) if name == "geom_pos"]
+    assert len(np.unique(targets[0], axis=0)) == 3  # each has its own
 
 
 def test_the_suite_is_known_without_importing_it():
@@ -166,145 +178,56 @@ def ten_lines(tmp_path, monkeypatch, code):
     monkeypatch.delenv(ALLOWED, raising=False)
 
 
-ARM = """<mujoco><worldbody><light pos="0 0 3"/><camera name="side" pos="0 -2 1"/>
-<body pos="0 0 .8"><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body>
-</worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
-GROWING = (
-    """
-from dm_control import suite
-def reach():
-    environment = suite.load("reacher", "easy")
-    environment.task.get_observation = lambda physics: {"contacts": physics.data.qpos[: 1 + (physics.time() > 0.03)]}
-    return environment
-def number():
-    return 7
-def broken():
-    return 1 / 0
-def strong():
-    return mjcf_environment(ARM.replace("-1 1", "-5 5"))
-def odd():
-    environment = mjcf_environment(ARM)
-    environment.task.before_step = lambda action, physics: physics.set_control(2 * action - 1)
-    return environment
-def blind():
-    return mjcf_environment(ARM.replace('<camera name="side" pos="0 -2 1"/>', ""))
-ARM = """
-    + repr(ARM)
-    + """
-def mjcf_environment(xml):
-    import tempfile
-    from dmcvb_gen.tasks import own
-    with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
-        file.write(xml)
-        file.flush()
-        return own.mjcf_environment(file.name, lambda physics: 0.0)
-"""
-)
+OWN = """
+from dmcvb_gen.tasks.own import mjcf_environment
+from tests.tasks.hostile_tasks import ARM, ended_by_python as ends
 
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("reach", "observes 'contacts' in different shapes"),
-        ("number", "gives a int; give a function that returns"),
-        ("broken", "cannot start task arm_tasks:broken .division by zero"),
-        ("missing", "cannot find task arm_tasks:missing"),
-        ("strong", "takes actions from -5 to 5; actions here are from -1 to 1"),
-        ("odd", "changes actions in before_step"),
-        ("blind", "has no camera to look through"),
-    ],
-)
-def test_a_task_of_ones_own_that_cannot_be_used_is_refused(tmp_path, monkeypatch, name, message):
-    ten_lines(tmp_path, monkeypatch, GROWING)
-    with pytest.raises(DmcvbError, match="set DMCVB_GEN_TASKS"):
-        get_task(f"arm_tasks:{name}")
-    allow([f"arm_tasks:{name}"])
-    with pytest.raises(DmcvbError, match=message):
-        get_task(f"arm_tasks:{name}")
-
-
-FAILING = (
-    "ARM = "
-    + repr(ARM)
-    + """
-from dmcvb_gen.tasks import own
-def made(reward, observe=None):
+def from_file():
     with open("arm.xml", "w") as file:
         file.write(ARM)
-    return own.mjcf_environment("arm.xml", reward, observe)
-def late(physics):
-    if physics.time() > 0.03:
-        raise ValueError("no", "two")
-    return {"position": physics.data.qpos.copy()}
-def reward_of_a_dictionary(physics):
-    raise KeyError("left")
-def breaks():
-    return made(reward_of_a_dictionary)
-def blinks():
-    return made(lambda physics: 0.0, late)
-def nothing():
-    return made(lambda physics: None)
-def nan():
-    return made(lambda physics: float("nan") if physics.time() > 0.03 else 1.0)
-def infinite():
-    return made(lambda physics: float("inf"))
+    return mjcf_environment("arm.xml", lambda physics: 1.0, initialize=start, time_limit=0.1)
+
+def start(physics, random):
+    physics.data.qpos[:] = random.uniform(-1, 1, 2)
 """
-)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("breaks", r"failed \(KeyError: 'left'\)"),
-        ("blinks", r"failed \(ValueError: \('no', 'two'\)\)"),
-        ("nothing", r"failed \(TypeError: .*None.*\)"),
-        ("nan", "gave the reward nan; its reward must be a finite number"),
-        ("infinite", "gave the reward inf; its reward must be a finite number"),
-    ],
-)
-def test_a_task_of_ones_own_that_fails_in_an_episode_is_told_in_one_line(tmp_path, monkeypatch, name, message):
-    ten_lines(tmp_path, monkeypatch, FAILING)
-    monkeypatch.setenv(ALLOWED, f"other:task, arm_tasks:{name} ,")  # as people write lists
-    task = get_task(f"arm_tasks:{name}")
-    batch = task.batch(2)
-    batch.reset([np.random.default_rng(seed) for seed in range(2)])
-    with pytest.raises(DmcvbError, match=f"^task arm_tasks:{name} {message}$"):
-        for _ in range(40):
-            batch.step(np.zeros((2, 1)))
+def test_the_code_of_a_task_of_ones_own_runs_only_if_a_person_named_it(tmp_path, monkeypatch):
+    ten_lines(tmp_path, monkeypatch, OWN)
+    with pytest.raises(DmcvbError, match="set DMCVB_GEN_TASKS"):
+        get_task("arm_tasks:from_file")
+    allow(["arm_tasks:missing"])
+    with pytest.raises(DmcvbError, match="cannot find task arm_tasks:missing"):
+        get_task("arm_tasks:missing")
+    monkeypatch.setenv(ALLOWED, "other:task, arm_tasks:from_file ,")  # as people write lists
+    task = get_task("arm_tasks:from_file")
+    starts = task.batch(2).reset([np.random.default_rng(seed) for seed in range(2)])
+    assert task.max_steps == 5 and (starts[0] != starts[1]).any()
 
 
-GOAL = (
-    "ARM = "
-    + repr(ARM.replace('pos="0 -2 1"', 'pos="0 -2 1" xyaxes="1 0 0 0 .4 1"'))
-    + """
-from dm_control.rl import control
-from dm_control.suite import base
-from dm_control import mujoco
-class Reach(base.Task):
-    def initialize_episode(self, physics):
-        self._goal = self.random.uniform(-1, 1)
-    def get_observation(self, physics):
-        return {"position": physics.data.qpos.copy(), "goal": [self._goal]}
-    def get_reward(self, physics):
-        return -abs(physics.data.qpos[0] - self._goal)
-def reach():
-    return control.Environment(mujoco.Physics.from_xml_string(ARM), Reach(), time_limit=0.4)
-"""
-)
-
-
-def test_what_a_task_keeps_in_python_alone_is_not_taken_for_damage(tmp_path, monkeypatch):
-    ten_lines(tmp_path, monkeypatch, GOAL)
-    monkeypatch.setenv(ALLOWED, "arm_tasks:reach")
-    assert get_task("arm_tasks:reach").unstored_fields == ("goal",)
-    assert get_task("reacher-easy").unstored_fields == ()  # its target lies in the model
-    pattern = {"tasks": "arm_tasks:reach", "levels": "random", "settings": "none", "episodes": 2}
+def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_without_its_code(tmp_path, monkeypatch):
+    ten_lines(tmp_path, monkeypatch, OWN)
+    monkeypatch.setenv(ALLOWED, "arm_tasks:ends")
+    pattern = {"tasks": "arm_tasks:ends", "levels": "random", "settings": "none", "episodes": 2}
     roll_out(make_recipe({"name": "r", "size": 16, "subsets": [pattern]}), tmp_path / "r")
     assert verify(tmp_path / "r").sound
 
+    name = "arm_tasks-ends/random/none"
+    shutil.copytree(tmp_path / "r", tmp_path / "wrong")
+    rewrite(tmp_path / "wrong", name, lambda group: group["reward"].__setitem__((1, 3), 0.25))
+    assert {(found.check, found.episode, found.step) for found in verify(tmp_path / "wrong").findings} >= {
+        ("rewards", 1, 3)
+    }
+
+    monkeypatch.delenv(ALLOWED)
+    get_task.cache_clear()
+    found = verify(tmp_path / "r")
+    assert found.sound and not found.complete and "set DMCVB_GEN_TASKS=arm_tasks:ends" in str(found.unchecked[0])
+    assert CliRunner().invoke(main, ["verify", str(tmp_path / "r")]).exit_code == 3
+
 
 def test_a_third_party_registers_a_task():
-    register_task("cartpole-mine", lambda: SuiteTask("cartpole-mine", lambda: suite.load("cartpole", "balance")))
+    register_task("cartpole-mine", lambda: EnvironmentTask("cartpole-mine", lambda: suite.load("cartpole", "balance")))
     try:
         assert get_task("cartpole-mine").state_size == 5
         with pytest.raises(DmcvbError, match="there is a task 'cartpole-mine' already"):

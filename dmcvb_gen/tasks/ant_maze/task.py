@@ -27,7 +27,7 @@ from dmcvb_gen.tasks.ant_maze.arena import (
 )
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
-from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, Task
+from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, PhysicsBatch, Task
 
 EPISODE_STEPS, EVALUATION_STEPS = 600, 1000
 """Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
@@ -81,7 +81,7 @@ What is left out follows from the joints, or is noise (the accelerometer).
 """
 
 
-class AntMazeBatch(EpisodeBatch):
+class AntMazeBatch(PhysicsBatch):
     task: AntMaze
 
     def __init__(self, task: AntMaze, size: int, threads: int = 1):
@@ -135,7 +135,7 @@ class AntMazeBatch(EpisodeBatch):
           LayoutError: a start or a goal in a wall.
         """
         ids, layout = self._all if ids is None else np.asarray(ids, int), self.task.layout
-        self.sims.reset(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._clear(ids)
         for sim, rng, (start, goal) in zip(ids, generators, pairs, strict=True):
             layout.check_cell(start, "start")
             layout.check_cell(goal, "goal")

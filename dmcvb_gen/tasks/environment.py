@@ -1,0 +1,493 @@
+"""Any dm_control task as one of ours: every episode is stepped by a dm_control `Environment`, reset for it alone.
+
+Whatever dm_control does is what is stored: writes into the simulation, changes of the model, its own way of ending an
+episode. Only the random numbers are ours, see `randomness`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+import pickle
+import weakref
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, EpisodeError, StepResult, Task, diverged, field_owner
+from dmcvb_gen.tasks.randomness import held_states, seed_task, seeded, watched
+
+DEFAULT_STEPS = 500
+"""Agent steps an episode if dm_control gives no time limit."""
+PROBE_STEPS = 10
+"""Agent steps of the episodes that the start's check compares."""
+PROBE_SEEDS = (0, 1)
+"""Seeds of these episodes."""
+MAX_ENTRIES = 10_000
+"""Values of the model that may change in an episode, at most: each row of `physics` holds them."""
+ASSETS = ("mesh_", "oct_", "skin_", "tex_")
+"""Beginnings of the names of large fields of a model, which only the start's check compares."""
+BAD_STATES = tuple(int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL"))
+"""Warnings after which MuJoCo has reset a simulation; a task cannot hide them."""
+
+
+class EnvironmentTask(Task):
+    """A task made from a dm_control `Environment` (`dm_control.rl.control`).
+
+    Each row of `physics` holds the whole state of the simulation and those fields of the model that episodes change.
+
+    Args:
+      id: the task's name.
+      make: makes an environment; called again for every episode, unless an environment keeps nothing of an episode.
+      domain: dm_control's domain, for its own suite; decides the floor's opacity under distractors.
+
+    Raises:
+      DmcvbError: the environment is none of dm_control's, gives another episode for the same seed, or has what cannot
+        be stored.
+    """
+
+    physics_spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    replayed = True
+
+    def __init__(self, id: str, make: Callable[[], Any], domain: str = ""):
+        self.id, self._make, self._idle = id, make, list[Any]()
+        self.floor_alpha = {"walker": 1.0, "cheetah": 1.0, "reacher": 0.0}.get(domain, 0.3)
+        self.trusted = self.reusable = bool(domain)  # the tests compare the suite's tasks with dm_control
+        self.state_fields, self.model_entries = {}, {}
+        self._fixed: dict[str, np.ndarray] = {}
+        with self._starting():
+            environment = self.make_environment(PROBE_SEEDS[0])
+            _check_environment(id, environment)
+            self._low, self._high = _bounds(id, environment)
+            limit = environment._step_limit / ACTION_REPEAT
+            self.substeps, self._control_timestep = environment._n_sub_steps, environment.control_timestep()
+        self.max_steps = math.ceil(limit - 1e-6) if math.isfinite(limit) else DEFAULT_STEPS
+        self.evaluation_steps = self.max_steps
+        self.return_range = (-math.inf, math.inf) if domain in ("", "lqr") else (0.0, 2.0 * self.max_steps)
+        self._examine(environment)
+
+    @contextlib.contextmanager
+    def _starting(self) -> Iterator[None]:
+        """An exception of the user's own code becomes one line."""
+        try:
+            yield
+        except DmcvbError:
+            raise
+        except Exception as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise DmcvbError(
+                f"cannot start task {self.id} ({reason}); make its environment run in dm_control first"
+            ) from error
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self._model
+
+    @property
+    def action_size(self) -> int:
+        return len(self._low)
+
+    @property
+    def action_low(self) -> np.ndarray:
+        return self._low
+
+    @property
+    def action_high(self) -> np.ndarray:
+        return self._high
+
+    @property
+    def array_attributes(self) -> dict[str, dict[str, Any]]:
+        """The actions' bounds, and where a row of `physics` holds the simulation's state and the model's fields."""
+        place = mujoco.mj_stateSize(self._model, self.physics_spec)
+        fields = {"state": [0, place]}
+        for name, columns in self.model_entries.items():
+            fields[f"model.{name}"] = [place, place + len(columns)]
+            place += len(columns)
+        bounds = {"low": self._low.tolist(), "high": self._high.tolist()}
+        return {"action": bounds, "physics": {"fields": fields, "mjtState": self.physics_spec}}
+
+    @property
+    def control_timestep(self) -> float:
+        return self._control_timestep
+
+    def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
+        return EnvironmentBatch(self, size)
+
+    def make_environment(self, seed: int) -> Any:
+        """A new environment; what it draws while it is made follows from `seed`."""
+        with seeded(seed):
+            return self._make()
+
+    def take_environment(self, seed: int) -> Any:
+        """An environment for an episode: a new one, or an idle one if nothing of its last episode is left in it."""
+        return self._idle.pop() if self._idle else self.make_environment(seed)
+
+    def error(self, reason: str) -> DmcvbError:
+        return DmcvbError(f"task {self.id} {reason}")
+
+    def give_back(self, environments: list[Any]) -> None:
+        """Take environments whose episodes are over."""
+        if self.reusable:
+            self._idle += environments
+
+    # -- the check at the start -------------------------------------------------------------------
+
+    def _examine(self, environment: Any) -> None:
+        """Learn the state's fields and the model's changes from short episodes; compare those of a user's own task.
+
+        Args:
+          environment: a new one, made with the first seed.
+        """
+        first, second = PROBE_SEEDS
+        probes = [_Probe(self, environment, first)]
+        self._model = copy.deepcopy(environment.physics.model._model)
+        if not self._model.ncam:
+            raise DmcvbError(f"{self.id} has no camera to look through; add a <camera> to its model")
+        if self.trusted:
+            probes += [_Probe(self, environment, seed) for seed in (second, first)]
+        else:
+            with self._starting():
+                probes += [_Probe(self, self.make_environment(seed), seed) for seed in (second, second, first)]
+            self._check_probes(probes)
+        start, assets = probes[0].models[0], probes[0].assets
+        changed = {name for probe in probes for name in probe.changed(start)}
+        self._fixed = {name: value for name, value in start.items() if not self.trusted and name not in changed}
+        self.model_entries = {name: np.arange(start[name].size) for name in sorted(changed)}
+        repainted = {name for probe in probes for name in assets if probe.assets.get(name) != assets[name]}
+        large = {name for name in changed if start[name].size > MAX_ENTRIES}
+        resized = {name for probe in probes for name in changed if probe.models[0][name].shape != start[name].shape}
+        for name in sorted(repainted | large | resized):
+            raise DmcvbError(
+                f"{self.id} changes {name} of the model in its episodes, which cannot be stored; leave it as it is, or "
+                "make a task for each"
+            )
+        self.give_back([environment])
+
+    def _check_probes(self, probes: Sequence[_Probe]) -> None:
+        """Refuse a task whose episodes do not follow from their seeds; look whether environments can be reused."""
+        one, two, two_again, one_again = probes
+        if set(one.held) & set(two.held):
+            raise DmcvbError(
+                f"{self.id} holds a random generator with a fixed seed, which begins every episode alike; draw from "
+                "self.random"
+            )
+        for before, after in ((one, one_again), (two, two_again)):
+            if reason := before.differs(after):
+                raise DmcvbError(
+                    f"{self.id} gives another {reason} for the same seed; draw every random number from self.random, "
+                    "and keep nothing outside of the environment"
+                )
+        first, second = PROBE_SEEDS
+        pairs = [(two, _Probe(self, one.environment, second)), (one, _Probe(self, one.environment, first))]
+        self.reusable = all(new.kept and new.kept == used.kept and not new.differs(used) for new, used in pairs)
+
+    def changed_field(self, model: mujoco.MjModel) -> str | None:
+        """The field of an episode's model that no short episode of the start's check changed; None if there is none."""
+        for name, value in self._fixed.items():
+            owner, field = field_owner(model, name)
+            if not same(np.ravel(getattr(owner, field)), value):
+                return name
+        return None
+
+
+def model_values(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """All numbers of a model but its assets, flat, by name: "geom_size", "opt.gravity", "vis.headlight.ambient"."""
+    found = {name: value for name, value in _arrays(model).items() if not name.startswith(ASSETS)}
+    owners = [("opt.", model.opt), ("stat.", model.stat)]
+    owners += [(f"vis.{part}.", getattr(model.vis, part)) for part in dir(model.vis) if not part.startswith("_")]
+    for prefix, owner in owners:
+        values = {name: getattr(owner, name) for name in dir(owner) if not name.startswith("_")}
+        found |= {prefix + name: np.ravel(value).copy() for name, value in values.items() if not callable(value)}
+    return found
+
+
+def _arrays(model: mujoco.MjModel, beginnings: tuple[str, ...] = ("",)) -> dict[str, np.ndarray]:
+    """Copies of a model's arrays, flat, by name."""
+    names = [name for name in dir(model) if name.startswith(beginnings) and not name.startswith("_")]
+    values = {name: getattr(model, name) for name in names}
+    return {name: np.ravel(value).copy() for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+class _Probe:
+    """An episode of a few steps, for the check at the start.
+
+    Attributes:
+      models: the model's values after the start and after each step.
+      held: states of the generators that the task held before the start.
+      kept: all that the environment keeps in Python at the end; empty if that cannot be told.
+      assets: digest of the model's textures, meshes and the like at the end.
+    """
+
+    def __init__(self, task: EnvironmentTask, environment: Any, seed: int):
+        self.environment, self.held = environment, held_states(environment.task)
+        episode, rng = _Episode(task, environment), np.random.default_rng(seed)
+        episode.reset(seed)
+        self.models, self._rows = [model_values(episode.model)], [np.append(episode.full_state(), episode.state)]
+        for _ in range(PROBE_STEPS):
+            with watched(task.error):
+                numbers = episode.step(rng.uniform(task.action_low, task.action_high))
+            self._rows.append(np.concatenate([episode.full_state(), episode.state, numbers]))
+            self.models.append(model_values(episode.model))
+            if episode.over:
+                break
+        self.kept = self._python_of(environment)
+        self.assets = {name: zlib.crc32(value.data) for name, value in _arrays(episode.model, ASSETS).items()}
+
+    @staticmethod
+    def _python_of(environment: Any) -> bytes:
+        parts = {name: value for name, value in vars(environment).items() if name != "_physics"}
+        try:
+            return pickle.dumps(parts)  # compared, and never read
+        except Exception:  # of a user's own code; what cannot be written is not known
+            return b""
+
+    def changed(self, start: Mapping[str, np.ndarray]) -> set[str]:
+        """Names of the model's fields that are ever other than in `start`."""
+        return {name for model in self.models for name in start if not same(model[name], start[name])}
+
+    def differs(self, other: _Probe) -> str | None:
+        """What is not the same in another run of the same episode; None if all is."""
+        rows = zip(self._rows, other._rows, strict=False)
+        if len(self._rows) != len(other._rows) or not all(same(one, two) for one, two in rows):
+            return "episode"
+        names = (
+            name
+            for one, two in zip(self.models, other.models, strict=True)
+            for name in one
+            if not same(one[name], two[name])
+        )
+        name = next(names, None)
+        return name and f"{name} of the model"
+
+
+def same(one: np.ndarray, two: np.ndarray) -> bool:
+    """Return True if two arrays have the same shape and the same values."""
+    return one.shape == two.shape and bool(((one == two) | (one != one) & (two != two)).all())
+
+
+def _check_environment(id: str, environment: Any) -> None:
+    from dm_control import mujoco as dm_mujoco
+    from dm_control.rl import control
+
+    if not isinstance(environment, control.Environment):
+        raise DmcvbError(
+            f"{id} gives a {type(environment).__name__}; give a function that returns a "
+            "dm_control.rl.control.Environment"
+        )
+    if not isinstance(environment.physics, dm_mujoco.Physics):
+        raise DmcvbError(f"{id} has a {type(environment.physics).__name__}; give it a dm_control.mujoco.Physics")
+
+
+def _bounds(id: str, environment: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest actions, (action,) float32; [-1, 1] where there are none."""
+    spec = environment.action_spec()
+    shape, dtype = getattr(spec, "shape", None), getattr(spec, "dtype", None)
+    if shape is None or len(shape) != 1 or not shape[0] or np.dtype(dtype).kind != "f":
+        given = f"{dtype} of shape {shape}" if shape is not None else f"a {type(spec).__name__}"
+        raise DmcvbError(f"{id} takes {given} as actions; give it actuators, and one row of numbers that drives them")
+    low, high = (
+        np.broadcast_to(np.asarray(getattr(spec, name, default), float), shape)
+        for name, default in (("minimum", -np.inf), ("maximum", np.inf))
+    )
+    lowest, highest = low <= -mujoco.mjMAXVAL, high >= mujoco.mjMAXVAL  # none, that is
+    low = np.where(lowest, np.minimum(-1, np.where(highest, -1, high - 2)), low)
+    high = np.where(highest, np.maximum(1, low + 2), high)
+    if not (low < high).all():
+        raise DmcvbError(f"{id} takes actions from {low} to {high}; the first must be less than the second")
+    inner = [bound.astype(np.float32) for bound in (low, high)]  # rounded towards each other
+    inner[0] = np.where(inner[0] < low, np.nextafter(inner[0], np.float32(np.inf)), inner[0])
+    inner[1] = np.where(inner[1] > high, np.nextafter(inner[1], np.float32(-np.inf)), inner[1])
+    return inner[0], inner[1]
+
+
+class _Episode:
+    """One episode in one environment: what dm_control gives, checked, as numbers.
+
+    Attributes:
+      state: (state,) float64, the last observation.
+      terminated, truncated: how it ended; both false while it runs.
+    """
+
+    def __init__(self, task: EnvironmentTask, environment: Any, place: int = 0):
+        self.task, self.environment, self.place = task, environment, place
+        self.steps, self.terminated, self.truncated = 0, False, False
+        self.state = np.zeros(0)
+
+    @property
+    def over(self) -> bool:
+        return self.terminated or self.truncated
+
+    def reset(self, seed: int) -> None:
+        """Begin."""
+        with self._told(), seeded(seed):
+            seed_task(self.environment.task, seed)
+            self._observe(self.environment.reset().observation)
+        self._warned = self._warnings()
+        self.check_model()
+
+    def step(self, action: np.ndarray) -> tuple[float, float]:
+        """Reward and discount of an agent step."""
+        total, discount = 0.0, 1.0
+        with self._told():
+            for _ in range(ACTION_REPEAT):
+                found = self.environment.step(action.copy())
+                if found.first():
+                    raise self.error("it began another episode within a step; end an episode with a last TimeStep")
+                total += float(found.reward)  # numpy would make NaN of None
+                discount *= float(found.discount)
+                if found.last():
+                    self.terminated, self.truncated = found.discount == 0, found.discount != 0
+                    self.check_model()
+                    break
+            self._observe(found.observation)
+        if not math.isfinite(total):
+            raise self.error(f"it gave the reward {total}; its reward must be a finite number")
+        if (risen := self._warnings() > self._warned).any():  # a task may have hidden them
+            raise self.error(diverged([mujoco.mjtWarning(kind).name for kind in np.array(BAD_STATES)[risen]]))
+        self.steps += 1
+        return total, discount
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The episode's model as it is now."""
+        return self.environment.physics.model._model
+
+    def full_state(self) -> np.ndarray:
+        """All that MuJoCo needs to go on from here."""
+        return self.environment.physics.get_state(self.task.physics_spec)
+
+    def row(self) -> np.ndarray:
+        """(physics,) float64: the simulation's state, then the model's entries."""
+        owners = (field_owner(self.model, name) for name in self.task.model_entries)
+        return np.concatenate([self.full_state(), *(np.ravel(getattr(owner, name)) for owner, name in owners)])
+
+    def put(self, row: np.ndarray) -> None:
+        """Put the simulation into a stored row; what the task keeps in Python stays as it is."""
+        physics, spec = self.environment.physics, self.task.physics_spec
+        with self._told():
+            self.task.apply_entries(self.model, row)
+            physics.reset()
+            physics.set_state(row[: mujoco.mj_stateSize(self.task.model, spec)], spec)
+            physics.after_reset()
+            self._observe(self.environment.task.get_observation(physics))
+
+    def error(self, reason: str) -> EpisodeError:
+        return EpisodeError(self.task.id, self.place, self.steps, reason)
+
+    def check_model(self) -> None:
+        """Raise EpisodeError if the episode changed the model where the episodes of the start's check did not."""
+        if name := self.task.changed_field(self.model):
+            raise self.error(
+                f"it changed {name} of the model, which its first episodes left as it was; change it in every episode"
+            )
+
+    def _warnings(self) -> np.ndarray:
+        return self.environment.physics.data.warning.number[list(BAD_STATES)]
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """An exception of the task's own code, or of dm_control, becomes one line that says where it happened."""
+        from dm_control.rl.control import PhysicsError
+
+        try:
+            yield
+        except DmcvbError:
+            raise
+        except PhysicsError as error:
+            raise self.error(diverged([str(error).rpartition(": ")[2]])) from error
+        except Exception as error:
+            reason = (str(error).splitlines() or [""])[0]
+            raise self.error(f"it failed ({type(error).__name__}: {reason})") from error
+
+    def _observe(self, observation: Any) -> None:
+        """Take an observation.
+
+        Raises:
+          EpisodeError: it is no dictionary of finite numbers with the names and sizes of the first one.
+        """
+        if not isinstance(observation, Mapping) or not observation:
+            raise self.error(f"it observes a {type(observation).__name__}; get_observation must give a dictionary")
+        parts, fields = [np.ravel(value) for value in observation.values()], self.task.state_fields
+        for name, part in zip(observation, parts, strict=True):
+            if part.dtype.kind not in "biuf":
+                raise self.error(f"it observes {name!r} as {part.dtype}; give numbers")
+        if not fields:
+            self.task.state_fields = fields = dict(zip(observation, map(len, parts), strict=True))
+        sizes = dict(zip(observation, map(len, parts), strict=True))
+        if sizes != fields or list(sizes) != list(fields):
+            name = next((name for name in fields if sizes.get(name) != fields[name]), next(iter(sizes)))
+            raise self.error(
+                f"it observes {name!r} in different sizes ({fields.get(name)} and {sizes.get(name)}); fix it"
+            )
+        self.state = np.concatenate(parts, dtype=np.float64)
+        if not np.isfinite(self.state).all():
+            name = next(name for name, part in zip(observation, parts, strict=True) if not np.isfinite(part).all())
+            raise self.error(f"it observes {name!r} with values that are no finite numbers; give finite ones")
+
+
+class EnvironmentBatch(EpisodeBatch):
+    """Episodes of an `EnvironmentTask`, one environment each."""
+
+    task: EnvironmentTask
+
+    def __init__(self, task: EnvironmentTask, size: int):
+        super().__init__(task, size)
+        self._episodes: list[_Episode | None] = [None] * size
+        self._in_use: list[Any] = []
+        weakref.finalize(self, EnvironmentTask.give_back, task, self._in_use)
+
+    def _start(self, ids, generators):
+        for sim, generator in zip(ids.tolist(), generators, strict=True):
+            self._begin(sim, int(generator.integers(2**63)))
+
+    def _begin(self, sim: int, seed: int) -> _Episode:
+        """A new episode in a place; its predecessor's environment is used again if that is the same as a new one."""
+        before = self._episodes[sim]
+        if before is not None:
+            before.check_model()
+            if not self.task.reusable:
+                self._in_use.remove(before.environment)
+        if before is None or not self.task.reusable:
+            environment = self.task.take_environment(seed)
+            self._in_use.append(environment)
+        else:
+            environment = before.environment
+        episode = self._episodes[sim] = _Episode(self.task, environment, sim)
+        episode.reset(seed)
+        return episode
+
+    def _running(self, sim: int) -> _Episode:
+        """The episode of a place; a place that was never reset gets one."""
+        return self._episodes[sim] or self._begin(sim, 0)
+
+    def state(self):
+        return np.array([self._running(sim).state for sim in range(self.size)], float)
+
+    def physics(self):
+        return np.array([self._running(sim).row() for sim in range(self.size)])
+
+    def set_physics(self, physics, ids=None):
+        """See `EpisodeBatch`; what a task keeps in Python stays as it is, so it may go on in another way."""
+        ids = self._all if ids is None else np.asarray(ids, int)
+        for sim, row in zip(ids.tolist(), np.asarray(physics, np.float64), strict=True):
+            self._running(sim).put(row)
+        return self.state()
+
+    def step(self, actions, active=None):
+        actions = self._check_actions(actions)
+        reward, discount = np.zeros(self.size), np.ones(self.size)
+        moving = self._all if active is None else np.flatnonzero(active)
+        episodes = [episode for sim in moving.tolist() if not (episode := self._running(sim)).over]
+        watch = contextlib.nullcontext() if self.task.trusted else watched(self.task.error)
+        terminated, truncated = np.zeros(self.size, bool), np.zeros(self.size, bool)
+        with watch:
+            for episode in episodes:
+                sim = episode.place
+                reward[sim], discount[sim] = episode.step(actions[sim])
+                terminated[sim], truncated[sim] = episode.terminated, episode.truncated
+        return StepResult(self.state(), reward, terminated, truncated, discount)

@@ -1,0 +1,508 @@
+"""Tasks of a user's own that do what is easily lost or cannot be repeated; each function gives an environment."""
+
+from __future__ import annotations
+
+import random
+import time
+
+import numpy as np
+from dm_control import mujoco
+from dm_control.rl import control
+from dm_control.suite import base
+from dm_env import specs
+
+ARM = """<mujoco><option timestep="0.01"/>
+<asset><texture type="skybox" builtin="flat" width="8" height="8" rgb1=".5 .2 .1"/>
+<material name="m" rgba="1 0 0 1"/></asset>
+<worldbody><light pos="0 0 3"/><camera name="side" pos="0 -2 1" xyaxes="1 0 0 0 .4 1"/>
+<body name="hand" mocap="true" pos=".6 0 .9"><geom type="sphere" size=".05" rgba="0 1 0 1"/></body>
+<body name="arm" pos="0 0 .8"><joint name="hinge" axis="0 1 0" damping=".1"/>
+<geom name="rod" type="capsule" size=".05" fromto="0 0 0 .5 0 0" material="m"/>
+<body pos=".5 0 0"><joint name="wrist" axis="0 1 0"/><geom type="capsule" size=".04" fromto="0 0 0 .3 0 0"/></body>
+</body></worldbody>
+<actuator><motor name="first" joint="hinge" ctrlrange="-1 1"/><motor joint="wrist" ctrlrange="-1 1"/></actuator>
+<sensor><actuatorfrc actuator="first"/></sensor></mujoco>"""
+TRIPLE = [[1.0, 0.0], [0.0, 1.0], [0.5, -0.5]]
+EPISODES = {"begun": 0}
+MODULE_GENERATOR = np.random.default_rng(7)
+
+
+class Arm(base.Task):
+    """Starts at random, earns the height of the hand; what is hostile is added by subclasses."""
+
+    def initialize_episode(self, physics):
+        physics.data.qpos[:] = self.random.uniform(-1, 1, 2)
+        self.start(physics)
+        super().initialize_episode(physics)
+
+    def start(self, physics):
+        pass
+
+    def get_observation(self, physics):
+        return {"position": physics.data.qpos.copy(), "velocity": physics.data.qvel.copy()}
+
+    def get_reward(self, physics):
+        return float(physics.data.xpos[-1, 2])
+
+
+def arm(task=None, xml=ARM, kind=control.Environment, **options):
+    options = {"time_limit": 0.5, "control_timestep": 0.02} | options
+    return kind(mujoco.Physics.from_xml_string(xml), task or Arm(), **options)
+
+
+# -- what is stored as dm_control does it -----------------------------------------------------------
+
+
+def plain():
+    return arm()
+
+
+def pushed_in_each_step():
+    class Task(Arm):
+        def before_step(self, action, physics):
+            physics.data.xfrc_applied[-1, 0] = 3 * np.sin(9 * physics.time())
+            super().before_step(action, physics)
+
+    return arm(Task())
+
+
+def pushed_from_the_start():
+    class Task(Arm):
+        def start(self, physics):
+            physics.data.qfrc_applied[:] = self.random.uniform(-1, 1, 2)
+
+    return arm(Task())
+
+
+def moves_its_hand_before_a_step():
+    class Task(Arm):
+        def before_step(self, action, physics):
+            physics.data.mocap_pos[0, 2] += 0.01
+            super().before_step(action, physics)
+
+    return arm(Task())
+
+
+def moves_its_hand_after_a_step():
+    class Task(Arm):
+        def after_step(self, physics):
+            physics.data.mocap_pos[0, 0] -= 0.02 + 0.1 * physics.data.qpos[0]
+
+    return arm(Task())
+
+
+def damping_drifts():
+    class Task(Arm):
+        def start(self, physics):
+            physics.model.dof_damping[:] *= self.random.uniform(0.5, 2.0)
+
+    return arm(Task())
+
+
+def drawn_looks():
+    class Task(Arm):
+        def start(self, physics):
+            physics.model.geom_size[1, 0] = self.random.uniform(0.02, 0.1)
+            physics.model.geom_rgba[0, :3] = self.random.uniform(0, 1, 3)
+            physics.model.mat_rgba[0, :3] = self.random.uniform(0, 1, 3)
+
+    return arm(Task())
+
+
+def changing_looks():
+    class Task(Arm):
+        def after_step(self, physics):
+            physics.model.geom_rgba[0, 0] = physics.time() % 1
+
+    return arm(Task())
+
+
+def drawn_gravity():
+    class Task(Arm):
+        def start(self, physics):
+            physics.model.opt.gravity[:] = [self.random.uniform(-1, 1), 0, -5]
+
+    return arm(Task())
+
+
+def own_step_and_reset():
+    class Environment(control.Environment):
+        def reset(self):
+            first = super().reset()
+            self.physics.data.qvel[0] = 1.0
+            return first._replace(observation={"seen": self.physics.data.qvel.copy()})
+
+        def step(self, action):
+            found = super().step(0.5 * np.asarray(action))
+            return found._replace(reward=(found.reward or 0) + 10, observation={"seen": self.physics.data.qpos.copy()})
+
+    return arm(kind=Environment)
+
+
+def cut_off():
+    class Task(Arm):
+        def get_termination(self, physics):
+            return 1.0 if physics.time() > 0.1 + 0.1 * abs(physics.data.qpos[0]) else None
+
+    return arm(Task())
+
+
+def ended_by_python():
+    class Task(Arm):
+        def start(self, physics):
+            self.left = self.random.randint(5, 12)
+
+        def after_step(self, physics):
+            self.left -= 1
+
+        def get_termination(self, physics):
+            return 0.0 if self.left <= 0 else None
+
+    return arm(Task())
+
+
+def half_a_discount():
+    class Task(Arm):
+        def get_termination(self, physics):
+            return 0.5 if physics.time() > 0.2 else None
+
+    return arm(Task())
+
+
+def three_actions_for_two_motors():
+    class Task(Arm):
+        def action_spec(self, physics):
+            return specs.BoundedArray((3,), float, [0, -2, -0.3], [3, 0.8, 0.1])
+
+        def before_step(self, action, physics):
+            physics.set_control(np.array(action) @ TRIPLE)
+
+    return arm(Task())
+
+
+def strong():
+    return arm(xml=ARM.replace('"wrist" ctrlrange="-1 1"', '"wrist" ctrlrange="-0.1 5"'))
+
+
+def no_bounds():
+    return arm(xml=ARM.replace(' ctrlrange="-1 1"', ""))
+
+
+def torques_alone():
+    class Task(Arm):
+        def get_observation(self, physics):
+            return {"torque": physics.data.sensordata.copy()}
+
+    return arm(Task())
+
+
+def flat():
+    return arm(flat_observation=True)
+
+
+def odd_limit():
+    return arm(time_limit=0.3)
+
+
+def sleeping():
+    return arm(xml=ARM.replace('<option timestep="0.01"/>', '<option timestep="0.01"><flag sleep="enable"/></option>'))
+
+
+def muscles():
+    act = '<general name="first" joint="hinge" dyntype="filter" dynprm="0.1" gainprm="2" ctrlrange="-1 1"/>'
+    return arm(xml=ARM.replace('<motor name="first" joint="hinge" ctrlrange="-1 1"/>', act))
+
+
+def current_step():
+    return arm(legacy_step=False)
+
+
+def counts_episodes():
+    class Task(Arm):
+        episodes = 0
+
+        def start(self, physics):
+            self.episodes += 1
+            physics.data.qvel[:] = self.episodes
+
+    return arm(Task())
+
+
+def keeps_physics():
+    environment = arm()
+    environment.task.get_reward = lambda physics: float(environment.physics.data.qpos[0])
+    return environment
+
+
+# -- what is drawn elsewhere, and seeded for each episode -------------------------------------------
+
+
+def numpy_at_the_start():
+    class Task(Arm):
+        def start(self, physics):
+            physics.data.qpos[:] = np.random.uniform(-1, 1, 2)
+
+    return arm(Task())
+
+
+def python_at_the_start():
+    class Task(Arm):
+        def start(self, physics):
+            physics.data.qpos[:] = random.uniform(-1, 1)
+
+    return arm(Task())
+
+
+def generator_of_its_own():
+    class Task(Arm):
+        def __init__(self):
+            super().__init__()
+            self.generator = np.random.default_rng()
+
+        def start(self, physics):
+            physics.data.qpos[:] = self.generator.uniform(-1, 1, 2)
+
+        def after_step(self, physics):
+            physics.data.qvel[:] += self.generator.normal(size=2)
+
+    return arm(Task())
+
+
+def new_generator_at_the_start():
+    class Task(Arm):
+        def start(self, physics):
+            physics.data.qpos[:] = np.random.default_rng().uniform(-1, 1, 2)
+
+    return arm(Task())
+
+
+def drawn_model():
+    rod = np.random.uniform(0.02, 0.08)
+    return arm(xml=ARM.replace('size=".05" fromto', f'size="{rod}" fromto'))
+
+
+# -- what is refused ---------------------------------------------------------------------------------
+
+
+def numpy_in_a_step():
+    class Task(Arm):
+        def after_step(self, physics):
+            physics.data.qvel[0] += np.random.normal()
+
+    return arm(Task())
+
+
+def python_in_a_step():
+    class Task(Arm):
+        def get_reward(self, physics):
+            return random.random()
+
+    return arm(Task())
+
+
+def numpy_in_a_late_step():
+    class Task(Arm):
+        def after_step(self, physics):
+            physics.data.qvel[0] += np.random.normal() if physics.time() > 0.45 else 0
+
+    return arm(Task())
+
+
+def new_generator_in_a_step():
+    class Task(Arm):
+        def before_step(self, action, physics):
+            super().before_step(action + np.random.default_rng().normal(size=2), physics)
+
+    return arm(Task())
+
+
+def fixed_generator():
+    class Task(Arm):
+        def __init__(self):
+            super().__init__()
+            self.generators = {"start": np.random.default_rng(0)}
+
+        def start(self, physics):
+            physics.data.qpos[:] = self.generators["start"].uniform(-1, 1, 2)
+
+    return arm(Task())
+
+
+def generator_of_the_module():
+    class Task(Arm):
+        def start(self, physics):
+            physics.data.qpos[:] = MODULE_GENERATOR.uniform(-1, 1, 2)
+
+    return arm(Task())
+
+
+def python_generator_without_seed():
+    generator = random.Random()
+
+    class Task(Arm):
+        def start(self, physics):
+            physics.data.qpos[:] = generator.uniform(-1, 1)
+
+    return arm(Task())
+
+
+def count_of_the_module():
+    class Task(Arm):
+        def start(self, physics):
+            EPISODES["begun"] += 1
+            physics.data.qvel[:] = EPISODES["begun"]
+
+    return arm(Task())
+
+
+def clock():
+    class Task(Arm):
+        def get_observation(self, physics):
+            return {"clock": np.array([time.perf_counter()])}
+
+    return arm(Task())
+
+
+def observed(value):
+    class Task(Arm):
+        def get_observation(self, physics):
+            return value(physics)
+
+    return arm(Task())
+
+
+def text():
+    return observed(lambda physics: {"name": "arm"})
+
+
+def thing():
+    return observed(lambda physics: {"physics": physics})
+
+
+def number():
+    return observed(lambda physics: 1.0)
+
+
+def nothing():
+    return observed(lambda physics: {})
+
+
+def growing():
+    return observed(lambda physics: {"contacts": physics.data.qpos[: 1 + (physics.time() > 0.03)]})
+
+
+def other_names():
+    return observed(lambda physics: {"late" if physics.time() > 0.03 else "early": physics.data.qpos})
+
+
+def nan_seen():
+    return observed(lambda physics: {"x": np.array([1.0, np.nan])})
+
+
+def late_nan_seen():
+    return observed(lambda physics: {"x": np.array([np.nan if physics.time() > 0.45 else 1.0])})
+
+
+def rewarded(value):
+    class Task(Arm):
+        def get_reward(self, physics):
+            return value(physics)
+
+    return arm(Task())
+
+
+def late_nan_reward():
+    return rewarded(lambda physics: np.nan if physics.time() > 0.45 else 1.0)
+
+
+def no_reward():
+    return rewarded(lambda physics: None)
+
+
+def breaks():
+    return rewarded(lambda physics: {}["left"])
+
+
+def breaks_late():
+    return rewarded(lambda physics: {}["left"] if physics.time() > 0.45 else 0.0)
+
+
+def no_motor():
+    start, end = ARM.index("<actuator>"), ARM.index("</mujoco>")  # and no sensor of them
+    return arm(xml=ARM[:start] + ARM[end:])
+
+
+def discrete():
+    class Task(Arm):
+        def action_spec(self, physics):
+            return specs.DiscreteArray(3)
+
+    return arm(Task())
+
+
+def no_camera():
+    return arm(xml=ARM.replace('<camera name="side" pos="0 -2 1" xyaxes="1 0 0 0 .4 1"/>', ""))
+
+
+class Diverging(Arm):
+    def after_step(self, physics):
+        if physics.time() > 0.45:
+            physics.data.qvel[0] = 1e12
+
+
+def diverges():
+    return arm(Diverging())
+
+
+def diverges_quietly():
+    class Environment(control.Environment):
+        def step(self, action):
+            with self.physics.suppress_physics_errors():
+                return super().step(action)
+
+    return arm(Diverging(), kind=Environment)
+
+
+def late_change():
+    class Task(Arm):
+        def after_step(self, physics):
+            if physics.time() > 0.45:
+                physics.model.geom_rgba[0, 0] = 0.3
+
+    return arm(Task())
+
+
+def other_models():
+    return arm(xml=ARM.replace('<light pos="0 0 3"/>', '<light pos="0 0 3"/>' * np.random.randint(1, 100)))
+
+
+def painted_anew():
+    class Task(Arm):
+        def start(self, physics):
+            physics.model.tex_data[:] = self.random.randint(256)
+
+    return arm(Task())
+
+
+def other_headlight():
+    class Task(Arm):
+        def start(self, physics):
+            physics.model.vis.headlight.ambient[:] = self.random.uniform(0, 1)
+
+    return arm(Task())
+
+
+def restarts_itself():
+    class Environment(control.Environment):
+        def step(self, action):
+            return super().step(action) if self.physics.time() < 0.1 else self.reset()
+
+    return arm(kind=Environment)
+
+
+def no_environment():
+    return 7
+
+
+def fails():
+    return 1 / 0

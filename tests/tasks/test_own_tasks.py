@@ -1,0 +1,189 @@
+"""Tasks of a user's own: stored as dm_control's own environment plays them, or refused in one line."""
+
+from __future__ import annotations
+
+import copy
+import functools
+
+import mujoco
+import numpy as np
+import pytest
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.policies.actor import random_policy
+from dmcvb_gen.policies.simulate import replay, simulate
+from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.tasks.base import ACTION_REPEAT
+from dmcvb_gen.tasks.cameras import Kinematics, nominal_cameras
+from dmcvb_gen.tasks.environment import EnvironmentTask
+from tests.tasks import hostile_tasks as h
+
+NAMES, SEED = ("own", "random"), 5
+FULL = mujoco.mjtState.mjSTATE_INTEGRATION
+
+EQUAL = (
+    h.plain, h.pushed_in_each_step, h.pushed_from_the_start, h.moves_its_hand_before_a_step,
+    h.moves_its_hand_after_a_step, h.damping_drifts, h.drawn_looks, h.changing_looks, h.drawn_gravity,
+    h.other_headlight, h.own_step_and_reset, h.cut_off, h.ended_by_python, h.half_a_discount,
+    h.three_actions_for_two_motors, h.strong, h.no_bounds, h.torques_alone, h.flat, h.odd_limit, h.sleeping,
+    h.muscles, h.current_step, h.counts_episodes, h.keeps_physics,
+)  # fmt: skip
+SEEDED = (
+    h.numpy_at_the_start, h.python_at_the_start, h.generator_of_its_own, h.new_generator_at_the_start, h.drawn_model,
+)  # fmt: skip
+REFUSED = {
+    h.numpy_in_a_step: "drew from a global random generator in a step; draw from self.random",
+    h.python_in_a_step: "drew from a global random generator in a step",
+    h.numpy_in_a_late_step: "drew from a global random generator in a step",
+    h.new_generator_in_a_step: "made a random generator without a seed in a step",
+    h.fixed_generator: "holds a random generator with a fixed seed, which begins every episode alike",
+    h.generator_of_the_module: "gives another episode for the same seed",
+    h.python_generator_without_seed: "gives another episode for the same seed",
+    h.count_of_the_module: "gives another episode for the same seed",
+    h.clock: "gives another episode for the same seed",
+    h.text: "observes 'name' as <U3; give numbers",
+    h.thing: "observes 'physics' as object; give numbers",
+    h.number: "observes a float; get_observation must give a dictionary",
+    h.nothing: "observes a dict; get_observation must give a dictionary",
+    h.growing: "observes 'contacts' in different sizes",
+    h.other_names: "observes 'early' in different sizes",
+    h.nan_seen: "observes 'x' with values that are no finite numbers",
+    h.no_reward: "failed .TypeError: .*None",
+    h.breaks: "failed .KeyError: 'left'",
+    h.no_motor: "takes float64 of shape .0,. as actions; give it actuators",
+    h.discrete: "takes int32 of shape .. as actions",
+    h.no_camera: "has no camera to look through",
+    h.other_models: "changes .* of the model in its episodes, which cannot be stored",
+    h.painted_anew: "changes tex_data of the model in its episodes, which cannot be stored",
+    h.restarts_itself: "began another episode within a step",
+    h.no_environment: "gives a int; give a function that returns",
+    h.fails: "cannot start task t .division by zero",
+}  # fmt: skip
+REFUSED_LATE = {
+    h.late_nan_seen: "observes 'x' with values that are no finite numbers",
+    h.late_nan_reward: "gave the reward nan",
+    h.breaks_late: "failed .KeyError: 'left'",
+    h.diverges: "the simulation diverged .mjWARN_BAD",
+    h.diverges_quietly: "the simulation diverged .mjWARN_BAD",
+    h.late_change: "changed geom_rgba of the model, which its first episodes left as it was",
+}  # fmt: skip
+
+
+def named(table):
+    return pytest.mark.parametrize("make", [pytest.param(make, id=make.__name__) for make in table])
+
+
+def rolled(task, episodes):
+    return simulate(task, [random_policy(task)], episodes, SEED, NAMES)
+
+
+def numbers(model):
+    owners = [model, model.opt, *(getattr(model.vis, part) for part in dir(model.vis) if part[0] != "_")]
+    for owner in owners:
+        for name in dir(owner):
+            value = getattr(owner, name)
+            if name[0] != "_" and not callable(value) and isinstance(value, np.ndarray | int | float):
+                yield name, np.array(value)
+
+
+def check_model(task, row, theirs):
+    """The stored row gives the very model that dm_control has."""
+    model = copy.deepcopy(task.model)
+    task.apply_entries(model, row)
+    for (name, ours), (_, wanted) in zip(numbers(model), numbers(theirs), strict=True):
+        np.testing.assert_array_equal(ours, wanted, err_msg=name)
+
+
+def check_episode(task, made, place, environment):
+    """An episode is the one that dm_control's own environment plays with the stored actions."""
+    seed = int(episode_stream(SEED, NAMES, int(made.episodes[place]), "initial_state").integers(2**63))
+    environment.task.random.set_state(np.random.RandomState(np.random.MT19937(seed)).get_state())
+    step, length, last = environment.reset(), int(made.length[place]), False
+    for row in range(length + 1):
+        physics = environment.physics
+        seen = np.concatenate([np.ravel(value) for value in step.observation.values()])
+        np.testing.assert_array_equal(made.state[place, row], seen.astype(np.float32))
+        full = physics.get_state(FULL)
+        np.testing.assert_array_equal(made.physics[place, row, : len(full)], full)
+        if row in (0, length // 2, length):
+            check_model(task, made.physics[place, row], physics.model.ptr)
+        if row == length:
+            break
+        assert not last
+        action, reward, discount = made.action[place, row], 0.0, 1.0
+        assert (environment.action_spec().minimum <= action).all() and (
+            action <= environment.action_spec().maximum
+        ).all()
+        for _ in range(ACTION_REPEAT):
+            step = environment.step(action.astype(float))
+            reward, discount, last = reward + step.reward, discount * step.discount, step.last()
+            if last:
+                break
+        assert made.reward[place, row] == np.float32(reward) and made.discount[place, row] == np.float32(discount)
+    assert last and made.terminated[place] == (step.discount == 0)
+
+
+@named(EQUAL)
+def test_what_dm_control_does_is_what_is_stored(make):
+    task = EnvironmentTask("t", make)
+    together, alone = rolled(task, [0, 1]), rolled(task, [1])
+    for place in range(2):
+        check_episode(task, together, place, make())
+    for name, values in alone.arrays().items():
+        np.testing.assert_array_equal(values[0], together.arrays()[name][1], err_msg=name)
+    assert (together.state[0, 0] != together.state[1, 0]).any() or make in (h.torques_alone, h.own_step_and_reset)
+
+
+@named([*EQUAL, *SEEDED])
+def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(make):
+    task, other = EnvironmentTask("t", make), EnvironmentTask("t", make)
+    many = rolled(task, [2, 0, 1, 3])
+    again = rolled(other, [3])
+    replayed = replay(task, many.action[3, : many.length[3]], 3, SEED, NAMES)
+    for name in ("state", "physics", "reward", "discount"):
+        ours = getattr(many, name)[3]
+        np.testing.assert_array_equal(ours, getattr(again, name)[0], err_msg=name)
+        np.testing.assert_array_equal(ours[: len(getattr(replayed, name)[0])], getattr(replayed, name)[0])
+    assert len({many.physics[place].tobytes() for place in range(4)}) == 4
+
+
+@named(REFUSED)
+def test_what_cannot_be_repeated_or_stored_is_refused_in_one_line(make):
+    with pytest.raises(DmcvbError, match=REFUSED[make]) as caught:
+        rolled(EnvironmentTask("t", make), [0])
+    assert "\n" not in str(caught.value)
+
+
+@named(REFUSED_LATE)
+def test_what_fails_late_names_task_episode_and_step(make):
+    task = EnvironmentTask("t", make)
+    with pytest.raises(DmcvbError, match=f"^task t, episode 8, step 1[0-2]: .*{REFUSED_LATE[make]}"):
+        rolled(task, [8])
+
+
+def test_an_environment_is_used_again_only_if_nothing_of_an_episode_is_left_in_it():
+    made = []
+
+    def counted(make):
+        made.append(make.__name__)
+        return make()
+
+    for make, expected in ((h.flat, False), (h.counts_episodes, False)):
+        task = EnvironmentTask("t", functools.partial(counted, make))
+        assert task.reusable is expected
+
+
+@named([h.sleeping, h.drawn_model, h.other_headlight, h.drawn_looks, h.changing_looks, h.flat])
+def test_the_cameras_of_stored_rows_are_mujocos(make):
+    task = EnvironmentTask("t", make)
+    rows = rolled(task, [0]).physics[0]
+    position = nominal_cameras(task, rows)[0][:, 0]
+    geoms = Kinematics(task, ["geom_xpos"])(rows)["geom_xpos"]
+    data, model = mujoco.MjData(task.model), copy.deepcopy(task.model)
+    for row, place, geom in zip(rows, position, geoms, strict=True):
+        task.apply_entries(model, row)
+        mujoco.mj_setState(model, data, row[: mujoco.mj_stateSize(model, FULL)], FULL)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        np.testing.assert_allclose(place, data.cam_xpos[0], atol=1e-6)
+        np.testing.assert_allclose(geom, data.geom_xpos, atol=1e-12)
