@@ -34,8 +34,8 @@ from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.text import as_names, quoted
 
 if TYPE_CHECKING:
-    from dmcvb_gen.benchmarks.setup import Setup
-    from dmcvb_gen.benchmarks.validate import Validation
+    from dmcvb_gen.agents.trainer import Budget
+    from dmcvb_gen.benchmarks.report import Validation
     from dmcvb_gen.generate.paint import RenderResult
     from dmcvb_gen.generate.regenerate import Outcome
     from dmcvb_gen.loaders.release import ReleaseReader
@@ -507,7 +507,7 @@ def validate(
       workers: Cells side by side. [default: 2, on one core 1]
       threads: Threads of each worker. [default: cores / workers]
       device: Device that trains.
-      precision: Precision of networks that see images; auto times both, and takes bfloat16 on GPUs that have it.
+      precision: Precision of networks that see images; auto takes bfloat16 if the device has instructions for it.
       compile: Compile the losses with torch.compile (for CUDA and long runs).
       memory (GB): Memory for images, of all workers together; ray: of each. [default: half of what is free]
       seed: Random seed of the trainings.
@@ -524,14 +524,14 @@ def validate(
     if checks_only:
         usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
         _refuse("checks_only trains nothing", **{name: options[name] != usual[name] for name in TRAINING})
-    return run_validation(validation_setup(options), options)
+    return run_validation(validation_budget(options), options)
 
 
-def validation_setup(options: Mapping[str, Any]) -> "Setup":
-    """Make the settings that all cells of a validation share from the arguments of `validate`."""
+def validation_budget(options: Mapping[str, Any]) -> "Budget":
+    """Make the budget of all trainings from the arguments of `validate`; mistakes in others are told, too."""
     from dmcvb_gen.agents.catalog import parse_agent
-    from dmcvb_gen.benchmarks.run import default_workers
-    from dmcvb_gen.benchmarks.validate import make_setup, plan_validation
+    from dmcvb_gen.benchmarks.cell import default_workers
+    from dmcvb_gen.benchmarks.report import make_budget, plan_validation
     from dmcvb_gen.dataset import open_release
 
     release, agents = open_release(options["release"]), as_names(options["agents"])
@@ -541,24 +541,23 @@ def validation_setup(options: Mapping[str, Any]) -> "Setup":
     if options["dino_weights"] is None and any(agent.ready_encoder for agent in chosen):
         raise DmcvbError(next(agent.ready_encoder.missing for agent in chosen if agent.ready_encoder))
     benchmarks = () if options["checks_only"] else as_names(options["benchmarks"])
-    plan_validation(release, benchmarks, agents, as_names(options["only"]))  # tells mistakes before precision is timed
-    given = {name: options[name] for name in ("out", "profile", "scale", "threads", "device", "precision", "compile")}
+    plan_validation(release, benchmarks, agents, as_names(options["only"]))
+    given = {name: options[name] for name in ("profile", "scale", "threads", "device", "precision", "compile")}
     given |= {name: options[name] for name in ("memory", "seed", "dino_weights", "backgrounds")}
-    workers = options["workers"] or default_workers(options["device"])
-    return make_setup(options["release"], workers=workers, training=not options["checks_only"], **given)
+    return make_budget(workers=options["workers"] or default_workers(options["device"]), **given)
 
 
 def run_validation(
-    setup: "Setup", options: Mapping[str, Any], on_score: Callable[[Any, dict[str, Any]], None] = ignore
+    budget: "Budget", options: Mapping[str, Any], on_score: Callable[[Any, dict[str, Any]], None] = ignore
 ) -> "Validation":
     """Run what the arguments of `validate` ask for.
 
     Args:
       on_score: called with each cell and its result, as soon as it is there.
     """
-    from dmcvb_gen.benchmarks.run import default_workers
-    from dmcvb_gen.benchmarks.validate import Progress
-    from dmcvb_gen.benchmarks.validate import validate as run
+    from dmcvb_gen.benchmarks.cell import default_workers
+    from dmcvb_gen.benchmarks.report import Progress
+    from dmcvb_gen.benchmarks.report import validate as run
 
     with progress_bar(options["progress"], " checks", "structure", scaled=False) as bar:
 
@@ -568,11 +567,12 @@ def run_validation(
 
         return run(
             options["release"],
-            setup,
+            options["out"] or Path("reports") / Path(options["release"]).name,
+            budget,
             benchmarks=() if options["checks_only"] else as_names(options["benchmarks"]),
             agents=as_names(options["agents"]),
             patterns=as_names(options["only"]),
-            workers=options["workers"] or default_workers(setup.device),
+            workers=options["workers"] or default_workers(budget.device),
             train_unsound=options["train_unsound"],
             progress=Progress(checking=bar, total=train, training=bar.advance, done=on_score),
         )

@@ -24,7 +24,7 @@ class Registry(Generic[Thing]):
 
     Args:
       kind: word for what it holds, for messages: "format".
-      package: the package of ours whose modules register their things on import.
+      package: the module of ours, or the package with modules, that registers its things on import.
       group: entry points of other packages, modules or objects in them, that do so too.
     """
 
@@ -51,7 +51,8 @@ class Registry(Generic[Thing]):
         """All things by name, this package's first."""
         if not self._loaded:
             self._loaded = True
-            for module in pkgutil.iter_modules(importlib.import_module(self.package).__path__):
+            package = importlib.import_module(self.package)
+            for module in pkgutil.iter_modules(getattr(package, "__path__", ())):
                 importlib.import_module(f"{self.package}.{module.name}")
             for entry in metadata.entry_points(group=self.group):
                 try:

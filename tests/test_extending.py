@@ -83,7 +83,7 @@ def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family,
     load("agent")
     agents = ["linear-bc", "state-linear-bc", "id+linear-bc:power=1"]
     report = validated(request.getfixturevalue(family), tmp_path, "--agents", ",".join(agents), "--only", only)
-    assert {result["cell"]["agent_name"] for result in report["results"]} == set(agents) and not report["failed"]
+    assert {result["cell"]["agent"] for result in report["results"]} == set(agents) and not report["failed"]
     assert all(result["curve"][-1]["loss"] > 0 for result in report["results"])
 
 
@@ -91,6 +91,6 @@ def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family,
 def test_a_benchmark_of_your_own_has_its_table_in_the_report(family, request, tmp_path):
     load("benchmark")
     report = validated(request.getfixturevalue(family), tmp_path, "--benchmark", "growth")
-    assert {result["cell"]["policy_label"].split()[-1] for result in report["results"]} >= {"random"}
+    assert {result["labels"]["policy"].split()[-1] for result in report["results"]} >= {"random"}
     assert {result["reference"] for result in report["results"]} == {"the same agent on all episodes"}
     assert "Growth: scores over shares of the data" in (tmp_path / "report" / "report.md").read_text()

@@ -1,6 +1,6 @@
 """Find agents by name: "id+bc" is an encoder pre-trained by inverse dynamics with a policy by BC.
 
-    MODULE:NAME                          a user's own agent (`benchmarks.own`)
+    MODULE:NAME                          a user's own agent (`benchmarks.cell.OwnAgent`)
     [PRETRAIN+]POLICY[:OPTION,...]
 
 POLICY and PRETRAIN are names that `learners.register_agent` knows. With PRETRAIN the encoder is pre-trained and then
@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from torch import nn
 
@@ -27,8 +26,6 @@ OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A user's own agent: "module:name"."""
 MOST = 64
 """The largest number that an option takes."""
-EARLIER = {"k": 1, "sample_k": False, "unbounded": False}
-"""Options that results of earlier versions name for every agent."""
 
 
 def policies() -> tuple[str, ...]:
@@ -50,7 +47,7 @@ def agent_names() -> tuple[str, ...]:
 def option_names() -> tuple[str, ...]:
     """The names of all options that agents take."""
     names = {"frames", *(name for part in PARTS.all().values() for name in part.options)}
-    return tuple(sorted("sample" if name == "sample_k" else name for name in names))
+    return tuple(sorted(names))
 
 
 def split_agents(text: str) -> tuple[str, ...]:
@@ -123,12 +120,6 @@ class Agent:
         parts = (part for part in (self.policy, self.pretrain) if part and not self.own)
         modules = {part: PARTS.get(part).__module__ for part in parts}
         return {part: source_digest(module) for part, module in modules.items() if not module.startswith("dmcvb_gen.")}
-
-    def facts(self) -> dict[str, Any]:
-        """All of it as plain values, under the names that results of earlier versions have."""
-        options = {"sample_k" if name == "sample" else name: value for name, value in self.options}
-        parts = {name: getattr(self, name) for name in ("policy", "pretrain", "sees_state", "stack", "own")}
-        return parts | EARLIER | options
 
 
 def parse_agent(name: str) -> Agent:

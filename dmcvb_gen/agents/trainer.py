@@ -6,9 +6,10 @@ and resumed draws what it would have drawn.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import torch
 from dmcvb_gen.agents.data import TrainingData, batches
 from dmcvb_gen.agents.learners import Batch, Learner
 from dmcvb_gen.agents.muon import Muon
+from dmcvb_gen.agents.networks import PAPER, Architecture
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, replacing
@@ -26,6 +28,8 @@ from dmcvb_gen.state_file import pack_state, read_state_file
 HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
 """At least so many batches, and transitions, of the hold-out are what a test loss is the mean of; but no more batches
 than were trained on."""
+POINTS = 50
+"""Points of the learning curve."""
 SAVE_SECONDS = 120.0
 """Seconds of work that a stop may cost."""
 RESUME_FILE = "resume.safetensors"
@@ -35,34 +39,81 @@ Curve = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class TrainSettings:
-    """Length and settings of a training (paper, table "Hyperparameters").
+class Budget:
+    """All that a training is told besides its agent and its data; the defaults are the paper's.
 
     Attributes:
-      steps: Adam steps.
-      batch_size: transitions a step.
-      evaluate_every: steps between online evaluations; one at the end in any case.
-      points: points of the learning curve.
-      half: bfloat16 autocast. Pays for pictures, not for states.
-      compile: torch.compile of the losses.
-      workers: threads that draw batches ahead; 0 draws them in turn (pictures in a mapped file have two in any case).
-      rate: times the learner's own learning rate (1e-3, the paper's).
-      shift: pictures are shifted at random, as the paper's; short trainings learn several times as fast without.
-      decay: the learning rate falls linearly to zero over the steps; the paper keeps it, short trainings gain by it.
-      muon: hidden matrices move by `Muon`, not by the paper's Adam.
+      name: e.g. "quick". note: printed wherever a score stands. scores: True if its scores mean anything.
+      pixel_steps: Adam steps of a policy that trains its own encoder on pictures.
+      pretrain_steps: Adam steps of a pre-trained encoder. frozen_steps: of a policy on a frozen encoder.
+      state_steps: Adam steps of an agent that sees states.
+      readout_steps: Adam steps of each decoder on a frozen encoder; 0: no inspection.
+      evaluations: online evaluations, evenly over a policy's training. Of several the best one counts, as in the paper,
+        which makes the score somewhat too high.
+      episodes: episodes of each evaluation.
+      episode_steps: agent steps an evaluation's episode is cut to; None: whole episodes.
+      batch_size: transitions an Adam step. state_batch_size: the same of agents that see states.
+      network: the convolutions of every encoder and decoder.
+      rate: times the learner's own learning rate (1e-3, the paper's), of agents that see pictures.
+      shift_from: passes over the data from which on a training shifts its pictures at random. 0: always, as the
+        paper's. Unshifted pictures are learned several times as fast, and after more than ten passes known by heart.
+      frozen_shift: pictures are shifted while a policy or decoder learns on a frozen encoder. Without shifts every
+        observation is encoded once, and its latent kept.
+      decay: the learning rate falls linearly to zero over each training, instead of staying as the paper's.
+      muon: of agents that see pictures, hidden matrices move by `Muon` instead of the paper's Adam.
+      precision: "float32" or "bfloat16" (autocast), of agents that see pictures.
+      seed: of the trainings.
+      device: "cpu" or "cuda". threads: of torch and physics in one process. compile: torch.compile the losses.
+      memory: bytes of pictures held at most, over all workers (on a cluster: by each cell); None: half of what is free
+        (on a cluster: of a cell's share of its node).
+      dino_weights: file of DINO's weights. backgrounds: folder of the background videos, if it has moved.
     """
 
-    steps: int = 400_000
+    name: str
+    pixel_steps: int = 400_000
+    pretrain_steps: int = 400_000
+    frozen_steps: int = 400_000
+    state_steps: int = 400_000
+    readout_steps: int = 400_000
+    evaluations: int = 20
+    episodes: int = 30
+    episode_steps: int | None = None
     batch_size: int = 256
-    evaluate_every: int = 20_000
-    points: int = 50
-    half: bool = True
-    compile: bool = False
-    workers: int = 0
+    state_batch_size: int = 256
+    network: Architecture = PAPER
     rate: float = 1.0
-    shift: bool = True
+    shift_from: float = 0.0
+    frozen_shift: bool = True
     decay: bool = False
     muon: bool = False
+    precision: str = "float32"
+    seed: int = 0
+    scores: bool = True
+    note: str = ""
+    device: str = "cpu"
+    threads: int = 1
+    compile: bool = False
+    memory: int | None = None
+    dino_weights: str | None = None
+    backgrounds: str | None = None
+
+    def shifts(self, steps: int, transitions: int) -> bool:
+        """True if an agent shifts its pictures while it learns for so many steps from so many transitions."""
+        return steps * self.batch_size >= self.shift_from * transitions
+
+    def scaled(self, factor: float) -> Budget:
+        """The same with every training `factor` times as long, and a name that says so."""
+        if factor == 1:
+            return self
+        kinds = ("pixel_steps", "pretrain_steps", "frozen_steps", "state_steps", "readout_steps")
+        steps = {name: max(1, round(getattr(self, name) * factor)) for name in kinds}
+        name = f"{self.name} x{factor:g}"
+        return replace(self, name=name, note=f"{name}: {factor:g} times the steps of {self.note}", **steps)
+
+    def facts(self) -> dict[str, Any]:
+        """What of it decides numbers, as JSON has it."""
+        machine = ("note", "device", "threads", "compile", "memory", "dino_weights", "backgrounds")
+        return json.loads(json.dumps({name: value for name, value in asdict(self).items() if name not in machine}))
 
 
 def draw(
@@ -107,9 +158,10 @@ def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) 
 def train(
     learner: Learner,
     data: TrainingData,
-    settings: TrainSettings,
+    budget: Budget,
+    steps: int,
     *,
-    seed: int = 0,
+    shift: bool = True,
     folder: Path | None = None,
     evaluate: Callable[[Learner], dict[str, Any]] | None = None,
     tick: Callable[[int], None] = lambda steps: None,
@@ -117,43 +169,48 @@ def train(
     """Train a learner in place.
 
     Args:
+      data: with pictures, or states alone: the budget differs.
+      steps: Adam steps.
+      shift: pictures are shifted at random, as the paper's.
       folder: folder of the state while it trains; a run with such a state resumes from it.
-      evaluate: gives scores of the learner, added to the curve.
+      evaluate: gives scores of the learner, added to the curve, at the end and so often as the budget says.
       tick: called with the number of steps since the last call.
 
     Raises:
       DmcvbError: the folder holds the state of another learner, or a loss is no longer finite.
     """
+    pixels = data.frames is not None
+    size, learner.half = budget.state_batch_size, pixels and budget.precision == "bfloat16"
+    if pixels:
+        size = budget.batch_size
+    if pixels and budget.muon:
+        dtype = torch.bfloat16 if learner.half else torch.float32
+        learner.optimizers = {name: Muon.instead_of(one, dtype) for name, one in learner.optimizers.items()}
     first, curve, spent, means = 0, [], 0.0, _Means()
     path = folder / RESUME_FILE if folder else None
-    if settings.muon:
-        precision = torch.bfloat16 if settings.half else torch.float32
-        learner.optimizers = {name: Muon.instead_of(one, precision) for name, one in learner.optimizers.items()}
     if path is not None and path.exists():
         first, curve, spent, means = _load_state(learner, path)
         tick(first)
-    learner.half = settings.half
-    if settings.compile:
+    if budget.compile:
         for name in learner.compiled:
             setattr(learner, name, compiled(getattr(learner, name)))
-    log_every = max(1, settings.steps // settings.points)
+    evaluate_every, log_every = -(-steps // (budget.evaluations if evaluate else 1)), max(1, steps // POINTS)
     started = saved = time.perf_counter()
 
     def make(step: int, reuse: Batch | None) -> Batch:
-        return draw(learner, data, settings.batch_size, seed, step, shift=settings.shift, reuse=reuse)
+        return draw(learner, data, size, budget.seed, step, shift=shift, reuse=reuse)
 
-    schedule = _Schedule(learner, settings)
-    workers = max(settings.workers, 2 if data.frames is not None and data.frames.mapped else 0)
-    for step, batch in batches(make, first, settings.steps, workers):
-        torch.manual_seed((seed << 32) + step)
+    schedule = _Schedule(learner, budget.rate if pixels else 1.0, steps if budget.decay else None)
+    workers = 2 if pixels and data.frames.mapped else int(data.device.type != "cpu")
+    for step, batch in batches(make, first, steps, workers):
+        torch.manual_seed((budget.seed << 32) + step)
         schedule.at(step)
         means.add(learner.update(batch))
         done = step + 1
         tick(1)
-        evaluating = done % settings.evaluate_every == 0 or done == settings.steps
+        evaluating = done % evaluate_every == 0 or done == steps
         if evaluating or done % log_every == 0:
-            held_out = hold_out_losses(learner, data, settings.batch_size, settings.steps)
-            point = {"step": done, **means.take(done), **held_out}
+            point = {"step": done, **means.take(done), **hold_out_losses(learner, data, size, steps)}
             if evaluating and evaluate:
                 point |= evaluate(learner)
             curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})
@@ -165,17 +222,17 @@ def train(
 
 
 class _Schedule:
-    """The learning rates of a learner's optimizers, step by step."""
+    """The learning rates of a learner's optimizers, step by step: `rate` times their own, falling to 0 after `end`."""
 
-    def __init__(self, learner: Learner, settings: TrainSettings):
+    def __init__(self, learner: Learner, rate: float, end: int | None):
         self._groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
         self._own = [group["lr"] for group in self._groups]
-        self._settings = settings
+        self._rate, self._end = rate, end
 
     def at(self, step: int) -> None:
-        factor = self._settings.rate * (1 - step / self._settings.steps if self._settings.decay else 1.0)
-        for group, rate in zip(self._groups, self._own, strict=True):
-            group["lr"] = rate * factor
+        factor = self._rate * (1 - step / self._end if self._end else 1.0)
+        for group, own in zip(self._groups, self._own, strict=True):
+            group["lr"] = own * factor
 
     def restore(self) -> None:
         for group, rate in zip(self._groups, self._own, strict=True):
@@ -209,11 +266,6 @@ class _Means:
                 raise DmcvbError(f"{name} is no longer finite at step {step}; look at the data with `dmcvb-gen verify`")
         self._sums, self._counts = {}, {}
         return means
-
-
-def forget(folder: Path) -> None:
-    """Remove the state of a training that is through."""
-    (folder / RESUME_FILE).unlink(missing_ok=True)
 
 
 def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: float, means: _Means) -> None:

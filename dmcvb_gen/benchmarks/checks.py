@@ -1,4 +1,4 @@
-"""Check the structure of a release before any training.
+"""Check the structure of a release before any training, and what scores do not say after it.
 
 `release.verify` looks at bytes, shapes, values, physics and sampled pixels; here it is asked first, and what only a
 benchmark cares about comes on top: returns as the policies and the paper promise, labels that fit their setting,
@@ -10,15 +10,19 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.agents.trainer import Budget
+from dmcvb_gen.benchmarks.evaluate import SPLIT
+from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell
 from dmcvb_gen.dataset import Release, Subset, open_release
-from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.inputs import background_source
+from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.errors import BackgroundError, StoreError
+from dmcvb_gen.generate.inputs import background_source, video_source
 from dmcvb_gen.generate.paint import render_differences
 from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
@@ -36,6 +40,10 @@ PICTURE_EPISODES = 100
 """Episodes of a subset whose every frame is looked at."""
 PAINTED_EPISODES = 8
 """The same, where its pictures are painted to be looked at."""
+STATE_BC_SHARE = 0.9
+"""Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
+Results = Sequence[tuple[Cell, dict[str, Any]]]
+"""Cells with their results."""
 
 
 @dataclass(frozen=True)
@@ -152,19 +160,24 @@ def _label_problems(
     return problems + [(jumps, "the background skips frames")]
 
 
-def check_pictures(subset: Subset) -> Iterator[Issue]:
-    """No frame is black or of one color, and no episode shows the same frame throughout."""
+def check_pictures(subset: Subset) -> tuple[list[Issue], list[Issue]]:
+    """(findings, warnings): frames that are black or of one color; episodes that show the same frame throughout.
+
+    A view of a goal that stays where it is, or a task in which nothing moves, shows one frame rightly.
+    """
     most = PAINTED_EPISODES if isinstance(subset, PaintedSubset) else PICTURE_EPISODES
     chosen = subset.episodes[:: max(1, -(-len(subset.episodes) // most))]
+    found, odd = [], []
     for episode in map(int, chosen):
         for name, frames in subset.episode(episode, subset.pixel_arrays).items():
             flat = frames.reshape(len(frames), -1)
             low, high = flat.min(axis=1), flat.max(axis=1)
             for bad, message in ((high == 0, "is black"), ((low == high) & (high > 0), "is of one color")):
                 if bad.any():
-                    yield Issue("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax()))
+                    found.append(Issue("pictures", subset.name, f"{name} {message}", episode, int(bad.argmax())))
             if len(frames) > 1 and (flat == flat[:1]).all() and high[0] > 0:
-                yield Issue("pictures", subset.name, f"{name} shows the same frame throughout", episode)
+                odd.append(Issue("pictures", subset.name, f"{name} shows the same frame throughout", episode))
+    return found, odd
 
 
 def known_returns(release: Release) -> dict[str, np.ndarray]:
@@ -237,5 +250,64 @@ def check_structure(
 def _check_subset(subset: Subset, tick: ProgressCallback) -> tuple[list[Issue], list[Issue]]:
     """Return what is wrong with a subset, and what is odd about it."""
     tick(subset.name)
-    found = [*check_policy_returns(subset), *check_labels(subset), *check_pictures(subset)]
-    return found, list(check_paper_returns(subset))
+    found, odd = check_pictures(subset)
+    return [*check_policy_returns(subset), *check_labels(subset), *found], [*odd, *check_paper_returns(subset)]
+
+
+# -- what scores do not say -------------------------------------------------------------------------
+
+
+def training_warnings(release: Release, budget: Budget, results: Results) -> Iterator[Issue]:
+    """List what makes the scores of cells say less than they seem to."""
+    cells = [cell for cell, _ in results]
+    yield from _seen_warnings(release, cells, budget.backgrounds)
+    for name in dict.fromkeys(cell.benchmark for cell in cells):
+        yield from BENCHMARKS.get(name).warnings(release, [cell for cell in cells if cell.benchmark == name])
+    if budget.scores:
+        found = [_learning_warning(budget, *each) or _few_warning(budget, *each) for each in results]
+        yield from dict.fromkeys(issue for issue in found if issue)
+
+
+def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> Iterator[Issue]:
+    """Evaluation shows what no data show (paper, section 5); data that were painted with it do not tell."""
+    learned = dict.fromkeys(part.subset for cell in cells if not cell.agent.sees_state for part in cell.policy)
+    for record in (release.subsets[name].record for name in learned):
+        what, seen = "maze style", record.goal_mode is not None and record.split == SPLIT
+        if record.backgrounds:
+            with contextlib.suppress(BackgroundError):  # what is not there fails in the cells
+                shown = load_backgrounds(video_source(release.path, record, backgrounds), SPLIT).digest
+                what, seen = "videos", record.backgrounds.get("digest") == shown
+        if seen:
+            text = f"painted with the {what} that evaluation shows: its scores are of distractors that were seen"
+            yield Issue("learning", record.name, text)
+
+
+def _few_warning(budget: Budget, cell: Cell, result: Mapping[str, Any]) -> Issue | None:
+    """Tell of data so few that pictures are shifted, for which a short training is too short."""
+    agent, steps = cell.agent, budget.pixel_steps
+    end_to_end = not (agent.sees_state or agent.own or agent.pretrain) and len(cell.policy) == 1
+    if not (end_to_end and budget.shift_from and cell.benchmark == "b1" and "error" not in result):
+        return None
+    if not budget.shifts(steps, result["transitions"]):
+        return None
+    drawn = steps * budget.batch_size
+    text = f"{budget.name} passes {drawn / result['transitions']:.0f} times over its {result['transitions']:,} steps"
+    text += f", so it shifts the images and learns more slowly; from {drawn / budget.shift_from:,.0f} on it does not"
+    return Issue("learning", cell.policy[0].subset, text)
+
+
+def _learning_warning(budget: Budget, cell: Cell, result: Mapping[str, Any]) -> Issue | None:
+    """Expert data that BC on states cannot learn from is odd."""
+    if "error" in result or cell.agent.name != "state-bc" or cell.policy_label != "expert":
+        return None
+    score, data = result["score"], result["data"]
+    if data["success"] is not None:
+        reached, wanted, what = 100 * score["success"], 100 * data["success"], "% of its goals, the data"
+    elif score["limit"] != data["limit"]:
+        return None  # returns of episodes that were cut elsewhere
+    else:
+        reached, wanted, what = score["mean"], data["mean"], "a return, the data"
+    if reached >= STATE_BC_SHARE * wanted:
+        return None
+    message = f"BC(state) reaches {reached:.0f} {what} {wanted:.0f} [{budget.name}]"
+    return Issue("learning", cell.policy[0].subset, message)

@@ -1,16 +1,22 @@
-"""Score a policy on fresh episodes, all in one batch.
+"""Score a policy on fresh episodes, all in one batch; keep and load policies that `validate` trained.
 
 The episodes are those of a task, painted at the data's size by the data's renderer, with a setting's distractors:
 unseen `val` videos and maze styles, and streams of their own, apart from every release's (paper, section 5). In mazes
 an agent has 1,000 steps (`Task.evaluation_steps`), where the authors' evaluation stops; the data were cut at 600.
+
+    agent = load_agent("reports/mini/cells/b1_walker-walk_none_state-bc_expert.safetensors")
+    dmcvb_gen.evaluate(agent, "walker-walk/none")
 """
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +25,7 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.files import replacing
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.recipe import RendererChoice
 from dmcvb_gen.policies.evaluation import goal_speed
@@ -30,9 +37,12 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 if TYPE_CHECKING:
-    from dmcvb_gen.agents.data import Normalization
+    from dmcvb_gen.agents.catalog import Agent
+    from dmcvb_gen.agents.data import Normalization, Sizes
     from dmcvb_gen.agents.learners import Policy
+    from dmcvb_gen.agents.networks import Architecture
 
+_log = logging.getLogger("dmcvb_gen")
 Act = Callable[[dict[str, np.ndarray]], Any]
 """A policy of one's own: observations of all episodes in, (episode, action) in [-1, 1] out.
 
@@ -49,7 +59,7 @@ SPLIT = "val"
 
 @dataclass(frozen=True)
 class Score:
-    """Returns of online episodes.
+    """Returns of episodes: of an evaluation, or of the data that a policy learned from.
 
     Attributes:
       mean, stderr: mean and standard error of the returns; the standard error is std / sqrt(episodes), std with n - 1,
@@ -71,10 +81,16 @@ class Score:
     seconds: float = 0.0
     pictures: np.ndarray | None = field(default=None, repr=False)
 
+    @classmethod
+    def of(cls, returns: np.ndarray, **others: Any) -> Score:
+        """The score of (episode,) returns; `others`: its further attributes."""
+        count = len(returns)
+        stderr = float(returns.std(ddof=1) / math.sqrt(count)) if count > 1 else math.nan
+        return cls(float(returns.mean()), stderr, tuple(float(value) for value in returns), **others)
+
     def facts(self) -> dict[str, Any]:
         """Everything but the pictures, as plain values."""
-        names = ("mean", "stderr", "returns", "success", "speed", "limit", "seconds")
-        return {name: getattr(self, name) for name in names}
+        return {name: value for name, value in vars(self).items() if name != "pictures"}
 
 
 def evaluation_steps(task: Task, max_steps: int | None = None) -> int:
@@ -168,14 +184,12 @@ class Evaluator:
     Args:
       where: the scene, or a subset whose task, setting, size and renderer are evaluated on.
       pixels: the policies see pictures; else states.
-      normalization: normalization of the states, for learned policies that see them.
       stack: frames an observation.
       episodes: run side by side, each once.
       seed: seed of the evaluation's streams.
       pair: the fixed (start, goal) cells of a maze's episodes, instead of random ones.
       max_steps: cut episodes short (for tests and smoke runs).
       backgrounds: folder of the `val` videos, if not the manifest's.
-      device: device of policy and renderer.
 
     Raises:
       DmcvbError: the renderer cannot start here, or there are no `val` videos.
@@ -186,14 +200,12 @@ class Evaluator:
         where: Subset | EvaluationScene,
         *,
         pixels: bool = True,
-        normalization: Normalization | None = None,
         stack: int = 3,
         episodes: int = 30,
         seed: int = 0,
         pair: tuple | None = None,
         max_steps: int | None = None,
         backgrounds: str | None = None,
-        device: str = "cpu",
         threads: int = 1,
         shots: int = 8,
     ):
@@ -202,16 +214,15 @@ class Evaluator:
         self.setting = parse_setting(scene.task, scene.setting)[0]
         self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
         self.steps = evaluation_steps(self.task, max_steps)
-        self.device, self.normalization, self.stack = device, normalization, stack
-        self.pair, self.renderer, self._videos = pair, None, None
+        self.stack, self.pair, self.renderer, self.videos = stack, pair, None, None
         if pixels:
             if self.setting.kind != "none":
-                self._videos = load_backgrounds(scene.backgrounds, scene.split)
+                self.videos = load_backgrounds(scene.backgrounds, scene.split)
             self.renderer = make_renderer(
                 scene.renderer,
                 self.task,
                 scene.size,
-                backgrounds=self._videos,
+                backgrounds=self.videos,
                 floor_alpha=floor_alpha_for(self.task, self.setting),
                 samples=scene.samples,
             )
@@ -225,22 +236,6 @@ class Evaluator:
         """The evaluation's own streams; the same for every policy, so that scores are compared on like episodes."""
         names = (STREAM_NAME, self.scene.task, self.scene.setting)
         return [episode_stream(self.seed, names, episode, name) for episode in range(self.episodes)]
-
-    def __call__(self, policy: Policy) -> Score:
-        """Evaluate a learned policy (torch)."""
-        import torch
-
-        from dmcvb_gen.agents.data import normalize_pixels
-
-        def act(observation: dict[str, np.ndarray]) -> np.ndarray:
-            if self.renderer is None:
-                seen = self.normalization(torch.from_numpy(observation["state"])).to(self.device)
-            else:
-                seen = normalize_pixels(torch.from_numpy(observation["pixels"]).to(self.device))
-            with torch.no_grad(), policy.precision():
-                return policy.act(seen).float().clamp(-1, 1).cpu().numpy()
-
-        return self.score(act)
 
     def score(self, act: Act) -> Score:
         """Roll a policy out. It is asked for one action a step, for all episodes at once.
@@ -273,10 +268,8 @@ class Evaluator:
             active &= ~result.terminated
             if not active.any():
                 break
-        return Score(
-            mean=float(returns.mean()),
-            stderr=float(returns.std(ddof=1) / math.sqrt(count)) if count > 1 else math.nan,
-            returns=tuple(float(value) for value in returns),
+        return Score.of(
+            returns,
             success=None if distance is None else float(ended.mean()),
             speed=None if distance is None else goal_speed(distance, length, ended, task),
             limit=self.steps,
@@ -290,7 +283,7 @@ class Evaluator:
             return None
         generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
         frames, split = self.steps + 1, self.scene.split
-        return DistractorSampler(self.task, self.setting, frames, generators, self._videos, split=split)
+        return DistractorSampler(self.task, self.setting, frames, generators, self.videos, split=split)
 
     def _see(self, stack, physics, walk: DistractorSampler, step: int, active, action=None) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
@@ -341,10 +334,10 @@ def evaluate(
     *,
     episodes: int = 30,
     seed: int = 0,
-    stack: int = 3,
-    pixels: bool = True,
-    size: int = 64,
-    renderer: str = RendererChoice().backend,
+    stack: int | None = None,
+    pixels: bool | None = None,
+    size: int | None = None,
+    renderer: str | None = None,
     samples: int | None = None,
     backgrounds: str = "builtin",
     split: str = SPLIT,
@@ -353,7 +346,9 @@ def evaluate(
 ) -> Score:
     """Score a policy of your own by the protocol, starts and videos of `validate`.
 
-    All episodes run side by side, and the policy is asked for the actions of all of them at once.
+    All episodes run side by side, and the policy is asked for the actions of all of them at once. If it has attributes
+    `stack`, `pixels` or `picture_size`, those are its own: other values are refused. A policy of `load_agent` has them;
+    if it learned from images of another renderer or from other videos than the evaluation's, a warning is logged.
 
     Args:
       policy: takes {"pixels": (episode, stack x view x 3, size, size) uint8, "state": (episode, state) float32} and
@@ -361,9 +356,10 @@ def evaluate(
       where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible".
       episodes: number of episodes, each run once.
       seed: seed of starts and distractors; `validate` has 0. Each setting has starts of its own.
-      stack: frames an observation; the first one of an episode is repeated.
-      pixels: give pictures; without them an evaluation takes seconds.
-      size: pixels a side. renderer: its name. samples: anti-aliasing samples of a pixel, the renderer's by default.
+      stack: frames an observation, by default 3; the first one of an episode is repeated.
+      pixels: give pictures, by default yes; without them an evaluation takes seconds.
+      size: pixels a side, by default 64. renderer: its name. samples: anti-aliasing samples of a pixel. Both are by
+        default those of the data that a `load_agent` policy learned from, or the package's.
       backgrounds: "builtin" or a folder of videos.
       split: videos and maze styles to show: "val", as `validate` does, or "train", those of the data. The difference of
         the two scores is what a policy loses on distractors that it has not seen.
@@ -373,8 +369,11 @@ def evaluate(
       A `Score`: mean, stderr and returns; of mazes also success and speed.
 
     Raises:
-      DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave [-1, 1].
+      DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave [-1, 1],
+        or observations of another kind than the policy's.
     """
+    stack = _own_value(policy, "stack", stack, 3)
+    pixels = _own_value(policy, "pixels", pixels, True)
     counts = {"episodes": episodes, "stack": stack, "threads": threads}
     counts |= {} if max_steps is None else {"max_steps": max_steps}
     for name, number in (counts | {"seed": seed}).items():
@@ -383,11 +382,155 @@ def evaluate(
             raise DmcvbError(f"{name} is {number}; give a whole number, at least {least}")
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
-    shown = dict(size=size, renderer=renderer, samples=samples, backgrounds=backgrounds, split=split)
-    scene = EvaluationScene.parse(where, **shown)
+    seen = getattr(policy, "evaluation", {}) or {}
+    drawn = seen.get("renderer") or {"name": RendererChoice().backend, "samples": None}
+    if renderer in (None, drawn["name"]):
+        samples = drawn["samples"] if samples is None else samples
+    shown = dict(renderer=renderer or drawn["name"], samples=samples, backgrounds=backgrounds, split=split)
+    scene = EvaluationScene.parse(where, size=_own_value(policy, "picture_size", size, 64) if pixels else 64, **shown)
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
     evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
     try:
+        if pixels and seen:
+            _tell_differences(scene, evaluator, seen)
         return evaluator.score(policy)
     finally:
         evaluator.close()
+
+
+def _own_value(policy: Act, name: str, given: Any, usual: Any) -> Any:
+    """A property of the observations: the policy's own, else the given one, else the usual one.
+
+    Raises:
+      DmcvbError: another one is given than the policy's own.
+    """
+    own = getattr(policy, name, None)
+    if own is not None and given not in (None, own):
+        name = name.removeprefix("picture_")
+        raise DmcvbError(f"{name} is {given}, and the policy learned with {own}; leave {name} out")
+    return next(value for value in (own, given, usual) if value is not None)
+
+
+def _tell_differences(scene: EvaluationScene, evaluator: Evaluator, seen: Mapping[str, Any]) -> None:
+    """Log what an evaluation shows otherwise than the data that a trained policy learned from."""
+    here = {"renderer": {"name": scene.renderer, "samples": scene.samples}}
+    if scene.split == SPLIT and seen["backgrounds"] and evaluator.videos is not None:
+        here["backgrounds"] = evaluator.videos.digest
+    for name, value in here.items():
+        if value != seen[name]:
+            _log.warning("the policy's own evaluation has %s %s, this one %s", name, seen[name], value)
+
+
+# -- trained policies -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrainedAgent:
+    """A trained policy, to call with a batch of observations as `evaluate` gives them.
+
+    Attributes:
+      agent: what it is, e.g. "id+bc" by its name. sizes: sizes of its observations and actions.
+      policy, normalization: its networks, and the normalization of the states that it learned from.
+      evaluation: what `protocol` says of the evaluation that belongs to its data; {} if nobody knows.
+    """
+
+    agent: Agent
+    sizes: Sizes
+    policy: Policy
+    normalization: Normalization
+    evaluation: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def pixels(self) -> bool:
+        """True if it sees pictures."""
+        return not self.agent.sees_state
+
+    @property
+    def stack(self) -> int:
+        """Frames an observation."""
+        return self.agent.stack
+
+    @property
+    def picture_size(self) -> int | None:
+        """Pixels a side of its pictures; None if it sees states."""
+        return self.sizes.picture or None
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Return (episode, action) float32 in [-1, 1] for the observations of all episodes."""
+        import torch
+
+        from dmcvb_gen.agents.data import normalize_pixels
+
+        device = next(self.policy.parameters()).device
+        if self.pixels:
+            seen = normalize_pixels(torch.from_numpy(observation["pixels"]).to(device))
+        else:
+            seen = self.normalization(torch.from_numpy(observation["state"])).to(device)
+        with torch.no_grad(), self.policy.precision():
+            return self.policy.act(seen).float().clamp(-1, 1).cpu().numpy()
+
+    def save(self, path: Path, network: Architecture) -> None:
+        """Write the weights that act, the normalization, and a header with all that the networks are made from."""
+        from safetensors.torch import save_file
+
+        facts = {
+            "format": FORMAT,
+            "agent": self.agent.name,
+            "sizes": asdict(self.sizes),
+            "network": asdict(network),
+            "half": self.policy.half,
+            "evaluation": dict(self.evaluation),
+        }
+        tensors = {name: value for name, value in self.policy.state_dict().items() if self.policy.acts_by(name)}
+        tensors |= {"normalization.mean": self.normalization.mean, "normalization.std": self.normalization.std}
+        with replacing(path) as temporary:
+            whole = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
+            save_file(whole, str(temporary), metadata={"facts": json.dumps(facts)})
+
+
+FORMAT = "dmcvb-gen trained agent"
+
+
+def load_agent(path: str | Path) -> TrainedAgent:
+    """The trained policy of a file that `validate` wrote beside a cell's result. Nothing in it can run code.
+
+    Raises:
+      DmcvbError: there is no such file, or it holds something else.
+    """
+    import torch
+    from safetensors import SafetensorError, safe_open
+
+    from dmcvb_gen.agents.catalog import parse_agent
+    from dmcvb_gen.agents.data import Normalization, Sizes
+    from dmcvb_gen.agents.networks import Architecture
+
+    try:
+        with safe_open(str(path), "pt") as file:
+            facts = json.loads((file.metadata() or {}).get("facts", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        if facts.get("format") != FORMAT:
+            raise ValueError("another format")
+        normalization = Normalization(tensors.pop("normalization.mean"), tensors.pop("normalization.std"))
+        agent, sizes, network = parse_agent(facts["agent"]), Sizes(**facts["sizes"]), Architecture(**facts["network"])
+        if normalization.mean.shape != (sizes.state,) or normalization.std.shape != (sizes.state,):
+            raise ValueError("the normalization does not fit")
+        with torch.device("meta"):  # without memory: a file may name any size
+            expected = _untrained(agent, sizes, network)
+        for name, weight in expected.state_dict().items():
+            if expected.acts_by(name) and (name not in tensors or tensors[name].shape != weight.shape):
+                raise ValueError(f"{name} does not fit")
+        policy = _untrained(agent, sizes, network)
+        unexpected = policy.load_state_dict(tensors, strict=False).unexpected_keys
+        if unexpected:
+            raise ValueError(f"{unexpected[0]} does not fit")
+        policy.half = bool(facts["half"])
+        return TrainedAgent(agent, sizes, policy.eval(), normalization, dict(facts.get("evaluation", {})))
+    except (OSError, SafetensorError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+        reason = str(error).splitlines()[0]
+        raise DmcvbError(f"{path} is no agent that validate trained ({reason})") from None
+
+
+def _untrained(agent: Agent, sizes: Sizes, network: Architecture) -> Policy:
+    from dmcvb_gen.agents.catalog import make_encoder, make_policy
+
+    return make_policy(agent, make_encoder(agent, sizes, architecture=network), sizes, network)

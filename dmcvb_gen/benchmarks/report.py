@@ -1,45 +1,57 @@
-"""Write the report of a validation: one self-contained HTML page, its tables as Markdown, and a JSON file.
+"""Validate a release: check it, run benchmarks on it, and write one page about it all.
 
-Wherever a score stands, the profile that made it stands beside it. The page's text lies in data/report.html.jinja,
-the tables' in data/report.md.jinja; here is what they show.
+The page is self-contained HTML; its tables lie beside it as Markdown, and all facts as JSON. It shows the results that
+lie in cells/ with the fingerprint of this release and budget; another release or budget means another folder.
+Wherever a score stands, the budget that made it stands beside it.
 """
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import html
+import io
+import json
+import math
 import re
+import tempfile
+import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from dmcvb_gen.benchmarks.agreement import rank_agreement, shared_cells
-from dmcvb_gen.benchmarks.checks import Structure, comparable, known_returns
-from dmcvb_gen.benchmarks.claims import claim_words, judge, mean_of
-from dmcvb_gen.benchmarks.figures import (
-    agreement_figures,
-    curve_figures,
-    data_url,
-    figure_url,
-    label_of,
-    place_of,
-    return_figures,
+from dmcvb_gen.agents.catalog import parse_agent
+from dmcvb_gen.agents.trainer import Budget
+from dmcvb_gen.benchmarks.cell import OwnAgent, default_threads, kept_results, open_data, planned_steps, run_cells
+from dmcvb_gen.benchmarks.checks import (
+    Results,
+    Structure,
+    check_structure,
+    comparable,
+    known_returns,
+    training_warnings,
 )
-from dmcvb_gen.benchmarks.kept import recipe_digest
-from dmcvb_gen.benchmarks.paper import paper_score
-from dmcvb_gen.benchmarks.setup import Setup
-from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, Missing
+from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, get_budget, only, paper_score, plan_benchmark
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import environment
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
+from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.spec import is_maze, task_folder
+from dmcvb_gen.spec import is_maze, matches, task_folder
+from dmcvb_gen.storage.remote import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import pluralize
 from dmcvb_gen.version import __version__
@@ -56,7 +68,7 @@ CHECKS = {
     "rewards": "physics gives the stored rewards",
     "physics": "stored actions lead to the stored physics states",
     "pixels": "sampled frames painted again are the stored ones",
-    "pictures": "no black, one-colored or frozen images",
+    "pictures": "no black or one-colored images",
     "labels": "distractor labels fit their setting",
     "modalities": "depth, segmentation and the like, if stored, are what the states show",
 }
@@ -68,35 +80,247 @@ SHEETS = 60
 MARKUP = {ord(mark): f"&#{ord(mark)};" for mark in "|\\*_`"}
 """Written as entities, they mean nothing to any reader of Markdown."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
-Results = Sequence[tuple[Cell, dict[str, Any]]]
+SAMPLES = 2_000
+"""Samples of the bootstrap."""
+FEWEST = 3
+"""Cells below which a rank correlation says nothing."""
+DPI = 110
+FEW_RETURNS = 20
+"""Fewer episodes are drawn as a mark each: bars would look like a distribution."""
 
 
-def write_report(
+# -- the validation ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Result of a validation.
+
+    Attributes:
+      structure: result of the structure checks.
+      results: (cell, result) of every cell that was asked for; a result of {"error": ...} failed.
+      missing: subsets that the benchmarks would need besides.
+      episodes: committed, and asked for by the manifest.
+      report: the page. facts: the JSON file beside it.
+    """
+
+    structure: Structure
+    results: tuple[tuple[Cell, dict[str, Any]], ...]
+    missing: tuple[Missing, ...]
+    warnings: tuple[Issue, ...]
+    episodes: tuple[int, int]
+    report: Path
+    facts: Path
+
+    @property
+    def failed(self) -> tuple[tuple[Cell, str], ...]:
+        return tuple((cell, result["error"]) for cell, result in self.results if "error" in result)
+
+    @property
+    def sound(self) -> bool:
+        """True if the release is sound and every cell could be run."""
+        return self.structure.sound and not self.failed
+
+    @property
+    def complete(self) -> bool:
+        """True if every episode is there."""
+        return self.episodes[0] == self.episodes[1]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Callbacks that follow a validation.
+
+    Attributes:
+      checking: a tick, told the subset that is checked.
+      total: called with the number of Adam steps to come.
+      training: called with what is trained and the steps made.
+      done: called with each cell and its result.
+    """
+
+    checking: ProgressCallback = ignore
+    total: Callable[[int], None] = field(default=lambda steps: None)
+    training: Callable[[str, int], None] = field(default=lambda what, steps: None)
+    done: Callable[[Cell, dict[str, Any]], None] = field(default=lambda cell, result: None)
+
+
+def make_budget(
+    profile: str = "smoke",
     *,
-    setup: Setup,
+    scale: float = 1.0,
+    workers: Workers = 1,
+    threads: int | None = None,
+    device: str = "cpu",
+    precision: str = "auto",
+    memory: float | None = None,
+    **fields: Any,
+) -> Budget:
+    """Make the budget of a validation from a user's arguments.
+
+    Args:
+      profile: "smoke", "brief", "quick" or "paper". scale: factor of its steps.
+      workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
+      precision: "auto" takes bfloat16 if the device has instructions for it.
+      memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
+      fields: others of `Budget`.
+
+    Raises:
+      DmcvbError: an unknown profile, or a device that is not here.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    return replace(
+        get_budget(profile).scaled(scale),
+        device=device,
+        precision=choose_precision(precision, device),
+        threads=threads or (default_threads(workers) if isinstance(workers, int) else 1),
+        memory=None if memory is None else int(memory * 1e9),
+        **{name: str(value) if isinstance(value, Path) else value for name, value in fields.items()},
+    )
+
+
+def validate(
+    path: str | Path,
+    out: str | Path,
+    budget: Budget,
+    *,
+    benchmarks: Sequence[str] = ("b1",),
+    agents: Sequence[str] = (),
+    patterns: Sequence[str] = (),
+    workers: Workers = 1,
+    train_unsound: bool = False,
+    progress: Progress | None = None,
+) -> Validation:
+    """Check a release, run benchmarks on it and write the report.
+
+    Args:
+      path: the release's folder. out: the report's.
+      benchmarks: names of registered benchmarks; none: structure checks alone.
+      agents: instead of each benchmark's own.
+      patterns: only these subsets.
+      workers: subsets checked and cells trained side by side, or a Ray cluster that sees the same folders.
+      train_unsound: run the benchmarks even if a structure check fails.
+
+    Raises:
+      DmcvbError: there is no release, or a name is unknown, or the release has no data for a benchmark asked for, or
+        the report's folder cannot be written, or holds results of another release or budget.
+    """
+    started, progress = time.perf_counter(), progress or Progress()
+    release = open_data(path, budget)
+    chosen, cells, missing = plan_validation(release, benchmarks, agents, patterns)
+    if patterns:  # a subset that was not asked for is not missing
+        asked = [replace(one, subsets=tuple(n for n in one.subsets if matches(n, patterns))) for one in missing]
+        missing = [one for one in asked if one.subsets or one.left_out]
+    claim_folder(out, release, budget, training=bool(cells))
+    structure = check_structure(chosen, budget.backgrounds, progress.checking, workers)
+    results: list[tuple[Cell, dict[str, Any]]] = []
+    if structure.sound or train_unsound:
+        progress.total(planned_steps(budget, cells))
+        for cell, result in run_cells(path, out, budget, cells, workers, progress.training):
+            progress.done(cell, result)
+            results.append((cell, {key: value for key, value in result.items() if key != "kept"}))
+        results.sort(key=lambda pair: cells.index(pair[0]))
+    known = {cell for cell, _ in results}
+    shown = [*results, *((cell, result) for cell, result in kept_results(release, out, budget) if cell not in known)]
+    warnings = (*structure.warnings, *training_warnings(release, budget, shown))
+    planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
+    facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
+    facts |= {"seconds": time.perf_counter() - started}
+    page = write_report(Path(out), facts, chosen, shown)
+    there, asked = (facts["episodes"][name] for name in ("there", "asked"))
+    json_file = page.with_suffix(".json")
+    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), page, json_file)
+
+
+def plan_validation(
+    release: Release, benchmarks: Sequence[str], agents: Sequence[str], patterns: Sequence[str]
+) -> tuple[Release, list[Cell], list[Missing]]:
+    """The subsets that are asked for, the cells of the benchmarks on them, and what is missing for others.
+
+    Raises:
+      DmcvbError: a name is unknown, or there are no data for a benchmark.
+    """
+    chosen = only(release, patterns)
+    if not chosen.subsets:
+        raise DmcvbError(f"{release.root} has no committed episodes yet; run the rollout first")
+    cells: list[Cell] = []
+    missing: list[Missing] = []
+    for name in dict.fromkeys(benchmarks):
+        found, lacking = plan_benchmark(name, chosen, agents, release.subsets.keys() - chosen.subsets.keys())
+        if not found:
+            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
+            needs += [f"let --only take {', '.join(m.left_out[:4])}" for m in lacking if m.left_out]
+            cure = "; ".join(needs) or "roll out a locomotion task"
+            raise DmcvbError(f"benchmark {name} has no data in {chosen.root}; {cure}")
+        cells += found
+        missing += lacking
+    used = {cell.agent for cell in cells}
+    for agent in used:
+        if agent.own:
+            OwnAgent.load(agent.own)  # a wrong name is told before any work
+    idle = [name for name in agents if (agent := parse_agent(name)).pretrain is None and agent not in used]
+    if benchmarks and idle:
+        raise DmcvbError(
+            f"{' and '.join(benchmarks)}: agents with a pre-trained encoder are set beside bc, and "
+            f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} none; remove "
+            f"{'it' if len(idle) == 1 else 'them'}, or add --benchmark b1"
+        )
+    return chosen, cells, missing
+
+
+def claim_folder(out: str | Path, release: Release, budget: Budget, training: bool) -> None:
+    """Make the report's folder, see that it takes files, and note whose results it holds; all before any work.
+
+    Raises:
+      DmcvbError: the folder cannot be made or written, or holds results of another release or budget.
+    """
+    folder = local_path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
+    mine, path = {"release": release.manifest.name, "budget": budget.facts()}, folder / "budget.json"
+    try:
+        there = json.loads(path.read_text())
+    except (OSError, ValueError):
+        there = None
+    if there is not None and there != mine:
+        names = {f"budget.{name}" for name in mine["budget"] if there["budget"].get(name) != mine["budget"][name]}
+        names |= {"release"} if there["release"] != mine["release"] else set()
+        whose = "release {release}, profile {budget[name]}, seed {budget[seed]}".format(**there)
+        raise DmcvbError(f"{out} holds results of {whose} (other {', '.join(sorted(names))}); give another --out")
+    if training:
+        write_json(path, mine)
+
+
+# -- facts ------------------------------------------------------------------------------------------
+
+
+def write_report(folder: Path, facts: Mapping[str, Any], release: Release, results: Results) -> Path:
+    """Write report.html, .md and .json into a folder; gives the path of the page."""
+    page = folder / "report.html"
+    write_json(page.with_suffix(".json"), facts)
+    write_text(page.with_suffix(".md"), render_tables(facts))
+    good = [(cell, result) for cell, result in results if "error" not in result]
+    write_text(page, render_page(facts, release, good, folder))
+    return page
+
+
+def report_facts(
     release: Release,
+    budget: Budget,
     structure: Structure,
-    cells: Sequence[Cell],
+    planned: int,
     results: Results,
     missing: Sequence[Missing],
     warnings: Sequence[Issue],
-    seconds: float,
-    name: str = "report",
-) -> tuple[Path, Path]:
-    """Write <name>.html, .md and .json into the setup's folder; gives the paths of the page and of the JSON file."""
-    page = Path(setup.out) / f"{name}.html"
-    facts = report_facts(setup, release, structure, cells, results, missing, warnings, seconds)
-    write_json(page.with_suffix(".json"), facts)
-    good = [(cell, result) for cell, result in results if "error" not in result]
-    write_text(page.with_suffix(".md"), render_tables(facts))
-    write_text(page, render_page(facts, release, good, setup))
-    return page, page.with_suffix(".json")
-
-
-def report_facts(setup, release, structure, cells, results, missing, warnings, seconds) -> dict[str, Any]:
+) -> dict[str, Any]:
     """Everything that the page says, as plain values."""
     failed = [{"cell": cell.id, "error": result["error"]} for cell, result in results if "error" in result]
-    there, asked = release_episodes(release)
+    asked = {record.name: record.episodes for record in release.manifest.subsets}
+    there = asked | {name: have for name, (have, _) in release.shortfalls.items()}
     return {
         "format": "dmcvb-gen validation",
         "generator": f"dmcvb-gen {__version__}",
@@ -105,21 +329,14 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
             "name": release.manifest.name,
             "version": release.manifest.version,
             "digest": release.manifest.digest,
-            "recipe_digest": recipe_digest(release),
-            "pixels": any(record.pixels for record in release.manifest.subsets),
             "path": release.root,
         },
         "sound": structure.sound and not failed,
         "complete": there == asked,
         "episodes": {"there": sum(there.values()), "asked": sum(asked.values())},
         "incomplete": {name: [there[name], asked[name]] for name in asked if there[name] < asked[name]},
-        "profile": dataclasses.asdict(setup.profile),
-        "structure": {
-            "sound": structure.sound,
-            "checked": structure.checked,
-            "seconds": structure.seconds,
-            "findings": [dataclasses.asdict(finding) for finding in structure.findings],
-        },
+        "budget": dataclasses.asdict(budget),
+        "structure": dataclasses.asdict(structure) | {"sound": structure.sound, "warnings": None},
         "warnings": [dataclasses.asdict(finding) for finding in warnings],
         "returns": {
             name: return_statistics(returns)
@@ -127,22 +344,13 @@ def report_facts(setup, release, structure, cells, results, missing, warnings, s
             for name, returns in known_returns(release).items()
             for subset in [release[name]]
         },
-        "cells_planned": len(cells),
+        "cells_planned": planned,
         "failed": failed,
         "results": [result | compare(cell, results) for cell, result in results if "error" not in result],
+        "comparison": comparison(budget, results),
         "missing": [dataclasses.asdict(entry) for entry in missing],
-        "settings": {
-            key: value for key, value in dataclasses.asdict(setup).items() if key not in ("profile", "root", "out")
-        },
         "versions": environment(),
-        "seconds": seconds,
     }
-
-
-def release_episodes(release: Release) -> tuple[dict[str, int], dict[str, int]]:
-    """Subset -> episodes that are committed, and that the manifest asks for."""
-    asked = {record.name: record.episodes for record in release.manifest.subsets}
-    return {name: len(release.subsets[name].episodes) if name in release.subsets else 0 for name in asked}, asked
 
 
 def compare(cell: Cell, results: Results) -> dict[str, Any]:
@@ -172,28 +380,78 @@ def compare(cell: Cell, results: Results) -> dict[str, Any]:
     return {"share": ours, "paper_share": paper, "difference": difference, "reference": benchmark.reference(cell)}
 
 
-# -- the page -------------------------------------------------------------------------------------
+def comparison(budget: Budget, results: Results) -> dict[str, list[dict[str, Any]]]:
+    """The cells of B1 that the paper's table has, too, and how alike they are ranked.
+
+    A score is taken as a share of its data's mean return, ours of our data and the paper's of the paper's, so that
+    tasks and levels compare. Cells whose episodes were cut elsewhere than the data's are left out.
+
+    Returns:
+      cells: task, where, ours, stderr, paper, ratio, paper_ratio. ranks: task, cells, rho, low, high: Spearman's rho of
+      a task's cells and of all, with the ends of its 95 % interval, a stratified bootstrap over episodes as in rliable
+      (Agarwal et al. 2021).
+    """
+    rows, shares = [], []
+    for cell, result in results:
+        data = paper_score(cell.task, cell.policy_label, cell.setting, "data")
+        if not (budget.scores and data and result.get("paper")) or result["data"]["mean"] <= 0:
+            continue
+        score, whole = result["score"], result["data"]["mean"]
+        if score["limit"] != result["data"]["limit"]:
+            continue
+        row = {"task": cell.task, "where": f"{cell.policy_label} {cell.setting} {cell.agent.name}"}
+        row |= {"ours": score["mean"], "stderr": score["stderr"], "paper": result["paper"]["mean"]}
+        rows.append(row | {"ratio": score["mean"] / whole, "paper_ratio": result["paper"]["mean"] / data[0]})
+        shares.append(np.array(score["returns"]) / whole)
+    groups = {task: [i for i, row in enumerate(rows) if row["task"] == task] for task in {r["task"]: 0 for r in rows}}
+    groups |= {"all tasks": list(range(len(rows)))} if len(groups) > 1 else {}
+    ranks = [
+        {"task": task, "cells": len(group)}
+        | rank_correlation([shares[i] for i in group], [rows[i]["paper_ratio"] for i in group])
+        for task, group in groups.items()
+        if len(group) >= FEWEST
+    ]
+    return {"cells": rows, "ranks": ranks}
 
 
-def render_page(facts: Mapping[str, Any], release: Release, good: Results, setup: Setup) -> str:
+def rank_correlation(returns: Sequence[np.ndarray], paper: Sequence[float], seed: int = 0) -> dict[str, float]:
+    """Spearman's rho between the means of (episode,) returns and the paper's numbers, and its 95 % interval."""
+    from scipy.stats import bootstrap, spearmanr  # takes a second, which other reports need not wait for
+
+    def rho(*drawn: np.ndarray) -> float:
+        ours = [of_cell.mean() for of_cell in drawn]
+        return float(spearmanr(ours, paper).statistic) if len(set(ours)) > 1 else 0.0  # all alike: no order
+
+    drawn = bootstrap(returns, rho, vectorized=False, n_resamples=SAMPLES, method="percentile", random_state=seed)
+    low, high = drawn.confidence_interval
+    return {"rho": rho(*returns), "low": float(low), "high": float(high)}
+
+
+# -- the page ---------------------------------------------------------------------------------------
+
+
+def render_page(facts: Mapping[str, Any], release: Release, good: Results, folder: Path) -> str:
     """The page of a report, self-contained.
 
     Args:
-      good: results of cells that did not fail.
+      good: results of cells that did not fail. folder: the report's.
     """
-    name = facts["profile"]["name"]
+    name = facts["budget"]["name"]
     return _template("report.html.jinja", autoescape=True).render(
         **_tables(facts),
         figures={
             "returns": [figure_url(figure) for figure in return_figures(release)],
-            "agreement": [figure_url(figure) for figure in agreement_figures(shared_cells(facts["results"]))],
             "curves": [figure_url(figure) for figure in curve_figures(good, name)],
         },
-        rollouts=_sheets(good, setup, "rollout"),
-        decoders=_sheets(good, setup, "decoder"),
+        rollouts=_sheets(good, folder, "rollout"),
+        decoders=_sheets(good, folder, "decoder"),
         inspection=_inspection(good, name),
-        times=_times(facts),
-        settings=_settings(facts),
+        times=[
+            (result["id"], *(f"{result['seconds'][part]:.0f}" for part in ("training", "evaluation", "inspection")))
+            for result in facts["results"]
+        ],
+        seconds=facts["seconds"],
+        settings=list({**facts["budget"], **facts["versions"]}.items()),
     )
 
 
@@ -208,14 +466,14 @@ def _template(name: str, autoescape: bool = False) -> Template:
     environment = Environment(
         loader=loader, autoescape=autoescape, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"cell": _markdown_cell, "values_of": _values_of, "score_row": _score_row}
+    environment.filters |= {"cell": _markdown_cell, "score_row": _score_row}
     return environment.get_template(name)
 
 
 def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
     return dict(
         release=facts["release"],
-        profile=facts["profile"],
+        budget=facts["budget"],
         verdict=_verdict(facts),
         trained=bool(facts["cells_planned"]),
         checks=_checks(facts["structure"]["findings"]),
@@ -225,10 +483,9 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         failed=[(entry["cell"], entry["error"]) for entry in facts["failed"]],
         returns=_returns(facts["returns"]),
         scores=[_scores(name, facts) for name in dict.fromkeys(r["cell"]["benchmark"] for r in facts["results"])],
-        groups=_groups(facts["results"]),
-        agreement=[(one.task, str(one)) for one in rank_agreement(shared_cells(facts["results"]))],
-        notes=_notes(facts["results"]),
-        answers=_answers(facts["results"]),
+        groups=_groups(facts),
+        comparison=_comparison(facts["comparison"]),
+        notes=_notes(facts),
         missing=_missing(facts["missing"]),
     )
 
@@ -239,21 +496,9 @@ def _markdown_cell(value: Any) -> str:
     return "<br>".join(text.replace("](", "]&#40;").splitlines())  # no link; "[smoke]" stays as it is
 
 
-def _values_of(row: Mapping[str, Any], names: Sequence[str]) -> list[Any]:
-    return [row[name] for name in names]
-
-
-def _score_row(row: Mapping[str, Any], profile: str) -> list[str]:
-    """A row of `_scores` in plain text, its profile beside every score."""
-    return [*row["facts"], "\n".join(row["data"]), *(_score_text(entry, profile) for entry in row["scores"])]
-
-
-def _score_text(entry: Mapping[str, Any] | None, profile: str) -> str:
-    if entry is None:
-        return ""
-    paper = entry["paper"]
-    published = [f"paper {paper['mean']} ± {paper['stderr']}{paper['share']}"] if paper else []
-    return "\n".join([f"{entry['mean']} ± {entry['stderr']} [{profile}]", *entry["lines"], *published])
+def _score_row(row: Mapping[str, Any]) -> list[str]:
+    """A row of `_scores` in plain text."""
+    return [*row["facts"], "\n".join(row["data"]), *("\n".join(lines or ()) for lines in row["scores"])]
 
 
 def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
@@ -270,19 +515,18 @@ def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
         kind, text = "sound", f"Sound: {checked}."
     if kind == "unsound" and not facts["complete"]:
         text += f" Incomplete: {there:,} of {asked:,} episodes."
-    done = len(facts["results"])
     if facts["cells_planned"]:
-        text += f" {done} of {facts['cells_planned']} benchmark cells run [{facts['profile']['name']}]."
+        done, name = len(facts["results"]), facts["budget"]["name"]
+        text += f" {done} of {facts['cells_planned']} benchmark cells run [{name}]."
     else:
         text += " The data were checked; no agent was trained."
     text += f" {pluralize(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
     return {"kind": kind, "text": text}
 
 
-def _checks(findings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _checks(findings: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int]]:
     counts = Counter(finding["check"] for finding in findings)
-    names = dict.fromkeys([*CHECKS, *counts])
-    return [{"name": name, "says": CHECKS.get(name, name), "findings": counts[name]} for name in names]
+    return [(name, CHECKS.get(name, name), counts[name]) for name in dict.fromkeys([*CHECKS, *counts])]
 
 
 def _listed(findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -303,17 +547,17 @@ def _returns(returns: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """One benchmark's table: a row a task, policy set and setting, a column an agent."""
     results = [result for result in facts["results"] if result["cell"]["benchmark"] == benchmark]
-    agents = list(dict.fromkeys(result["cell"]["agent_name"] for result in results))
-    rows: dict[tuple, dict[str, Any]] = {}
-    by_state: dict[tuple, dict[str, Any]] = {}
+    agents = list(dict.fromkeys(result["cell"]["agent"] for result in results))
+    rows: dict[tuple, dict[str, list[str]]] = {}
+    by_state: dict[tuple, dict[str, list[str]]] = {}
     data: dict[tuple, list[str]] = {}
     for result in results:
         cell = result["cell"]
-        key = (task_folder(cell["task"]), cell["policy_label"], cell["setting"])
-        data[key] = _data_lines(result["data"])
-        rows.setdefault(key, {})[cell["agent_name"]] = entry = _score(result)
-        if cell["agent"]["sees_state"]:
-            by_state.setdefault(key[:2], {})[cell["agent_name"]] = entry
+        key = (task_folder(cell["task"]), result["labels"]["policy"], cell["setting"])
+        data[key] = [_number(result["data"]["mean"]), *_goal_lines(result["data"])]
+        rows.setdefault(key, {})[cell["agent"]] = lines = _score_lines(result, facts["budget"])
+        if parse_agent(cell["agent"]).sees_state:
+            by_state.setdefault(key[:2], {})[cell["agent"]] = lines
     for key, row in rows.items():  # states know of no distractors: one score stands beside those of every setting
         rows[key] = by_state.get(key[:2], {}) | row
     return {
@@ -326,50 +570,22 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _groups(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Means that the paper gives: of mazes by their group of layouts (B1), of goal pairs by their maze (B3)."""
-    groups: dict[tuple, list[Mapping[str, Any]]] = {}
-    for result in results:
-        cell = result["cell"]
-        if not is_maze(cell["task"]) or not result["profile"]["scores"]:
-            continue
-        group = BENCHMARKS.get(cell["benchmark"]).group(cell["task"], cell["policy_label"])
-        if group is None:
-            continue
-        encoder = f" (encoder: {cell['pretrain_label']})" if cell["pretrain_label"] else ""
-        key = (cell["benchmark"], *group, cell["setting"], cell["agent_name"] + encoder)
-        groups.setdefault(key, []).append(result)
-    rows = []
-    for key, members in groups.items():
-        scores = [member["score"] for member in members]
-        mean, error = mean_of([score["mean"] for score in scores], [score["stderr"] for score in scores])
-        success = sum(score["success"] for score in scores) / len(scores)
-        rows.append((*key, str(len(scores)), f"{_number(mean)} ± {_number(error)}", f"{100 * success:.0f} %"))
-    return rows
-
-
-def _number(value: float) -> str:
-    """A return: one decimal if that is worth something."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
-
-
-def _score(result: Mapping[str, Any]) -> dict[str, Any]:
-    """An entry of a score table: mean and standard error, further lines, and the paper's."""
+def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[str]:
+    """An entry of a score table: mean and standard error with the budget, further lines, and the paper's."""
     score, paper = result["score"], result["paper"]
-    lines = _goal_lines(score)
-    if result["share"] is not None and result["profile"]["scores"]:
-        lines.insert(0, f"{100 * result['share']:.0f} % of {result['reference']}")
-    elif result["difference"] and result["profile"]["scores"]:  # 0 is the reference itself
+    lines = [f"{_number(score['mean'])} ± {_number(score['stderr'])} [{budget['name']}]"]
+    if result["share"] is not None and budget["scores"]:
+        lines.append(f"{100 * result['share']:.0f} % of {result['reference']}")
+    elif result["difference"] and budget["scores"]:  # 0 is the reference itself
         side = "above" if result["difference"] > 0 else "below"
-        lines.insert(0, f"{_number(abs(result['difference']))} {side} {result['reference']}")
-    if result["cell"]["pretrain_label"]:
-        lines.append(f"encoder: {result['cell']['pretrain_label']}")
-    if paper and result["profile"]["scores"]:
+        lines.append(f"{_number(abs(result['difference']))} {side} {result['reference']}")
+    lines += _goal_lines(score)
+    if result["labels"]["encoder"]:
+        lines.append(f"encoder: {result['labels']['encoder']}")
+    if paper and budget["scores"]:  # noise is never set beside the paper's numbers
         share = f", {100 * result['paper_share']:.0f} %" if result["paper_share"] is not None else ""
-        paper = {"mean": f"{paper['mean']:.0f}", "stderr": f"{paper['stderr']:.0f}", "share": share}
-    else:
-        paper = None  # noise is never set beside the paper's numbers
-    return {"mean": _number(score["mean"]), "stderr": _number(score["stderr"]), "lines": lines, "paper": paper}
+        lines.append(f"paper {paper['mean']:.0f} ± {paper['stderr']:.0f}{share}")
+    return lines
 
 
 def _goal_lines(score: Mapping[str, Any]) -> list[str]:
@@ -380,27 +596,58 @@ def _goal_lines(score: Mapping[str, Any]) -> list[str]:
     return lines + [f"{score['speed']:.2f} m/s to the goal"] if score["speed"] is not None else lines
 
 
-def _data_lines(data: Mapping[str, Any]) -> list[str]:
-    return [_number(data["mean"]), *_goal_lines(data)]
+def _number(value: float) -> str:
+    """A return: one decimal if that is worth something."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
-def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
+def _groups(facts: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Means that the paper gives: of mazes by their group of layouts (B1), of goal pairs by their maze (B3).
+
+    The standard error takes the scores for independent.
+    """
+    groups: dict[tuple, list[Mapping[str, Any]]] = {}
+    for result in facts["results"] if facts["budget"]["scores"] else ():
+        cell = Cell.of(result["cell"])
+        group = BENCHMARKS.get(cell.benchmark).group(cell) if is_maze(cell.task) else None
+        if group is not None:
+            groups.setdefault((cell.benchmark, *group, cell.setting, cell.label), []).append(result["score"])
+    rows = []
+    for key, scores in groups.items():
+        mean = math.fsum(score["mean"] for score in scores) / len(scores)
+        error = math.sqrt(math.fsum(score["stderr"] ** 2 for score in scores)) / len(scores)
+        success = sum(score["success"] for score in scores) / len(scores)
+        rows.append((*key, str(len(scores)), f"{_number(mean)} ± {_number(error)}", f"{100 * success:.0f} %"))
+    return rows
+
+
+def _comparison(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, list[tuple[str, ...]]]:
+    cells = [
+        (row["task"], row["where"], f"{_number(row['ours'])} ± {_number(row['stderr'])}", _number(row["paper"]))
+        + (f"{row['ratio']:.2f}", f"{row['paper_ratio']:.2f}")
+        for row in found["cells"]
+    ]
+    ranks = [
+        (row["task"], str(row["cells"]), f"{row['rho']:.2f} [{row['low']:.2f}, {row['high']:.2f}]")
+        for row in found["ranks"]
+    ]
+    return {"cells": cells, "ranks": ranks}
+
+
+def _notes(facts: Mapping[str, Any]) -> list[str]:
     """Return the notes that a reader of the scores needs."""
+    results = facts["results"]
     most = max((result["evaluations"] for result in results), default=1)
     kind = "of the trained policy" if most == 1 else f"the best of {most} over a training, as in the paper"
     notes = [f"A score is an online evaluation {kind}: mean and standard error over its episodes."]
     for evaluated, data in sorted({(r["score"]["limit"], r["data"]["limit"]) for r in results}):
-        if evaluated == data:
-            notes.append(f"Evaluations are cut at {evaluated:,} agent steps, as the data are.")
-        else:
-            notes.append(
-                f"Evaluations are cut at {evaluated:,} agent steps, the data at {data:,}: their returns cannot be "
-                "compared where the end is not reached before."
-            )
+        text = f"Evaluations are cut at {evaluated:,} agent steps, "
+        unlike = f"the data at {data:,}: their returns cannot be compared where the end is not reached before."
+        notes.append(text + ("as the data are." if evaluated == data else unlike))
     pictured = [result for result in results if "size" in result["evaluation"]]
-    others = ", agents that see states in float32" if len(pictured) < len(results) else ""
-    for precision in sorted({result["machine"]["precision"] for result in pictured}):
-        notes.append(f"Networks that see images computed in {precision}{others}.")
+    if pictured:
+        others = ", agents that see states in float32" if len(pictured) < len(results) else ""
+        notes.append(f"Networks that see images computed in {facts['budget']['precision']}{others}.")
     for data, evaluation in sorted({(r["renderers"]["data"], r["renderers"]["evaluation"]) for r in pictured}):
         if data != evaluation:
             notes.append(
@@ -415,80 +662,110 @@ def _notes(results: Sequence[Mapping[str, Any]]) -> list[str]:
     return notes
 
 
-def _answers(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    words = claim_words()
-    return [(words[a.claim], a.where, a.answer, a.numbers) for a in judge(results)]
+def _inspection(good: Results, budget: str) -> list[tuple]:
+    rows = []
+    for cell, result in good:
+        if found := result["inspection"]:
+            errors = [found[key] for key in ("observation_mse", "state_mse")]
+            fields = ", ".join(f"{name} {error:.3f}" for name, error in (found["state_l1"] or {}).items())
+            shown = ["-" if error is None else f"{error:.4f}" for error in errors]
+            rows.append((cell.label, cell.place, *shown, fields, budget))
+    return rows
 
 
-def _inspection(good: Results, profile: str) -> list[tuple]:
-    return [
-        (
-            label_of(cell),
-            place_of(cell),
-            *(
-                "-" if result["inspection"][key] is None else f"{result['inspection'][key]:.4f}"
-                for key in ("observation_mse", "state_mse")
-            ),
-            ", ".join(f"{field} {error:.3f}" for field, error in (result["inspection"]["state_l1"] or {}).items()),
-            profile,
-        )
-        for cell, result in good
-        if result["inspection"]
-    ]
-
-
-def _sheets(good: Results, setup: Setup, kind: str) -> dict[str, Any]:
+def _sheets(good: Results, folder: Path, kind: str) -> dict[str, Any]:
     """Pictures that cells left: "rollout" or "decoder"."""
-    found = []
     seeing = [(cell, result) for cell, result in good if not cell.agent.sees_state]
-    paths = [setup.cells / f"{cell.id}.{kind}.png" for cell, _ in seeing]
+    paths = [folder / "cells" / f"{cell.id}.{kind}.png" for cell, _ in seeing]
     there = [(*pair, path) for pair, path in zip(seeing, paths, strict=True) if path.exists()]
+    found = []
     for cell, result, path in there[:SHEETS]:
-        caption = f"{label_of(cell)} on {place_of(cell)}"
+        caption = f"{cell.label} on {cell.place}"
         if kind == "rollout":
-            score = result["final"]
-            caption += f": first of {len(score['returns'])} episodes of the last evaluation, return "
-            caption += f"{_number(score['returns'][0])} [{setup.profile.name}]"
+            returns = result["final"]["returns"]
+            caption += f": first of {len(returns)} episodes of the last evaluation, return {_number(returns[0])} "
+            caption += f"[{result['budget']['name']}]"
         found.append({"caption": caption, "source": data_url(path.read_bytes())})
     return {"shown": found, "more": len(there) - len(found), "names": f"cells/*.{kind}.png"}
 
 
-def _missing(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _missing(entries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
     rows = []
     for entry in entries:
-        command = entry["command"].startswith("dmcvb-gen")
         if entry["subsets"]:
-            subsets = ", ".join(entry["subsets"])
-            rows.append(dict(benchmark=entry["benchmark"], subsets=subsets, how=entry["command"], command=command))
+            rows.append((entry["benchmark"], ", ".join(entry["subsets"]), entry["command"]))
         if entry["left_out"]:
-            subsets, how = ", ".join(entry["left_out"]), "in the release, left out by --only"
-            rows.append(dict(benchmark=entry["benchmark"], subsets=subsets, how=how, command=False))
+            rows.append((entry["benchmark"], ", ".join(entry["left_out"]), "in the release, left out by --only"))
     return rows
 
 
-def _times(facts: Mapping[str, Any]) -> dict[str, Any]:
-    rows = [
-        (
-            result["id"],
-            *(f"{result['seconds'][part]:.0f}" for part in ("training", "evaluation", "inspection", "all")),
-            f"{result['pretraining']['seconds']:.0f}" if result["pretraining"] else "",
-            f"{result['steps_per_second']:.1f}",
-            f"{result['memory_bytes'] / 1e9:.1f}",
-        )
-        for result in facts["results"]
-    ]
-    return {"rows": rows, "total": f"{facts['seconds']:.0f}", "structure": f"{facts['structure']['seconds']:.0f}"}
+# -- figures ----------------------------------------------------------------------------------------
 
 
-def _settings(facts: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    if not facts["cells_planned"]:
-        return list({**facts["settings"], **facts["versions"]}.items())
-    profile = {key: value for key, value in facts["profile"].items() if key not in ("name", "note")}
-    network = profile["network"]
-    profile["network"] = "channels {}, strides {}".format(
-        *(" ".join(map(str, network[key])) for key in ("channels", "strides"))
-    )
-    return list({"profile": facts["profile"]["name"], **profile, **facts["settings"], **facts["versions"]}.items())
+def data_url(png: bytes) -> str:
+    """A PNG as a URL that holds it."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-__all__ = ["CHECKS", "compare", "release_episodes", "render_page", "render_tables", "report_facts", "write_report"]
+def figure_url(figure: Figure) -> str:
+    """A figure as a PNG in a URL."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return data_url(buffer.getvalue())
+
+
+def return_figures(release: Release) -> Iterator[Figure]:
+    """A histogram of each subset's returns, the paper's quartiles and range as a box under it."""
+    for name, returns in known_returns(release).items():
+        figure = Figure(figsize=(4, 2.4), layout="constrained")
+        axis, subset, few = figure.add_subplot(), release.subsets[name], len(returns) < FEW_RETURNS
+        if few:
+            axis.plot(returns, np.full(len(returns), 0.5), "|", color="#4477aa", markersize=14, markeredgewidth=2)
+            axis.set_ylim(-0.25, 1)
+        else:
+            axis.hist(returns, bins=30, color="#4477aa")
+            axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.set_title(name.replace("/", "\n", 1), fontsize=9)
+        axis.set(xlabel="return", ylabel="a mark an episode" if few else "episodes")
+        paper = paper_returns(subset.task, subset.level) if comparable(subset) else None
+        if paper:
+            low = -0.12 * axis.get_ylim()[1]
+            axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)
+            axis.plot([paper["p25"], paper["p75"]], [low, low], color="#cc6677", linewidth=6, solid_capstyle="butt")
+            axis.plot([paper["median"]], [low], "|", color="black", markersize=9)
+            axis.set_yticks([tick for tick in axis.get_yticks() if tick >= 0])
+        if few:
+            axis.set_yticks([])
+        yield figure
+
+
+def curve_figures(results: Results, budget: str) -> Iterator[Figure]:
+    """A figure a group of cells (task, policy set, setting): losses on the left, online scores on the right."""
+    groups: dict[tuple, list] = {}
+    for cell, result in results:
+        groups.setdefault((cell.benchmark, cell.place), []).append((cell, result))
+    colors = {name: f"C{index}" for index, name in enumerate(dict.fromkeys(cell.label for cell, _ in results))}
+    for (_, place), members in groups.items():
+        figure = Figure(figsize=(11, 2.8), layout="constrained")
+        loss, score = figure.subplots(1, 2)
+        for cell, result in members:
+            _draw_curve(loss, score, cell.label, colors[cell.label], result["curve"])
+        evaluated, data = members[0][1]["score"], members[0][1]["data"]
+        if evaluated["limit"] == data["limit"]:  # else their returns cannot be compared
+            score.axhline(data["mean"], color="gray", linestyle="--", linewidth=1, label="data")
+        loss.set(title=f"{place}: loss (test solid, training dotted)", xlabel="Adam step", yscale="log")
+        score.set(title=f"online return [{budget}]", xlabel="Adam step")
+        if data["mean"] > 0:
+            score.set_ylim(bottom=0)
+        score.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+        yield figure
+
+
+def _draw_curve(loss, score, label: str, color: str, curve: list[dict[str, Any]]) -> None:
+    for name, style in (("loss", ":"), ("test_loss", "-")):
+        points = [(point["step"], point[name]) for point in curve if name in point]
+        if points:
+            loss.plot(*zip(*points, strict=True), style, color=color, linewidth=1)
+    points = [(p["step"], p["score"]["mean"], p["score"]["stderr"]) for p in curve if "score" in p]
+    steps, means, errors = zip(*points, strict=True)
+    score.errorbar(steps, means, errors, marker="o", markersize=3, color=color, label=label)

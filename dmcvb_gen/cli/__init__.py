@@ -41,7 +41,6 @@ GROUPS = {
         "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
         "validate": ("validate:validate", "Train the paper's agents on a release and report their scores."),
-        "claims": ("validate:claims", "Test the paper's claims, and its ranking, on reports of validate."),
         "diff": ("release:diff_command", "Compare two releases: subsets, episodes and digests."),
     },
     "Share": {
@@ -58,10 +57,6 @@ GROUPS = {
 """Heading -> command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""
 COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in commands.items()}
 """Command -> ("module:attribute", short help)."""
-
-
-ALIASES = {"questions": "claims"}
-"""Earlier name of a command -> its name."""
 RESUMING = frozenset({"rollout", "paint", "repaint", "validate", "publish", "fetch", "export", "import"})
 """Commands that keep what they finished, and go on from there when they are run again."""
 
@@ -73,14 +68,13 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx, name):
-        name = ALIASES.get(name, name)
         if name not in COMMANDS:
             return None
         module, attribute = COMMANDS[name][0].split(":")
         return getattr(importlib.import_module(f"dmcvb_gen.cli.{module}"), attribute)
 
     def resolve_command(self, ctx, args):
-        if args and args[0] not in COMMANDS | ALIASES and not args[0].startswith("-"):
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"Did you mean {near[0]!r}?" if near else "`dmcvb-gen --help` lists the commands."
             ctx.fail(f"unknown command {args[0]!r}. {hint}")

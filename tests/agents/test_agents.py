@@ -35,8 +35,8 @@ from dmcvb_gen.agents.paper import (
     StateProbe,
 )
 from dmcvb_gen.agents.td3_bc import TD3BC
-from dmcvb_gen.agents.trainer import TrainSettings, train
-from dmcvb_gen.benchmarks.profiles import PROFILES
+from dmcvb_gen.agents.trainer import Budget, train
+from dmcvb_gen.benchmarks.plan import BUDGETS
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.tasks import ACTION_REPEAT
 from tests import independent_td3_bc
@@ -203,7 +203,7 @@ def papers_table():
     forward, trained = LatentForwardDynamics(encoder, paper), make_pretrainer(parse_agent("id+bc"), encoder, paper)
     predict, decoder, by_state_decoder = StatePrediction(encoder, paper), ObservationDecoder(9), state_decoder(STATES)
     td3 = TD3BC(encoder, paper)
-    settings, profile = TrainSettings(), PROFILES["paper"]
+    budget = BUDGETS["paper"]
     moved_by_actor = {id(p) for group in td3.optimizers["actor"].param_groups for p in group["params"]}
     bc, default = BehaviorCloning(encoder, paper), ("relu", "relu", "tanh")
     rows = {
@@ -260,14 +260,14 @@ def papers_table():
         ("State decoder", "Hidden layer sizes"): ((256, 256), hidden(by_state_decoder)),
         ("State decoder", "Activations"): (("relu", "relu", ""), activations(by_state_decoder)),
         ("State decoder", "Output dimension"): (STATES, last_linear(by_state_decoder).out_features),
-        ("Learning", "Number of iterations"): ({400_000}, {settings.steps, profile.pixel_steps, profile.state_steps,
-                                                            profile.pretrain_steps, profile.frozen_steps}),
-        ("Learning", "Batch size"): ({256}, {settings.batch_size, profile.batch_size, profile.state_batch_size}),
+        ("Learning", "Number of iterations"): ({400_000}, {budget.pixel_steps, budget.state_steps,
+                                                            budget.pretrain_steps, budget.frozen_steps}),
+        ("Learning", "Batch size"): ({256}, {budget.batch_size, budget.state_batch_size}),
         ("Learning", "Optimizer"): ("Adam", type(bc.optimizers["main"]).__name__),
-        ("Learning", "Learning rate"): (0.001, bc.optimizers["main"].param_groups[0]["lr"] * settings.rate),
-        ("Learning", "Online evaluation frequency"): (20_000, settings.evaluate_every),
-        ("Online evaluation", "Number of evaluations"): (400_000 // 20_000, profile.evaluations),
-        ("Online evaluation", "Number of runs"): (30, profile.episodes),
+        ("Learning", "Learning rate"): (0.001, bc.optimizers["main"].param_groups[0]["lr"] * budget.rate),
+        ("Learning", "Online evaluation frequency"): (20_000, budget.pixel_steps // budget.evaluations),
+        ("Online evaluation", "Number of evaluations"): (400_000 // 20_000, budget.evaluations),
+        ("Online evaluation", "Number of runs"): (30, budget.episodes),
         ("Online evaluation", "Action repeat"): (2, ACTION_REPEAT),
     }  # fmt: skip
     for name, module in (("Actor", td3.net.actor), ("Critic 1", td3.net.critic1), ("Critic 2", td3.net.critic2)):
@@ -309,7 +309,7 @@ def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
         encoder = observation_encoder(data.channels, data.frames.size)
         policy = (BehaviorCloning if frozen == "bc" else TD3BC)(encoder, data.sizes, frozen=True)
         seen = data.encoded(encoder) if encoded else data
-        train(policy, seen, TrainSettings(steps=4, batch_size=8, evaluate_every=4, half=False, shift=False), seed=3)
+        train(policy, seen, Budget("short", batch_size=8, seed=3), 4, shift=False)
         policies.append(policy)
     observation = data.observe(data.train_rows)
     torch.testing.assert_close(*(policy.act(observation) for policy in policies), atol=1e-5, rtol=1e-4)
@@ -523,7 +523,6 @@ def test_names_of_the_paper_and_options_are_understood():
     assert parse_agent("bc").paper_name == "null+bc" and parse_agent("state-bc").paper_name == "bc(state)"
     agent = parse_agent("id+bc:frames=1,k=5,sample")
     assert (agent.stack, agent.options, agent.paper_name) == (1, (("k", 5), ("sample", True)), None)
-    assert agent.facts()["sample_k"] is True and parse_agent("bc").facts()["k"] == 1
     assert parse_agent(agent.name) == agent
 
 

@@ -14,7 +14,7 @@ from dmcvb_gen.agents import trainer
 from dmcvb_gen.agents.data import PAD, Slice, TrainingData, batches, load_data, normalize_pixels
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.paper import BehaviorCloning
-from dmcvb_gen.agents.trainer import TrainSettings, draw, hold_out_losses, train
+from dmcvb_gen.agents.trainer import Budget, draw, hold_out_losses, train
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset import steps as steps_module
 from dmcvb_gen.dataset.steps import StepTable
@@ -109,12 +109,15 @@ def test_shifts_can_be_left_out_and_the_same_transitions_are_drawn():
     assert (shifted.reward == plain.reward).all()
 
 
+SHORT = Budget("short", batch_size=8, state_batch_size=8, evaluations=3)
+
+
 @pytest.mark.parametrize("shift", [True, False])
 def test_a_training_shifts_its_pictures_as_it_is_told(monkeypatch, shift):
     data, asked = make_data(), []
     batch = data.batch
     monkeypatch.setattr(data, "batch", lambda *a, **k: asked.append((k["shift"], k["hold_out"])) or batch(*a, **k))
-    train(pixel_learner(data), data, TrainSettings(steps=3, batch_size=4, evaluate_every=3, shift=shift))
+    train(pixel_learner(data), data, SHORT, 3, shift=shift)
     assert {told for told, held in asked if not held} == {shift}
 
 
@@ -164,11 +167,11 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
         torch.testing.assert_close(one.observation, two.observation)
         torch.testing.assert_close(one.next_observation, two.next_observation)
     assert len(held) == 2000
-    settings = TrainSettings(steps=2, batch_size=4, half=True)
+    budget = Budget("short", batch_size=4, precision="bfloat16")
     losses = []
     for data in (held, stored):
         torch.manual_seed(0)
-        losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), data.sizes), data, settings)[-1]["loss"])
+        losses.append(train(BehaviorCloning(observation_encoder(9, SIZE), data.sizes), data, budget, 2)[-1]["loss"])
     assert losses[0] == losses[1]
 
 
@@ -250,12 +253,10 @@ def state_learner(data):
     return BehaviorCloning(state_encoder(data.state.shape[1]), data.sizes)
 
 
-SETTINGS = TrainSettings(steps=12, batch_size=8, evaluate_every=4, points=3, half=False)
-
-
-def test_the_curve_has_losses_hold_out_and_scores():
+def test_the_curve_has_losses_hold_out_and_scores(monkeypatch):
+    monkeypatch.setattr(trainer, "POINTS", 3)
     data = make_data().states_only()
-    curve = train(state_learner(data), data, SETTINGS, evaluate=lambda learner: {"score": 1.0})
+    curve = train(state_learner(data), data, SHORT, 12, evaluate=lambda learner: {"score": 1.0})
     assert [point["step"] for point in curve] == [4, 8, 12]
     assert all({"loss", "test_loss", "score", "seconds"} <= set(point) for point in curve)
     assert curve[-1]["loss"] < curve[0]["loss"]
@@ -275,10 +276,10 @@ def without_time(point):
     [({}, state_learner), ({"decay": True}, state_learner), ({}, pixel_learner), ({"muon": True}, pixel_learner)],
 )
 def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, changed, make_learner):
-    data, settings = make_data(), dataclasses.replace(SETTINGS, **changed)
+    data, budget = make_data(), dataclasses.replace(SHORT, **changed)
     data = data if make_learner is pixel_learner else data.states_only()
     whole = make_learner(data)
-    wanted = train(whole, data, settings)
+    wanted = train(whole, data, budget, 12)
     monkeypatch.setattr(trainer, "SAVE_SECONDS", 0.0)
     made = []
 
@@ -288,10 +289,10 @@ def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, change
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(make_learner(data), data, settings, folder=tmp_path, tick=stop)
+        train(make_learner(data), data, budget, 12, folder=tmp_path, tick=stop)
     resumed = make_learner(data)
     made.clear()
-    curve = train(resumed, data, settings, folder=tmp_path, tick=made.append)
+    curve = train(resumed, data, budget, 12, folder=tmp_path, tick=made.append)
     assert made[0] == 6 and sum(made) == 12  # the state of step 6 was on disk
     for one, two in zip(whole.parameters(), resumed.parameters(), strict=True):
         torch.testing.assert_close(one, two, atol=0, rtol=0)
@@ -303,32 +304,34 @@ def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to():
     for decay, seen in rates.items():
         learner = state_learner(data)
         [group] = learner.optimizers["main"].param_groups
-        settings = dataclasses.replace(SETTINGS, steps=4, decay=decay)
-        train(learner, data, settings, tick=lambda steps, group=group, seen=seen: seen.append(group["lr"]))
+        budget = dataclasses.replace(SHORT, decay=decay)
+        train(learner, data, budget, 4, tick=lambda steps, group=group, seen=seen: seen.append(group["lr"]))
     assert rates == {True: pytest.approx([1e-3, 0.75e-3, 0.5e-3, 0.25e-3]), False: [1e-3] * 4}
 
 
-def test_a_rate_is_a_factor_of_the_learners_own():
-    data, seen = make_data().states_only(), []
-    learner = state_learner(data)
-    [group] = learner.optimizers["main"].param_groups
-    settings = dataclasses.replace(SETTINGS, steps=2, rate=3.0)
-    train(learner, data, settings, tick=lambda steps: seen.append(group["lr"]))
-    assert seen == [pytest.approx(3e-3)] * 2 and group["lr"] == 1e-3
+def test_a_rate_is_a_factor_of_the_learners_own_of_those_that_see_pictures():
+    data, budget = make_data(), dataclasses.replace(SHORT, rate=3.0)
+    for learner, seen, expected in (
+        (pixel_learner(data), data, 3e-3),
+        (state_learner(data.states_only()), data.states_only(), 1e-3),
+    ):
+        [group], rates = learner.optimizers["main"].param_groups, []
+        train(learner, seen, budget, 2, tick=lambda steps, group=group, rates=rates: rates.append(group["lr"]))
+        assert rates == [pytest.approx(expected)] * 2 and group["lr"] == 1e-3
 
 
 def test_a_damaged_state_is_refused_with_what_to_do(tmp_path):
     data = make_data().states_only()
     (tmp_path / trainer.RESUME_FILE).write_bytes(b"cut short")
     with pytest.raises(DmcvbError, match="delete it"):
-        train(state_learner(data), data, SETTINGS, folder=tmp_path)
+        train(state_learner(data), data, SHORT, 12, folder=tmp_path)
 
 
 def test_a_loss_that_is_no_longer_finite_stops_the_run():
     data = make_data().states_only()
     data.action[data.train_rows] = float("nan")
     with pytest.raises(DmcvbError, match="finite"):
-        train(state_learner(data), data, SETTINGS)
+        train(state_learner(data), data, SHORT, 12)
 
 
 @pytest.mark.parametrize("most, batches", [(2, 2), (1000, 64)])

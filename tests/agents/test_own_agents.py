@@ -17,11 +17,9 @@ from click.testing import CliRunner
 import dmcvb_gen
 from dmcvb_gen import own_code
 from dmcvb_gen.agents.catalog import parse_agent
+from dmcvb_gen.benchmarks.cell import CellRun, OwnAgent
 from dmcvb_gen.benchmarks.evaluate import Evaluator
-from dmcvb_gen.benchmarks.experiments import run_cell
-from dmcvb_gen.benchmarks.own import OwnAgent
-from dmcvb_gen.benchmarks.suites import plan_benchmark
-from dmcvb_gen.benchmarks.validate import make_setup
+from dmcvb_gen.benchmarks.plan import BUDGETS, plan_benchmark
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -70,19 +68,12 @@ def test_it_is_the_evaluation_of_validate(small_release):
     """The same policy as a learned one of `validate` on a subset, and as one's own by the subset's name."""
     subset = open_release(small_release)["walker-walk/random/dynamic"]
 
-    class Learned:
-        def precision(self):
-            return torch.autocast("cpu", enabled=False)
-
-        def act(self, observation):
-            return observation.flatten(1)[:, :6].tanh()
-
-    evaluator = Evaluator(subset, episodes=2, max_steps=5)
-    ours = evaluator(Learned())
-    evaluator.close()
-
     def own(observation):
         return np.tanh(observation["pixels"].reshape(2, -1)[:, :6] / np.float32(255) - 0.5)
+
+    evaluator = Evaluator(subset, episodes=2, max_steps=5)
+    ours = evaluator.score(own)
+    evaluator.close()
 
     size = subset.record.size
     renderer = subset.record.renderer["name"]
@@ -147,7 +138,7 @@ def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_p
     command += [value for name in ("still", "learned", "broken") for value in ("--agent", f"own_agents:{name}")]
     result = CliRunner().invoke(main, [*command, "--workers", "1", "--threads", "1", "--out", str(tmp_path / "report")])
     facts = json.loads((tmp_path / "report" / "report.json").read_text())
-    scores = {r["cell"]["agent_name"]: r["score"] for r in facts["results"]}
+    scores = {r["cell"]["agent"]: r["score"] for r in facts["results"]}
     assert set(scores) == {"state-bc", "own_agents:still", "own_agents:learned"}, result.output
     assert all("renderer" not in r["evaluation"] for r in facts["results"])  # none of them saw pictures
     [failed] = facts["failed"]
@@ -161,7 +152,8 @@ def test_validate_sets_agents_of_ones_own_beside_the_papers(small_release, tmp_p
 
 CHANGING = """
 import numpy as np
-from changing_parts.rates import RATE
+
+RATE = 0.5
 
 def ready(observation):
     return np.full((len(observation["state"]), 6), float(open("weights.txt").read()))
@@ -179,19 +171,18 @@ def changing(small_release, tmp_path, monkeypatch):
     """Agents whose policy hangs on other files: (name) -> its cell's result, as in a new process."""
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    files = {"changing.py": CHANGING, "changing_parts/__init__.py": "", "changing_late.py": "LATE = 0.5\n"}
-    for name, text in files.items() | {("changing_parts/rates.py", "RATE = 0.5\n"), ("weights.txt", "0.0")}:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+    for name, text in {"changing.py": CHANGING, "changing_late.py": "LATE = 0.5\n", "weights.txt": "0.0"}.items():
         (tmp_path / name).write_text(text)
-    release, setup = open_release(small_release), make_setup(small_release, out=tmp_path / "out", training=False)
+    release = open_release(small_release)
 
     def score(name):
         own_code._digests.clear()
-        for module in ("changing_late", "changing_parts.rates", "changing_parts", "changing"):
+        for module in ("changing_late", "changing"):
             sys.modules.pop(module, None)
         importlib.invalidate_caches()
         cells, _ = plan_benchmark("b1", release, [f"changing:{name}"])
-        return run_cell(setup, next(cell for cell in cells if cell.setting == "none"))
+        cell = next(cell for cell in cells if cell.setting == "none")
+        return CellRun(small_release, tmp_path / "out", BUDGETS["smoke"], cell).result()
 
     yield score
     own_code._digests.clear()
@@ -214,25 +205,13 @@ def test_a_ready_policy_is_scored_anew_whatever_it_loads(changing, tmp_path):
 def test_an_agent_that_learns_is_trained_again_if_a_module_of_its_folder_changed(changing, tmp_path):
     first = json.loads(json.dumps(changing("learned")))
     assert changing("learned") == first | {"kept": True}
-    write_later(tmp_path / "changing_parts" / "rates.py", "RATE = -0.5\n")
+    write_later(tmp_path / "changing_late.py", "LATE = -0.5\n")  # imported by a function alone
     second = changing("learned")
     assert "kept" not in second and list(second["score"]["returns"]) != first["score"]["returns"]
-    write_later(tmp_path / "changing_late.py", "LATE = -0.5\n")  # imported by a function alone
-    assert list(changing("learned")["score"]["returns"]) == first["score"]["returns"]
-    agent = OwnAgent.load("changing:learned")
-    assert set(agent.helpers) == {"changing_late", "changing_parts", "changing_parts.rates"}
-    write_later(tmp_path / "changing_parts" / "rates.py", "RATE = 0.1\n")
+    assert {"changing", "changing_late.py"} <= OwnAgent.load("changing:learned").digests.keys()
+    write_later(tmp_path / "changing.py", CHANGING + "\n")
     with pytest.raises(DmcvbError, match="has changed, but its old code still runs"):
-        _ = agent.helpers
-
-
-def test_installed_packages_and_this_one_are_no_modules_beside_an_agent(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    (tmp_path / "alone_agent.py").write_text("import json, numpy, dmcvb_gen.spec\n\ndef learned(data):\n    pass\n")
-    assert OwnAgent.load("alone_agent:learned").helpers == {}  # so that its results of earlier versions count
-    assert "click.core" in OwnAgent.load("click:echo").helpers
-    assert all(name.startswith("click.") for name in OwnAgent.load("click:echo").helpers)
+        _ = OwnAgent.load("changing:learned").digests
 
 
 def test_validate_says_that_a_score_of_an_own_agent_is_an_earlier_ones(changing, small_release, tmp_path):
@@ -285,7 +264,7 @@ def test_what_an_agent_learns_from_is_what_it_sees_when_it_is_scored(kind, reque
     result = CliRunner().invoke(main, command)
     facts = json.loads((tmp_path / "report" / "report.json").read_text())
     assert not facts["failed"], facts["failed"]
-    seeing = [one for one in facts["results"] if "seeing" in one["cell"]["agent_name"]]
+    seeing = [one for one in facts["results"] if "seeing" in one["cell"]["agent"]]
     assert seeing and all("renderer" in one["evaluation"] for one in seeing), result.output
 
 
@@ -322,7 +301,7 @@ def test_a_benchmark_of_encoders_refuses_own_agents_alone_by_their_names(small_m
     command = ["validate", str(small_mazes), "--benchmark", "b3", "--out", str(tmp_path / "out")]
     one, two = ["--agent", "goal_agents:still"], ["--agent", "goal_agents:learned"]
     for agents, told in (
-        (one, "b3 sets agents with a pre-trained encoder beside bc, and goal_agents:still has none; remove it"),
+        (one, "set beside bc, and goal_agents:still has none; remove it"),
         (one + two, "goal_agents:still and goal_agents:learned have none; remove them"),
     ):
         result = CliRunner().invoke(main, command + agents)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import json
 import shlex
 from pathlib import Path
 
@@ -13,23 +14,28 @@ import pytest
 import torch
 from click.testing import CliRunner
 from PIL import Image
+from safetensors.torch import save_file
 
 from dmcvb_gen import own_code
-from dmcvb_gen.agents.catalog import make_encoder, parse_agent
-from dmcvb_gen.agents.data import Normalization, Slice, default_memory, load_data, normalize_pixels
+from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
+from dmcvb_gen.agents.data import Normalization, Slice, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import PARTS
+from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
-from dmcvb_gen.benchmarks import experiments, report
-from dmcvb_gen.benchmarks import validate as validate_module
-from dmcvb_gen.benchmarks.evaluate import Evaluator
-from dmcvb_gen.benchmarks.experiments import _DataCache, run_cell, train_settings
-from dmcvb_gen.benchmarks.paper import paper_score
-from dmcvb_gen.benchmarks.profiles import PROFILES, get_profile
-from dmcvb_gen.benchmarks.report import compare
-from dmcvb_gen.benchmarks.run import planned_steps, run_cells, share_memory
-from dmcvb_gen.benchmarks.setup import Setup, fingerprint, keep_precision, open_data, pretraining_of
-from dmcvb_gen.benchmarks.suites import BENCHMARKS, Cell, plan_benchmark
-from dmcvb_gen.benchmarks.validate import _few_warnings, make_setup
+from dmcvb_gen.agents.trainer import train
+from dmcvb_gen.benchmarks import cell as cells_module
+from dmcvb_gen.benchmarks.cell import CellRun, fingerprint, planned_steps, run_cells, state_units
+from dmcvb_gen.benchmarks.checks import training_warnings
+from dmcvb_gen.benchmarks.evaluate import Evaluator, TrainedAgent
+from dmcvb_gen.benchmarks.plan import (
+    BENCHMARKS,
+    BUDGETS,
+    Cell,
+    get_budget,
+    paper_score,
+    plan_benchmark,
+)
+from dmcvb_gen.benchmarks.report import _groups, compare
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
@@ -88,7 +94,7 @@ def test_b1_has_every_agent_on_every_set_and_states_once():
 def test_b1_takes_the_agents_asked_for_and_shares_encoders():
     cells, _ = plan_benchmark("b1", release_of(*WALKER), ["id+bc", "id+td3-bc", "bc"])
     assert {cell.agent.name for cell in cells} == {"id+bc", "id+td3-bc", "bc"}
-    encoders = {pretraining_of(cell) for cell in cells} - {None}
+    encoders = {cell.encoder for cell in cells} - {None}
     assert len(encoders) == 10  # five sets x two distractors, one for both policies
 
 
@@ -211,7 +217,7 @@ def test_unknown_benchmarks_and_profiles_list_the_known_ones():
     with pytest.raises(UnknownNameError, match=", ".join(sorted(BENCHMARKS.all()))):
         plan_benchmark("b4", release_of(*WALKER))
     with pytest.raises(UnknownNameError, match="brief, paper, quick, smoke"):
-        get_profile("slow")
+        get_budget("slow")
 
 
 def test_the_papers_scores_are_those_of_its_table():
@@ -222,19 +228,29 @@ def test_the_papers_scores_are_those_of_its_table():
 
 
 def test_the_paper_profile_is_the_papers_and_a_scaled_one_says_so():
-    paper = PROFILES["paper"]
+    paper = BUDGETS["paper"]
     assert (paper.pixel_steps, paper.batch_size, paper.episodes) == (400_000, 256, 30)
     assert paper.pixel_steps // paper.evaluations == 20_000
-    half = PROFILES["quick"].scaled(0.5)
-    assert half.pixel_steps == PROFILES["quick"].pixel_steps / 2 and "x0.5" in half.name and "0.5 times" in half.note
-    assert not PROFILES["smoke"].scores
+    half = BUDGETS["quick"].scaled(0.5)
+    assert half.pixel_steps == BUDGETS["quick"].pixel_steps / 2 and "x0.5" in half.name and "0.5 times" in half.note
+    assert not BUDGETS["smoke"].scores
+
+
+def test_a_cell_is_read_back_from_its_facts():
+    goals = dict(fixed_goals=5, episodes_per_goal=10, episodes=50)
+    for release in (release_of(*WALKER), release_of(f"{MAZE}/expert/hidden", f"{MAZE}/expert/fixed", **goals)):
+        for name in BENCHMARKS.all():
+            for cell in plan_benchmark(name, release)[0]:
+                assert Cell.of(json.loads(json.dumps(cell.facts()))) == cell
 
 
 # -- online evaluation ----------------------------------------------------------------------------
 
 
 class Recorder:
-    """A policy that moves a little, the same way every time, and remembers what it saw."""
+    """A network that moves a little, the same way every time, and remembers what it saw."""
+
+    half = False
 
     def __init__(self, size):
         self.size, self.seen = size, []
@@ -242,9 +258,15 @@ class Recorder:
     def precision(self):
         return torch.autocast("cpu", enabled=False)
 
+    def parameters(self):
+        return iter([torch.zeros(1)])
+
     def act(self, observation):
         self.seen.append(observation.clone())
         return torch.full((len(observation), self.size), 0.1)
+
+    def trained(self, name="bc", normalization=None):
+        return TrainedAgent(parse_agent(name), None, self, normalization)
 
 
 def rewards_by_hand(evaluator, actions, steps):
@@ -261,9 +283,9 @@ def rewards_by_hand(evaluator, actions, steps):
 def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
     subset = open_release(small_release)["walker-walk/random/none"]
     normalization = Normalization(torch.full((24,), 0.5), torch.full((24,), 2.0))
-    evaluator = Evaluator(subset, pixels=False, normalization=normalization, episodes=3, max_steps=6)
+    evaluator = Evaluator(subset, pixels=False, episodes=3, max_steps=6)
     policy = Recorder(6)
-    score = evaluator(policy)
+    score = evaluator.score(policy.trained("state-bc", normalization))
     returns, states = rewards_by_hand(evaluator, 6, 6)
     np.testing.assert_allclose(score.returns, returns, rtol=1e-6)
     assert score.mean == pytest.approx(returns.mean())
@@ -276,9 +298,9 @@ def test_pictures_are_of_unseen_videos_newest_frame_last(small_release):
     subset = open_release(small_release)["walker-walk/random/dynamic"]
     evaluator = Evaluator(subset, episodes=2, max_steps=4, shots=2)
     policy = Recorder(6)
-    score = evaluator(policy)
+    score = evaluator.score(policy.trained())
     evaluator.close()
-    assert evaluator._videos.split == "val"
+    assert evaluator.videos.split == "val"
     stacks = [seen.unflatten(1, (3, 3)) for seen in policy.seen]
     assert stacks[0].shape == (2, 3, 3, 16, 16) and stacks[0].abs().max() <= 0.5
     assert torch.equal(stacks[0][:, 0], stacks[0][:, 2])  # the first frame is repeated
@@ -314,11 +336,9 @@ def test_mazes_are_scored_by_success_and_start_where_the_pair_says():
     subset = release_of(f"{MAZE}/expert/fixed")[f"{MAZE}/expert/fixed"]
     task = get_task("ant-maze-empty7x7")
     normalization = Normalization(torch.zeros(task.state_size), torch.ones(task.state_size))
-    evaluator = Evaluator(
-        subset, pixels=False, normalization=normalization, episodes=2, max_steps=3, pair=((1, 1), (5, 5))
-    )
+    evaluator = Evaluator(subset, pixels=False, episodes=2, max_steps=3, pair=((1, 1), (5, 5)))
     policy = Recorder(8)
-    score = evaluator(policy)
+    score = evaluator.score(policy.trained("state-bc", normalization))
     assert score.success == 0.0 and score.speed is None and score.mean < 0
     place = policy.seen[0][:, task.state_slices["walker_position"]]
     start = torch.as_tensor(task.layout.world((1, 1)), dtype=place.dtype)
@@ -340,34 +360,22 @@ def without_time(point):
 
 # -- running cells --------------------------------------------------------------------------------
 
+SMOKE = BUDGETS["smoke"]
+
 
 def test_cells_in_processes_give_what_cells_in_this_one_give(small_release, tmp_path):
-    release = open_release(small_release)
-    cells = [cell for cell in plan_benchmark("b1", release, ["state-bc"])[0]][:1]
+    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
     scores = []
     for workers in (1, 2):
-        setup = Setup(str(small_release), str(tmp_path / str(workers)), PROFILES["smoke"])
-        [(cell, result)] = list(run_cells(setup, cells, workers))
+        [(cell, result)] = list(run_cells(small_release, tmp_path / str(workers), SMOKE, cells, workers))
         scores.append((cell.id, result["score"]["returns"], result["curve"][-1]["loss"]))
     assert scores[0][1] == pytest.approx(scores[1][1]) and scores[0][2] == pytest.approx(scores[1][2])
-
-
-def test_the_cells_of_a_run_open_the_release_once(small_release, tmp_path, monkeypatch):
-    opened = []
-    monkeypatch.setattr("dmcvb_gen.benchmarks.setup.open_data", lambda setup: opened.append(1) or open_data(setup))
-    cells = plan_benchmark("b1", open_release(small_release), ["bc"])[0][:2]
-    for run in (1, 2):
-        setup = Setup(str(small_release), str(tmp_path / str(run)), PROFILES["smoke"])
-        results = dict(run_cells(setup, cells))
-        assert len(cells) == len(results) == 2 and not any("error" in result for result in results.values())
-        assert len(opened) == run
 
 
 def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path):
     release = open_release(small_release)
     cells = [c for c in plan_benchmark("b1", release, ["dino+bc", "state-bc"])[0] if c.setting == "none"]
-    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
-    results = {cell.agent.name: result for cell, result in run_cells(setup, cells)}
+    results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, SMOKE, cells)}
     assert "--dino-weights" in results["dino+bc"]["error"] and results["state-bc"]["score"]["mean"] >= 0
 
 
@@ -375,74 +383,52 @@ def test_processes_train_each_encoder_before_its_cells(small_release, tmp_path):
     cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc", "id+bc"])[0]]
     cells = [c for c in cells if c.setting in ("none", "static") and c.policy_label == cells[0].policy_label]
     steps = []
-    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
-    results = dict(run_cells(setup, cells, 2, lambda what, made: steps.append(made)))
+    found = run_cells(small_release, tmp_path, SMOKE, cells, 2, lambda what, made: steps.append(made))
+    results = dict(found)
     assert results.keys() == set(cells) and not any("error" in result for result in results.values())
-    encoders = {pretraining_of(cell) for cell in cells if cell.agent.pretrain}
+    encoders = {cell.encoder for cell in cells} - {None}
     assert len(encoders) == 2
     for cell in cells:
-        if cell.agent.pretrain:
-            trained = (tmp_path / "encoders" / f"{pretraining_of(cell).id}.json").stat().st_mtime_ns
+        if cell.encoder:
+            trained = (tmp_path / "encoders" / f"{cell.encoder.id}.json").stat().st_mtime_ns
             assert trained < (tmp_path / "cells" / f"{cell.id}.json").stat().st_mtime_ns
-    assert sum(steps) == planned_steps(setup.profile, cells)
+    assert sum(steps) == planned_steps(SMOKE, cells)
 
 
-def test_a_result_of_another_seed_or_profile_is_not_taken_for_this_one(small_release, tmp_path):
+def test_a_result_of_another_seed_is_not_taken_for_this_one(small_release, tmp_path):
     cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
     made = []
-    for seed, profile in ((0, "smoke"), (0, "smoke"), (1, "smoke")):
-        steps = []
-        setup = Setup(str(small_release), str(tmp_path), PROFILES[profile], seed=seed)
-        list(run_cells(setup, cells, tick=lambda what, count, steps=steps: steps.append(count)))
+    for seed in (0, 0, 1):
+        steps, budget = [], dataclasses.replace(SMOKE, seed=seed)
+        list(run_cells(small_release, tmp_path, budget, cells, tick=lambda _, count, steps=steps: steps.append(count)))
         made.append(sum(steps))
     assert made == [3, 0, 3]
-    with pytest.raises(DmcvbError, match="committed|release"):
-        open_release(tmp_path)
 
 
 def test_what_a_score_hangs_on_besides_the_data_is_in_its_fingerprint(small_release, tmp_path):
-    from safetensors.torch import save_file
-
+    """A row for each change: which agents' cells are other ones then."""
     release, weights = open_release(small_release), tmp_path / "dino.safetensors"
-    cells = plan_benchmark("b1", release, ["dino+bc", "bc", "state-bc"])[0]
-    by_agent = {cell.agent.name: cell for cell in cells if cell.setting == "dynamic"}
+    cells = {c.agent.name: c for c in plan_benchmark("b1", release, ["dino+bc", "id+bc", "bc", "state-bc"])[0]}
+    cells |= {"encoder": cells["id+bc"].encoder}
     own = tmp_path / "clips" / "val" / "one"
     own.mkdir(parents=True)
     Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(own / "0.png")
     save_file({"x": torch.zeros(1)}, str(weights))
-    plain = Setup(str(small_release), str(tmp_path), PROFILES["smoke"], dino_weights=str(weights))
-    moved = dataclasses.replace(plain, backgrounds=str(tmp_path / "clips"))
-    assert fingerprint(plain, release, by_agent["bc"]) != fingerprint(moved, release, by_agent["bc"])
-    [by_state] = [cell for cell in cells if cell.agent.sees_state]
-    assert fingerprint(plain, release, by_state) == fingerprint(moved, release, by_state)  # states show no videos
-    before = fingerprint(plain, release, by_agent["dino+bc"]), fingerprint(plain, release, by_agent["bc"])
-    save_file({"x": torch.ones(1)}, str(weights))
-    after = fingerprint(plain, release, by_agent["dino+bc"]), fingerprint(plain, release, by_agent["bc"])
-    assert before[0] != after[0] and before[1] == after[1]
-
-
-def test_the_precision_of_pictures_is_in_the_fingerprint_of_what_sees_them(small_release, tmp_path):
-    release = open_release(small_release)
-    cells = {cell.agent.name: cell for cell in plan_benchmark("b1", release, ["bc", "id+bc", "state-bc"])[0]}
-    exact = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
-    rounded = dataclasses.replace(exact, precision="bfloat16")
-
-    def differ(work):
-        return fingerprint(exact, release, work) != fingerprint(rounded, release, work)
-
-    assert differ(cells["bc"]) and differ(pretraining_of(cells["id+bc"])) and not differ(cells["state-bc"])
-
-
-def test_a_report_that_goes_on_keeps_the_precision_that_auto_took(monkeypatch, tmp_path):
-    taken = iter(("bfloat16", "float32"))
-    monkeypatch.setattr(
-        validate_module, "choose_precision", lambda asked, *_: next(taken) if asked == "auto" else asked
-    )
-    first = make_setup("release", out=tmp_path)
-    keep_precision(first)
-    again, asked = make_setup("release", out=tmp_path), make_setup("release", out=tmp_path, precision="float32")
-    assert (first.precision, again.precision, asked.precision) == ("bfloat16", "bfloat16", "float32")
-    assert make_setup("release", out=tmp_path / "other").precision == "float32"
+    save_file({"x": torch.ones(1)}, str(tmp_path / "other.safetensors"))
+    plain = dataclasses.replace(SMOKE, dino_weights=str(weights))
+    before = {name: fingerprint(release, plain, cell) for name, cell in cells.items()}
+    everything, seeing = set(cells), {"dino+bc", "id+bc", "bc"}
+    for change, expected in (
+        ({"backgrounds": str(tmp_path / "clips")}, seeing),  # states show no videos
+        ({"dino_weights": str(tmp_path / "other.safetensors")}, {"dino+bc"}),
+        ({"precision": "bfloat16"}, seeing | {"encoder"}),
+        ({"seed": 1}, everything),
+        ({"rate": 2.0}, everything),
+        ({"threads": 7, "note": "x", "memory": 5, "compile": True}, set()),
+    ):
+        budget = dataclasses.replace(plain, **change)
+        found = {name for name, cell in cells.items() if fingerprint(release, budget, cell) != before[name]}
+        assert found == expected, change
 
 
 def test_an_agent_of_another_package_that_changed_is_another_one(small_release, tmp_path, monkeypatch):
@@ -453,24 +439,42 @@ def test_an_agent_of_another_package_that_changed_is_another_one(small_release, 
     file.write_text((EXAMPLES / "agent.py").read_text().replace("linear-bc", "their-bc"))
     importlib.import_module("theirs")
     cells = {cell.agent.name: cell for cell in plan_benchmark("b1", release, ["their-bc", "bc"])[0]}
-    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
-    before = {name: fingerprint(setup, release, cell) for name, cell in cells.items()}
+    before = {name: fingerprint(release, SMOKE, cell) for name, cell in cells.items()}
     file.write_text(file.read_text() + "\n# changed\n")
     with pytest.raises(DmcvbError, match="old code still runs; restart Python"):
-        fingerprint(setup, release, cells["their-bc"])
+        fingerprint(release, SMOKE, cells["their-bc"])
     own_code._digests.clear()  # as in a new process
-    after = {name: fingerprint(setup, release, cell) for name, cell in cells.items()}
+    after = {name: fingerprint(release, SMOKE, cell) for name, cell in cells.items()}
     assert before["their-bc"] != after["their-bc"] and before["bc"] == after["bc"]
 
 
-def test_workers_share_the_memory_for_pictures(small_release):
-    setup = Setup(str(small_release), "out", PROFILES["smoke"], memory=1000)
-    assert share_memory(setup, 4).memory == 250
-    with_default = share_memory(dataclasses.replace(setup, memory=None), 4).memory
-    assert with_default == pytest.approx(default_memory() / 4, rel=0.2)
+class Cluster(SerialPool):
+    """Cells in this process, which have 4 MB each."""
+
+    def memory_each(self):
+        return 4_000_000
 
 
-def test_cells_on_a_cluster_take_no_more_than_their_share_of_a_node(small_release, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "workers, change, expected",
+    [
+        (4, {"memory": 1000}, 250),
+        (Ray("nowhere:1"), {}, 2_000_000),
+        (Ray("nowhere:1"), {"memory": 1000}, 1000),
+        (Ray("nowhere:1"), {"device": "cuda"}, None),  # a cell has a GPU, and its memory, alone
+    ],
+)
+def test_cells_take_no_more_memory_than_their_share(small_release, tmp_path, monkeypatch, workers, change, expected):
+    held = []
+    pool = Cluster if isinstance(workers, Ray) else SerialPool
+    monkeypatch.setattr(cells_module, "open_pool", lambda *_, **__: pool())
+    monkeypatch.setattr(cells_module, "try_cell", lambda *given, tick=None: held.append(given[2].memory) or {})
+    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    list(run_cells(small_release, tmp_path, dataclasses.replace(SMOKE, **change), cells, workers))
+    assert held == [expected]
+
+
+def test_a_node_is_shared_by_the_cells_that_fit_on_it():
     nodes = [
         {"Alive": True, "Resources": {"CPU": 8.0, "memory": 8e9, "GPU": 2.0}},
         {"Alive": True, "Resources": {"CPU": 5.0, "memory": 1e10}},
@@ -481,27 +485,14 @@ def test_cells_on_a_cluster_take_no_more_than_their_share_of_a_node(small_releas
     assert share_of_node(nodes, Needs(cpus=2, gpus=1)) == 4e9
     assert share_of_node(nodes, Needs(cpus=16)) is None
 
-    class Cluster(SerialPool):
-        def memory_each(self):
-            return 4_000_000
 
-    held = []
-    monkeypatch.setattr("dmcvb_gen.benchmarks.run.open_pool", lambda *_, **__: Cluster())
-    monkeypatch.setattr("dmcvb_gen.benchmarks.run.run_cell", lambda setup, *_: held.append(setup.memory) or {})
-    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
-    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"])
-    for given in (setup, dataclasses.replace(setup, memory=1000), dataclasses.replace(setup, device="cuda")):
-        list(run_cells(given, cells, Ray("nowhere:1")))
-    assert held == [2_000_000, 1000, None]  # a cell has a GPU, and its memory, alone
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 @pytest.mark.parametrize("decoder", ["observation decoder", "state decoder"])
 def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, request, tmp_path, monkeypatch):
     folder = request.getfixturevalue(whole)
     cell = plan_benchmark("b1", open_release(folder), ["bc"])[0][0]
-    one, other = (Setup(str(folder), str(tmp_path / name), PROFILES["smoke"]) for name in ("one", "other"))
-    expected = run_cell(one, cell)
+    expected = CellRun(folder, tmp_path / "one", SMOKE, cell).result()
     monkeypatch.setattr("dmcvb_gen.agents.trainer.SAVE_SECONDS", 0.0)
     made, again = [], []
 
@@ -511,34 +502,34 @@ def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, requ
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_cell(other, cell, stop)
-    found = run_cell(other, cell, lambda what, steps: again.append((what, steps)))
+        CellRun(folder, tmp_path / "other", SMOKE, cell, stop).result()
+    found = CellRun(folder, tmp_path / "other", SMOKE, cell, lambda *told: again.append(told)).result()
     at_once = [steps for what, steps in again if what == decoder][0]
-    assert at_once == 1 and sum(steps for _, steps in again) == planned_steps(other.profile, [cell])
+    assert at_once == 1 and sum(steps for _, steps in again) == planned_steps(SMOKE, [cell])
 
     def plain(result):
         curves = {name: [without_time(point) for point in curve] for name, curve in result["curves"].items()}
         return result | {"curves": curves}
 
     assert plain(found["inspection"]) == plain(expected["inspection"])
-    decoding = sum(curve[-1]["seconds"] for curve in found["inspection"]["curves"].values())
-    assert found["seconds"]["all"] >= found["seconds"]["inspection"] >= decoding > 0
+    assert found["seconds"]["all"] >= found["seconds"]["inspection"] > 0
     assert list(found["score"]["returns"]) == list(expected["score"]["returns"])
     assert not list((tmp_path / "other").rglob("*.run"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, request, tmp_path, monkeypatch):
     folder, found, told = request.getfixturevalue(whole), {}, {}
     cell = plan_benchmark("b1", open_release(folder), ["bc"])[0][0]
-    profile, original = dataclasses.replace(PROFILES["smoke"], frozen_shift=False), experiments.encoded
+    budget, original = dataclasses.replace(SMOKE, frozen_shift=False), CellRun._encoded
 
     def inspection(draws):
-        monkeypatch.setattr(experiments, "encoded", lambda *a: original(*a[:3], draws, a[-1]))
+        monkeypatch.setattr(CellRun, "_encoded", lambda run, encoder, data, _: original(run, encoder, data, draws))
         ticks = []
-        setup = Setup(str(folder), str(tmp_path / str(draws)), profile)
-        found[draws] = run_cell(setup, cell, lambda *tick: ticks.append(tick))["inspection"]
-        assert sum(steps for _, steps in ticks) == planned_steps(profile, [cell])
+        run = CellRun(folder, tmp_path / str(draws), budget, cell, lambda *tick: ticks.append(tick))
+        found[draws] = run.result()["inspection"]
+        assert sum(steps for _, steps in ticks) == planned_steps(budget, [cell])
         told[draws] = {what for what, _ in ticks}
 
     inspection(0)
@@ -549,13 +540,14 @@ def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, reques
         assert found[0][name] == pytest.approx(found[10**9][name], rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(whole, request, tmp_path):
-    folder = str(request.getfixturevalue(whole))
-    subset = next(iter(open_release(folder).subsets.values()))
-    setup = Setup(folder, str(tmp_path), PROFILES["smoke"])
-    data, network = load_data({subset.name: subset}, [Slice(subset.name)], pixels=True), setup.profile.network
-    encoder = make_encoder(parse_agent("bc"), data.sizes, None, network)
+    release = open_release(request.getfixturevalue(whole))
+    cell = plan_benchmark("b1", release, ["bc"])[0][0]
+    run = CellRun(release.root, tmp_path, SMOKE, cell)
+    data, network = run.data(), SMOKE.network
+    encoder = make_encoder(cell.agent, data.sizes, None, network)
     readouts = {
         "observation": ObservationProbe(encoder, data.sizes, network),
         "state": StateProbe(encoder, data.sizes),
@@ -563,46 +555,46 @@ def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(who
     for probe in readouts.values():
         for weights in probe.parameters():
             weights.data.zero_()
-    errors = experiments._test_errors(readouts, data, setup, subset.task, lambda *_: None)
+    errors = run.test_errors(readouts, data)
     rows = data.hold_out_rows
     whole_batch = data.transitions(rows)
     assert len(rows) and errors["observation_mse"] == pytest.approx(float(whole_batch.observation.square().mean()))
     assert errors["state_mse"] == pytest.approx(float(whole_batch.state.square().mean()), rel=1e-5)
-    own = whole_batch.state.abs().mean(dim=0) * data.normalization.std / experiments.state_units(setup, subset.task)
+    own = whole_batch.state.abs().mean(dim=0) * data.normalization.std / state_units(release, cell.task)
     assert errors["state_l1"] == pytest.approx(
-        {name: float(own[part].mean()) for name, part in get_task(subset.task).state_slices.items()}, rel=1e-5
+        {name: float(own[part].mean()) for name, part in get_task(cell.task).state_slices.items()}, rel=1e-5
     )
 
 
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
-def test_a_picture_cell_is_made_again_if_the_units_of_its_state_errors_change(whole, request, tmp_path):
+def test_a_picture_cell_is_made_again_if_the_units_of_its_state_errors_change(whole, request):
     folder = request.getfixturevalue(whole)
-    release, setup = open_release(folder), Setup(str(folder), str(tmp_path), PROFILES["smoke"])
+    release = open_release(folder)
     cells = {agent: plan_benchmark("b1", release, [agent])[0][0] for agent in ("bc", "state-bc")}
-    before = {agent: fingerprint(setup, release, cell) for agent, cell in cells.items()}
+    before = {agent: fingerprint(release, SMOKE, cell) for agent, cell in cells.items()}
     other = next(iter(release.subsets.values()))
     record = other.record.model_copy(update={"name": f"{other.task}/other/{other.setting}"})
     one = dict(list(other.commits.items())[:1])
     manifest = release.manifest.model_copy(update={"subsets": (*release.manifest.subsets, record)})
     grown = Release(release.root, manifest, release.subsets | {record.name: Subset(folder, record, one, {})})
-    assert fingerprint(setup, grown, cells["bc"]) != before["bc"]
-    assert fingerprint(setup, grown, cells["state-bc"]) == before["state-bc"]
+    assert fingerprint(grown, SMOKE, cells["bc"]) != before["bc"]
+    assert fingerprint(grown, SMOKE, cells["state-bc"]) == before["state-bc"]
 
 
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
-    cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc"])[0]][:1]
-    setup = Setup(str(small_release), str(tmp_path), PROFILES["smoke"], seed=7)  # data that no other test has loaded
+    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    budget = dataclasses.replace(SMOKE, seed=7)  # data that no other test has loaded
 
     def out_of_memory(*_, **__):
         raise MemoryError("no room for 7 GB")
 
-    monkeypatch.setattr("dmcvb_gen.benchmarks.experiments.load_data", out_of_memory)
-    [(cell, result)] = list(run_cells(setup, cells))
+    monkeypatch.setattr(cells_module, "load_data", out_of_memory)
+    [(cell, result)] = list(run_cells(small_release, tmp_path, budget, cells))
     log = tmp_path / "cells" / f"{cell.id}.log"
     assert result["error"] == f"MemoryError: no room for 7 GB (all of it in {log})"
     assert "out_of_memory" in log.read_text()
     monkeypatch.undo()
-    [(_, result)] = list(run_cells(setup, cells))
+    [(_, result)] = list(run_cells(small_release, tmp_path, budget, cells))
     assert "error" not in result and not log.exists()
 
 
@@ -633,72 +625,95 @@ def test_ablations_are_set_beside_bc_on_all_of_the_expert_without_distractors():
 
 def test_a_cells_seconds_are_those_of_all_its_sessions(small_release, tmp_path, monkeypatch):
     points = [{"step": 10, "score": {"mean": 1.0, "seconds": 20.0}, "seconds": 100.0}]
-    monkeypatch.setattr(
-        "dmcvb_gen.benchmarks.experiments.train", lambda *args, **options: points
-    )  # the rest was made before
+    monkeypatch.setattr(cells_module, "train", lambda *args, **options: points)  # the rest was made before
     cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
-    [(_, result)] = list(run_cells(Setup(str(small_release), str(tmp_path), PROFILES["smoke"]), cells))
-    seconds = result["seconds"]
-    assert (seconds["training"], seconds["evaluation"]) == (80, 20) and seconds["all"] >= 100
-    assert result["steps_per_second"] == PROFILES["smoke"].state_steps / 80
+    [(_, result)] = list(run_cells(small_release, tmp_path, SMOKE, cells))
+    assert result["seconds"] == {"training": 80, "evaluation": 20, "inspection": 0, "all": 100}
 
 
-def test_data_that_grew_or_look_otherwise_are_read_again(small_release):
-    release, part = open_release(small_release), (Slice("walker-walk/random/none"),)
-    setup, cache = Setup(str(small_release), "out", PROFILES["smoke"]), _DataCache()
-    subset = release[part[0].subset]
+def test_data_that_grew_or_look_otherwise_are_read_again(small_release, tmp_path):
+    release = open_release(small_release)
+    cell = plan_benchmark("b1", release, ["state-bc"])[0][0]
+    subset = release[cell.policy[0].subset]
     half = Subset(subset.root, subset.record, {0: subset.commits[0]}, {})
     less = Release(release.root, release.manifest, {subset.name: half})
-    assert [len(cache.get(setup, one, part, False, 3).lengths) for one in (less, less, release)] == [2, 2, 3]
-    before = cache._data
-    assert cache.get(setup, release, part, False, 3) and cache._data is before
-    cache.get(dataclasses.replace(setup, backgrounds="elsewhere"), release, part, False, 3)
-    assert cache._data is not before
+
+    def data_of(release, budget=SMOKE):
+        run = CellRun(small_release, tmp_path, budget, cell)
+        run.release = release
+        return run.data(pixels=False)
+
+    found = [data_of(one) for one in (less, less, release, release)]
+    assert [len(data.lengths) for data in found] == [2, 2, 3, 3]
+    assert found[0] is found[1] and found[2] is found[3]
+    assert data_of(release, dataclasses.replace(SMOKE, memory=10**9)) is not found[3]
 
 
-def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate():
-    setup = Setup(root="r", out="o", profile=PROFILES["brief"])
-    pixels, states = train_settings(setup, 10, 64), train_settings(setup, 10, 64, pixels=False)
-    assert (pixels.batch_size, pixels.rate, pixels.shift, pixels.half) == (64, 2.0, True, False)
-    assert not train_settings(setup, 10, 65).shift  # fewer than ten passes over the data
-    assert (states.batch_size, states.rate, states.half) == (256, 1.0, False)
-    quick = dataclasses.replace(setup, profile=PROFILES["quick"])
-    assert train_settings(quick, 10, 64).muon and not train_settings(quick, 10, 64, pixels=False).muon
-    whole = train_settings(Setup(root="r", out="o", profile=PROFILES["paper"]), 10, 10**9)
-    assert (whole.batch_size, whole.rate, whole.shift, whole.decay) == (256, 1.0, True, False)
+def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate(small_release, monkeypatch):
+    """What `train` is told of each kind of agent, seen at its batches and its optimizer."""
+    release = open_release(small_release)
+    pixels = load_data(release, [Slice("walker-walk/random/none")])
+    for name, data, size, rate, optimizer in (
+        ("brief", pixels, 64, 2e-3, "Adam"),
+        ("brief", pixels.states_only(), 256, 1e-3, "Adam"),
+        ("quick", pixels, 64, 1e-3, "Muon"),
+        ("quick", pixels.states_only(), 256, 1e-3, "Adam"),
+        ("paper", pixels, 256, 1e-3, "Adam"),
+    ):
+        torch.manual_seed(0)
+        agent = parse_agent("bc" if data.frames else "state-bc")
+        learner = make_policy(agent, make_encoder(agent, data.sizes, None, PATCHES), data.sizes, PATCHES)
+        seen = []
+
+        def update(batch, learner=learner, seen=seen):
+            [group] = learner.optimizers["main"].param_groups
+            seen.append((len(batch.action), group["lr"], type(learner.optimizers["main"]).__name__))
+            return {"loss": torch.zeros(())}
+
+        monkeypatch.setattr(learner, "update", update)
+        train(learner, data, dataclasses.replace(BUDGETS[name], precision="bfloat16"), 1)
+        assert seen == [(size, rate, optimizer)] and learner.half == (data.frames is not None)
+
+
+def test_pictures_are_shifted_from_so_many_passes_over_the_data_on():
+    assert BUDGETS["brief"].shifts(10, 64) and not BUDGETS["brief"].shifts(10, 65)
+    assert BUDGETS["paper"].shifts(10, 10**9)
 
 
 def test_a_release_so_small_that_quick_shifts_its_pictures_is_told(small_release):
-    cells = plan_benchmark("b1", open_release(small_release), ["bc", "state-bc", "id+bc"])[0]
+    release = open_release(small_release)
+    cells = plan_benchmark("b1", release, ["bc", "state-bc", "id+bc"])[0]
     [bc] = {cell for cell in cells if cell.agent.name == "bc" and cell.setting == "none"}
-    quick = PROFILES["quick"]
+    quick = BUDGETS["quick"]
 
-    def told(transitions: int, cell=bc, profile=quick) -> list[str]:
-        return [
-            issue.message for issue in _few_warnings(profile, [(cell, {"transitions": transitions, "episodes": 100})])
-        ]
+    def told(transitions: int, cell=bc, budget=quick) -> list[str]:
+        good = {"mean": 1.0, "limit": 500, "success": None}
+        result = {"transitions": transitions, "score": good, "data": good}
+        return [issue.message for issue in training_warnings(release, budget, [(cell, result)])]
 
     assert told(quick.pixel_steps * quick.batch_size // 10)
     assert not told(quick.pixel_steps * quick.batch_size // 10 + 1)
-    [text] = told(47_500)  # 5 of the 100 are held out
-    assert "passes 22 times over 100 episodes" in text and "with 216 episodes" in text
-    assert not told(47_500, profile=PROFILES["paper"]) and not told(47_500, profile=PROFILES["smoke"])
+    [text] = told(47_500)
+    assert "passes 22 times over its 47,500 steps" in text and "from 102,400 on it does not" in text
+    assert not told(47_500, budget=BUDGETS["paper"]) and not told(47_500, budget=BUDGETS["smoke"])
     assert not any(told(47_500, cell) for cell in cells if cell.agent.name != "bc")
 
 
 def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
-    def result(benchmark, task, label, mean, scores=True):
-        cell = dict(benchmark=benchmark, task=task, policy_label=label, setting="visible", agent_name="bc")
-        score = dict(mean=mean, stderr=3.0, success=0.5)
-        return dict(cell=cell | dict(pretrain_label=""), profile=dict(scores=scores), score=score)
+    def result(benchmark, task, mean, pair=None):
+        setting = "visible" if pair is None else "fixed"
+        part = Slice(f"{task}/expert/{setting}", goal_pair=pair)
+        cell = Cell(benchmark, task, setting, parse_agent("bc"), (part,))
+        return {"cell": cell.facts(), "score": dict(mean=mean, stderr=3.0, success=0.5)}
 
     layouts = ("easy7x7a", "easy7x7b", "easy7x7c", "empty7x7", "medium7x7a")
-    results = [result("b1", f"ant-maze-{layout}", "expert", -100.0 - 30 * i) for i, layout in enumerate(layouts)]
-    results += [result("b3", "ant-maze-empty7x7", f"expert goal {pair}", -200.0 - pair) for pair in range(5)]
-    results += [result("b1", "walker-walk", "expert", 900.0), result("b1", "ant-maze-tiny", "expert", -9.0)]
+    results = [result("b1", f"ant-maze-{layout}", -100.0 - 30 * i) for i, layout in enumerate(layouts)]
+    results += [result("b3", "ant-maze-empty7x7", -200.0 - pair, pair) for pair in range(5)]
+    results += [result("b1", "walker-walk", 900.0), result("b1", "ant-maze-tiny", -9.0)]
     own = "ant-maze-empty7x7@geodesic"  # the paper has no table of it
-    results += [result("b1", own, "expert", -9.0)] + [result("b3", own, f"expert goal {pair}", -8.0) for pair in (0, 1)]
-    rows = {(row[0], row[1]): row[5:] for row in report._groups(results)}
+    results += [result("b1", own, -9.0)] + [result("b3", own, -8.0, pair) for pair in (0, 1)]
+    facts = {"results": results, "budget": {"scores": True}}
+    rows = {(row[0], row[1]): row[5:] for row in _groups(facts)}
     assert rows == {
         ("b1", "ant-maze/single-obstacle"): ("3", "-130 ± 1.7", "50 %"),
         ("b1", "ant-maze/empty"): ("1", "-190 ± 3.0", "50 %"),
@@ -706,9 +721,4 @@ def test_mazes_are_grouped_as_in_the_paper_and_goal_pairs_are_averaged():
         ("b3", "ant-maze-empty7x7"): ("5", "-202 ± 1.3", "50 %"),
         ("b3", "ant-maze-empty7x7-geodesic"): ("2", "-8.0 ± 2.1", "50 %"),
     }
-    assert not report._groups([result("b1", "ant-maze-empty7x7", "expert", -9.0, scores=False)])
-
-
-def test_only_networks_that_see_pictures_compute_in_bfloat16():
-    setup = Setup(root="r", out="o", profile=PROFILES["brief"], precision="bfloat16")
-    assert train_settings(setup, 10, 64).half and not train_settings(setup, 10, 64, pixels=False).half
+    assert not _groups(facts | {"budget": {"scores": False}})

@@ -5,24 +5,25 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import numpy as np
 import pytest
+from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import save_file
 
 import dmcvb_gen
 from dmcvb_gen.agents.networks import PATCHES
-from dmcvb_gen.benchmarks import trained
-from dmcvb_gen.benchmarks.profiles import get_profile
-from dmcvb_gen.benchmarks.trained import load_agent
-from dmcvb_gen.benchmarks.validate import make_setup, validate
+from dmcvb_gen.benchmarks import evaluate as evaluation
+from dmcvb_gen.benchmarks.evaluate import load_agent
+from dmcvb_gen.benchmarks.plan import BUDGETS
+from dmcvb_gen.benchmarks.report import validate
 from dmcvb_gen.errors import DmcvbError
 
 
 def report_of(release, out, agents, only):
     """A report of a few steps whose scores count."""
-    profile = dataclasses.replace(get_profile("smoke"), scores=True, network=PATCHES, episodes=3, readout_steps=0)
-    setup = dataclasses.replace(make_setup(release, out=out), profile=profile)
-    validate(release, setup, agents=agents, patterns=only)
+    budget = dataclasses.replace(BUDGETS["smoke"], scores=True, network=PATCHES, episodes=3, readout_steps=0)
+    validate(release, out, budget, agents=agents, patterns=only)
     return out
 
 
@@ -43,8 +44,7 @@ def test_every_score_of_a_report_is_computed_again_from_its_policy_file(report, 
     results = json.loads((folder / "report.json").read_text())["results"]
     for result in results:
         agent = load_agent(folder / "cells" / f"{result['id']}.safetensors")
-        scene = dict(size=agent.sizes.picture) if agent.pixels else {}
-        options = dict(episodes=3, max_steps=10, pixels=agent.pixels, stack=agent.stack) | scene
+        options = dict(episodes=3, max_steps=10)
         where = f"{result['cell']['task']}/{result['cell']['setting']}"
         again = dmcvb_gen.evaluate(agent, where, **options)
         assert list(again.returns) == result["final"]["returns"], result["id"]
@@ -72,15 +72,36 @@ def test_a_file_that_names_other_sizes_than_it_holds_makes_no_networks(change, w
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     changed = [] if change == "no facts" else facts | {key: facts[key] | new for key, new in change.items()}
     save_file(tensors, str(tmp_path / "x.safetensors"), metadata={"facts": json.dumps(changed)})
-    made, untrained = [], trained._untrained
+    made, untrained = [], evaluation._untrained
 
     def watched(*arguments):
         policy = untrained(*arguments)
         made.append(next(policy.parameters()).device.type)
         return policy
 
-    monkeypatch.setattr(trained, "_untrained", watched)
+    monkeypatch.setattr(evaluation, "_untrained", watched)
     with pytest.raises(DmcvbError, match="no agent that validate trained"):
         load_agent(tmp_path / "x.safetensors")
     assert "cpu" not in made
     assert load_agent(kept).agent.name == "td3-bc" and made[-2:] == ["meta", "cpu"]
+
+
+@pytest.mark.slow
+def test_an_evaluation_unlike_the_policys_data_is_refused_or_said(walkers, caplog, tmp_path):
+    agent = load_agent(walkers / "cells" / "b1_walker-walk_dynamic_td3-bc_random.safetensors")
+    options = dict(episodes=2, max_steps=2)
+    for wrong, told in (
+        (dict(size=32), "size is 32, and the policy learned with 16; leave size out"),
+        (dict(stack=1), "stack is 1, and the policy learned with 3; leave stack out"),
+        (dict(pixels=False), "pixels is False, and the policy learned with True; leave pixels out"),
+    ):
+        with pytest.raises(DmcvbError, match=told):
+            dmcvb_gen.evaluate(agent, "walker-walk/dynamic", **wrong, **options)
+    dmcvb_gen.evaluate(agent, "walker-walk/dynamic", **options)
+    assert not caplog.messages
+    (tmp_path / "clips" / "val" / "one").mkdir(parents=True)
+    Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(tmp_path / "clips" / "val" / "one" / "0.png")
+    dmcvb_gen.evaluate(agent, "walker-walk/dynamic", backgrounds=str(tmp_path / "clips"), **options)
+    dmcvb_gen.evaluate(agent, "walker-walk/dynamic", samples=1, **options)
+    videos, samples = caplog.messages
+    assert "has backgrounds" in videos and "has renderer" in samples and "'samples': 1" in samples

@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.agents.data import Slice, load_data
+from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.checks import check_labels, check_policy_returns, check_structure
-from dmcvb_gen.benchmarks.experiments import data_score
-from dmcvb_gen.benchmarks.goals import goal_cells
+from dmcvb_gen.benchmarks.plan import goal_cells
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.manifest import PolicyRecord
@@ -80,7 +80,7 @@ def test_a_maze_release_goes_through_b1_and_b3(report):
     out, result = report
     assert result.exit_code == 0, result.output
     facts = json.loads((out / "report.json").read_text())
-    ran = [(r["cell"]["benchmark"], r["cell"]["agent_name"], r["cell"]["policy_label"]) for r in facts["results"]]
+    ran = [(r["cell"]["benchmark"], r["cell"]["agent"], r["labels"]["policy"]) for r in facts["results"]]
     assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {
         ("b3", agent, f"random goal {pair}") for agent in ("bc", "id+bc") for pair in range(2)
     }
@@ -106,7 +106,7 @@ def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(release
 
 def test_maze_scores_have_reward_success_and_speed_beside_the_datas_own(report, release):
     facts = json.loads((report[0] / "report.json").read_text())
-    [score] = [r for r in facts["results"] if r["cell"]["agent_name"] == "state-bc"]
+    [score] = [r for r in facts["results"] if r["cell"]["agent"] == "state-bc"]
     subset = open_release(release)[f"{NAME}/visible"]
     reached = subset.read("terminated")
     assert score["data"]["success"] == reached.mean() and score["data"]["limit"] == subset.record.max_steps

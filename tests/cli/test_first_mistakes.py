@@ -317,8 +317,8 @@ def test_a_maze_of_ones_own_without_a_policy_is_told_how_to_train_one(tmp_path):
     assert "`dmcvb-gen train-behaviour --layout FILE`" in said and "**" not in said
 
 
-def test_mistakes_in_what_is_validated_are_told_before_the_precision_is_timed(small_release, tmp_path, monkeypatch):
-    monkeypatch.setattr("dmcvb_gen.benchmarks.validate.choose_precision", lambda *_: pytest.fail("timed"))
+def test_mistakes_in_what_is_validated_are_told_before_any_work(small_release, tmp_path, monkeypatch):
+    monkeypatch.setattr("dmcvb_gen.benchmarks.report.check_structure", lambda *_: pytest.fail("work was done"))
     for words, told in (
         (["--benchmark", "b9"], "unknown benchmark 'b9'"),
         (["--benchmark", "b3"], "has no data"),

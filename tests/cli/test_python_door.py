@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import dmcvb_gen
-from dmcvb_gen.benchmarks.validate import make_setup
+from dmcvb_gen.benchmarks.report import make_budget
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
@@ -125,8 +125,8 @@ def test_shipped_recipes_and_manifests_by_name(tmp_path):
 def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
     """Runs and reports are written as JSON, which has no paths."""
     folder, _ = family
-    setup = make_setup(folder / "r", out=tmp_path, backgrounds=tmp_path / "videos", dino_weights=tmp_path / "weights")
-    json.dumps(dataclasses.asdict(setup))
+    budget = make_budget(backgrounds=tmp_path / "videos", dino_weights=tmp_path / "weights")
+    json.dumps(dataclasses.asdict(budget))
     begun = []
 
     def stop(_, config, __):

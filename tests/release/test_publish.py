@@ -165,14 +165,14 @@ def test_behavior_cloning_trains_on_a_fetched_part(s3, tmp_path):
     from dmcvb_gen.agents.data import Slice, load_data
     from dmcvb_gen.agents.networks import observation_encoder
     from dmcvb_gen.agents.paper import BehaviorCloning
-    from dmcvb_gen.agents.trainer import TrainSettings, train
+    from dmcvb_gen.agents.trainer import Budget, train
 
     fetch("s3://bucket/small", tmp_path / "part", ["*/*/static"], options=s3.options)
     assert verify(tmp_path / "part").sound
     torch.manual_seed(0)
     data = load_data(dmcvb_gen.open(tmp_path / "part"), [Slice("walker-walk/random/static")])
     learner = BehaviorCloning(observation_encoder(9, 16), data.sizes)
-    curve = train(learner, data, TrainSettings(steps=20, batch_size=16))
+    curve = train(learner, data, Budget("short", batch_size=16), 20)
     assert np.isfinite(curve[-1]["loss"]) and 0 < curve[-1]["loss"] < 1  # random actions cannot be foretold
 
 

@@ -93,9 +93,11 @@ def _light(root):
 
 
 def _report(root):
-    from dmcvb_gen.benchmarks.validate import check_writable
+    from dmcvb_gen.benchmarks.plan import BUDGETS
+    from dmcvb_gen.benchmarks.report import claim_folder
+    from dmcvb_gen.dataset import open_release
 
-    check_writable(URL)
+    claim_folder(URL, open_release(root), BUDGETS["smoke"], training=True)
 
 
 def _train(root):

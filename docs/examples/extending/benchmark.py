@@ -1,6 +1,6 @@
 """A benchmark: `--benchmark growth` asks how scores grow with the data, of every subset of a release."""
 
-from dmcvb_gen.benchmarks.suites import Benchmark, Cell, Slice, register_benchmark
+from dmcvb_gen.benchmarks.plan import Benchmark, Cell, Slice, register_benchmark
 
 
 @register_benchmark("growth")

@@ -1,0 +1,698 @@
+"""Train and score cells of a release; each result is a JSON file, and one that is there is not made again.
+
+    <out>/encoders/<id>.safetensors, .json   a pre-trained encoder and its learning curve, shared by cells
+    <out>/cells/<id>.json                    a cell's scores, curve, settings, times
+    <out>/cells/<id>.safetensors             its trained policy (`evaluate.load_agent`)
+    <out>/cells/<id>.rollout.png             frames of an evaluation episode
+    <out>/cells/<id>.decoder.png             what decoders see through the encoder
+    <out>/cells/<id>.log, encoders/<id>.log  the traceback of one that failed
+
+A result carries the fingerprint of all that decides it (cell, budget, digests of data, backgrounds and weights); one
+with another fingerprint is made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib
+import inspect
+import json
+import os
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
+from dmcvb_gen.agents.data import Normalization, TrainingData, choose_episodes, default_memory, load_data
+from dmcvb_gen.agents.learners import Learner, Policy
+from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
+from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
+from dmcvb_gen.benchmarks.evaluate import Act, Evaluator, Score, TrainedAgent, protocol, renderer_choice
+from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
+from dmcvb_gen.dataset import Release, Subset, open_release
+from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import replacing, write_json, write_text
+from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
+from dmcvb_gen.loaders.source import StepSource
+from dmcvb_gen.own_code import source_digest
+from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
+from dmcvb_gen.parallel.cores import usable_cores
+from dmcvb_gen.policies.evaluation import goal_speed
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.version import __version__
+
+RESULT_VERSION = 4
+TICK_SECONDS = 0.2
+"""Progress is told no more often: an Adam step on states takes less than telling of it."""
+INSPECTED = 150_000
+"""Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
+UNIT_EPISODES = 100
+
+
+# -- your own agents --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class AgentData:
+    """Data that your own agent learns from.
+
+    Attributes:
+      sources: one a subset, all steps of its training episodes (`StepSource`: len(), [i] and gather(), numpy alone).
+      task, setting: scene of its policy's score. seed: seed of the validation.
+    """
+
+    sources: tuple[StepSource, ...]
+    task: str
+    setting: str
+    seed: int
+
+    @property
+    def source(self) -> StepSource:
+        """The first source; the only one, unless levels are mixed."""
+        return self.sources[0]
+
+
+@dataclass(frozen=True)
+class OwnAgent:
+    """An agent that a user brought, "module:name".
+
+    The name is that of a ready policy, or of a function or class whose first parameter is called `data` and whose
+    others have defaults: it gets the episodes that a cell learns from (`AgentData`) and makes a policy. A policy is a
+    callable as `dmcvb_gen.evaluate` takes it. Two attributes of the named object, if it has them, say what its policy
+    sees: `stack` (frames, 3) and `pixels` (True).
+    """
+
+    name: str
+    value: Any
+
+    @classmethod
+    def load(cls, name: str) -> OwnAgent:
+        """Import it; modules of the working folder are found.
+
+        Raises:
+          DmcvbError: there is no such module or name, importing it fails, or it cannot be called.
+        """
+        module, _, attribute = name.partition(":")
+        if os.getcwd() not in sys.path:
+            sys.path.insert(0, os.getcwd())
+        try:
+            value = getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # a user's module may raise anything
+            raise DmcvbError(f"cannot load agent {name} ({error}); give MODULE:NAME, run from its folder") from None
+        if not callable(value):
+            raise DmcvbError(f"agent {name} is a {type(value).__name__}; expected a policy or a function of `data`")
+        agent = cls(name, value)
+        if isinstance(value, type) and not agent.learns:
+            raise DmcvbError(f"agent {name} is a class; expected a policy, or a function or class of `data`")
+        return agent
+
+    @property
+    def learns(self) -> bool:
+        """True if it makes a policy of data."""
+        try:
+            first, *others = inspect.signature(self.value).parameters.values()
+        except (TypeError, ValueError):
+            return False
+        optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        return first.name == "data" and all(o.default is not o.empty or o.kind in optional for o in others)
+
+    @property
+    def stack(self) -> int:
+        return int(getattr(self.value, "stack", 3))
+
+    @property
+    def pixels(self) -> bool:
+        return bool(getattr(self.value, "pixels", True))
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Module files -> SHA-256, of the agent's own and of all that lie beside it: a changed agent is trained again.
+
+        Raises:
+          DmcvbError: the agent's file has changed since it was imported.
+        """
+        module = self.name.partition(":")[0]
+        found = {module: source_digest(module)}
+        file = getattr(sys.modules[module], "__file__", None)
+        for path in sorted(Path(file).parent.glob("*.py")) if file else ():
+            found.setdefault(path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+        return found
+
+    def policy(self, data: AgentData) -> Act:
+        """The policy, trained if it learns.
+
+        Raises:
+          DmcvbError: training gives something that cannot be called.
+        """
+        policy = self.value(data) if self.learns else self.value
+        if not callable(policy):
+            raise DmcvbError(f"agent {self.name} returned a {type(policy).__name__}; expected a policy to call")
+        return policy
+
+
+def sees_pictures(agent: Agent) -> bool:
+    """Return True if an agent learns from pictures and is evaluated on them."""
+    return OwnAgent.load(agent.own).pixels if agent.own else not agent.sees_state
+
+
+# -- what decides a result --------------------------------------------------------------------------
+
+
+def open_data(root: str | Path, budget: Budget) -> Release:
+    """The release of a run; images that it does not store are rendered when they are read.
+
+    Raises:
+      StoreError: there is no release, or it is damaged.
+    """
+    room = DEFAULT_CACHE if budget.memory is None else min(budget.memory, DEFAULT_CACHE)
+    return painted_release(open_release(root), Painting(backgrounds=budget.backgrounds, cache_bytes=room), True)
+
+
+def data_digests(release: Release, cell: Cell) -> dict[str, str]:
+    """Subset -> digest of its data, of all that a cell learns from."""
+    return {name: subset_digest(release[name].commits) for name in sorted(cell.subsets)}
+
+
+def evaluation_of(release: Release, budget: Budget, cell: Cell) -> dict[str, Any]:
+    """All that decides the evaluation of a cell's policy, as plain values (`evaluate.protocol`).
+
+    Raises:
+      BackgroundError: there are no `val` videos.
+    """
+    subset, pair = release[cell.policy[0].subset], cell.policy[0].goal_pair
+    shown = dict(pictures=sees_pictures(cell.agent), max_steps=budget.episode_steps)
+    return protocol(subset, goal_cells(subset, pair), budget.backgrounds, **shown)
+
+
+def fingerprint(release: Release, budget: Budget, cell: Cell) -> str:
+    """SHA-256 of everything that decides a result; of the machine, the precision alone.
+
+    Raises:
+      DmcvbError: an encoder's weights or background videos are needed and not there.
+    """
+    agent = cell.agent
+    learns_pictures = not (agent.sees_state or agent.own)
+    facts = {"version": RESULT_VERSION, "cell": cell.facts(), "budget": budget.facts()}
+    facts |= {"data": data_digests(release, cell), "code": agent.foreign_code()}
+    if not learns_pictures:
+        facts["budget"].pop("precision")
+    if cell.benchmark != ENCODER:
+        facts["evaluation"] = evaluation_of(release, budget, cell)
+        if budget.readout_steps and learns_pictures:  # `state_units` are of them
+            alike = [subset for subset in release.subsets.values() if subset.task == cell.task]
+            facts["units"] = sorted(subset_digest(subset.commits) for subset in alike)
+        if agent.own:
+            facts["own"] = OwnAgent.load(agent.own).digests
+        if agent.ready_encoder:
+            facts["weights"] = agent.ready_encoder.digest(budget.dino_weights)
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def read_result(path: Path, wanted: str) -> dict[str, Any] | None:
+    """A result file, or None if there is none with that fingerprint."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        result = json.loads(path.read_text())
+        return result if result.get("fingerprint") == wanted else None
+    return None
+
+
+def kept_results(release: Release, out: str | Path, budget: Budget) -> list[tuple[Cell, dict[str, Any]]]:
+    """The results in a report's folder whose fingerprint is that of their cell on this release, by this budget."""
+    found = []
+    for path in sorted((Path(out) / "cells").glob("*.json")):
+        with contextlib.suppress(DmcvbError, OSError, ValueError, LookupError, TypeError, AttributeError):
+            result = json.loads(path.read_text())
+            cell = Cell.of(result["cell"])
+            BENCHMARKS.get(cell.benchmark)
+            if result["fingerprint"] == fingerprint(release, budget, cell):
+                found.append((cell, result))
+    return found
+
+
+# -- one cell ---------------------------------------------------------------------------------------
+
+_held: dict[tuple, TrainingData] = {}
+"""The data of the last slices asked for: cells that follow each other often share them."""
+
+
+def policy_steps(budget: Budget, agent: Agent) -> int:
+    """Adam steps of a cell's policy; those of a user's own agent are not known."""
+    if agent.own:
+        return 0
+    if agent.sees_state:
+        return budget.state_steps
+    return budget.frozen_steps if agent.pretrain else budget.pixel_steps
+
+
+class CellRun:
+    """The training and evaluation of one cell.
+
+    Args:
+      root: the release's folder. out: the report's folder.
+      tick: told what is being done and how many Adam steps were made since the last call.
+
+    Raises:
+      DmcvbError: there is no release, or DINO's weights or the `val` videos are missing.
+    """
+
+    def __init__(self, root: str | Path, out: str | Path, budget: Budget, cell: Cell, tick: ProgressCallback = ignore):
+        self.root, self.out, self.budget, self.cell, self.tick = str(root), Path(out), budget, cell, tick
+        self.release = open_data(root, budget)
+        self.mark = fingerprint(self.release, budget, cell)
+        self.own = OwnAgent.load(cell.agent.own) if cell.agent.own else None
+
+    def path(self, suffix: str) -> Path:
+        """A file of the cell, e.g. its ".json"."""
+        folder = "encoders" if self.cell.benchmark == ENCODER else "cells"
+        return self.out / folder / f"{self.cell.id}{suffix}"
+
+    def result(self) -> dict[str, Any]:
+        """Train and score it, unless its result is there.
+
+        A ready policy of the user's is scored each time: its score hangs on more than its code, and costs one
+        evaluation. A kept result of an own agent that learns has "kept": True.
+
+        Raises:
+          DmcvbError: the renderer cannot start, training does not stay finite, or an own policy gives no actions.
+        """
+        encoder = self.cell.benchmark == ENCODER
+        done = None if self.own and not self.own.learns else read_result(self.path(".json"), self.mark)
+        if done and (not encoder or self.path(".safetensors").exists()):
+            return done | {"kept": True} if self.own else done
+        made = self._pretrain() if encoder else self._score_own(self.own) if self.own else self._train()
+        facts = {"id": self.cell.id, "fingerprint": self.mark, "cell": self.cell.facts()}
+        facts |= {"budget": self.budget.facts() | {"note": self.budget.note}, **made}
+        write_json(self.path(".json"), facts)
+        shutil.rmtree(self._states, ignore_errors=True)
+        return facts
+
+    @property
+    def _states(self) -> Path:
+        """Folder of the states of its trainings, from which a stopped one resumes."""
+        return self.path(f".{self.mark[:12]}.run")
+
+    @property
+    def _subset(self) -> Subset:
+        return self.release[self.cell.policy[0].subset]
+
+    def data(self, pixels: bool = True, stack: int = 3) -> TrainingData:
+        """The data of the cell's slices; painting many images takes minutes, so they are kept for the next cell."""
+        budget, parts = self.budget, self.cell.policy
+        digests = tuple(data_digests(self.release, self.cell).items())  # a release may have grown
+        key = (self.root, parts, digests, budget.seed, budget.backgrounds, budget.device, budget.memory)
+        if not pixels and (key, False) not in _held and (key, True) in _held:
+            return _held[key, True].states_only()
+        if (key, pixels) not in _held:
+            _held.clear()  # free the old pictures before new ones are read
+            names = " + ".join(dict.fromkeys(part.subset for part in parts))
+            _held[key, pixels] = load_data(
+                self.release,
+                parts,
+                pixels=pixels,
+                seed=budget.seed,
+                device=budget.device,
+                memory=budget.memory,
+                scratch=self.out,
+                tick=lambda share: self.tick(f"images of {names}, {share:.0%}", 0) if pixels else None,
+            )
+        return _held[key, pixels].with_stack(stack) if pixels else _held[key, pixels]
+
+    # -- training
+
+    def _pretrain(self) -> dict[str, Any]:
+        """Train an encoder and keep it."""
+        budget, agent = self.budget, self.cell.agent
+        data = self.data(stack=agent.stack)
+        torch.manual_seed(budget.seed)
+        encoder = make_encoder(agent, data.sizes, architecture=budget.network)
+        learner = make_pretrainer(agent, encoder, data.sizes, budget.network).to(budget.device)
+        steps, label = budget.pretrain_steps, f"{agent.pretrain} encoder of {self.cell.task}"
+        curve = self._fit(learner, data, steps, budget.shifts(steps, len(data)), label)
+        with replacing(self.path(".safetensors")) as path:
+            save_file({name: value.cpu().contiguous() for name, value in encoder.state_dict().items()}, str(path))
+        return {"curve": curve, "seconds": curve[-1]["seconds"]}
+
+    def _train(self) -> dict[str, Any]:
+        """Train a policy, score it and look into its encoder."""
+        budget, cell, pixels = self.budget, self.cell, not self.cell.agent.sees_state
+        encoder = cell.encoder and CellRun(self.root, self.out, budget, cell.encoder, self.tick)
+        pretrained = encoder and encoder.result()
+        data = self.data(pixels, cell.agent.stack)
+        torch.manual_seed(budget.seed)
+        phi = make_encoder(cell.agent, data.sizes, budget.dino_weights, budget.network)
+        if encoder:
+            _load_encoder(encoder.path(".safetensors"), phi)
+        policy = make_policy(cell.agent, phi, data.sizes, budget.network).to(budget.device)
+        trained = TrainedAgent(
+            cell.agent, data.sizes, policy, data.normalization, evaluation_of(self.release, budget, cell)
+        )
+        curve = self._train_policy(policy, trained, data)
+        if budget.scores and not cell.agent.ready_encoder:  # DINO's weights are a large file of the user's
+            trained.save(self.path(".safetensors"), budget.network)
+        inspection = self.inspect(policy.encoder, data) if pixels and budget.readout_steps else None
+        looking = sum(points[-1]["seconds"] for points in inspection["curves"].values()) if inspection else 0.0
+        return self._facts(data, curve, looking) | {
+            "pretraining": pretrained and {key: pretrained[key] for key in ("curve", "seconds")},
+            "inspection": inspection,
+        }
+
+    def _train_policy(self, policy: Policy, trained: TrainedAgent, data: TrainingData) -> Curve:
+        budget, agent = self.budget, self.cell.agent
+        steps, frozen = policy_steps(budget, agent), agent.pretrain is not None
+        shift = budget.frozen_shift if frozen else budget.shifts(steps, len(data))
+        if frozen:
+            data = self._encoded(policy.encoder, data, steps * budget.batch_size)
+        with self._evaluator(trained.pixels, agent.stack) as evaluator:
+
+            def evaluate(_: Learner) -> dict[str, Any]:
+                score = evaluator.score(trained)
+                self._save_shots(score)
+                return {"score": score.facts()}
+
+            return self._fit(policy, data, steps, shift, f"{agent.name} on {self.cell.place}", evaluate=evaluate)
+
+    def _fit(
+        self,
+        learner: Learner,
+        data: TrainingData,
+        steps: int,
+        shift: bool,
+        label: str,
+        folder: str = "",
+        evaluate: Any = None,
+    ) -> Curve:
+        options = dict(shift=shift, folder=self._states / folder, evaluate=evaluate)
+        return train(learner, data, self.budget, steps, tick=lambda made: self.tick(label, made), **options)
+
+    def _encoded(self, encoder: nn.Module, data: TrainingData, draws: int) -> TrainingData:
+        """Data of a frozen encoder: latents are computed once if that pays and the budget does not shift pictures.
+
+        Args:
+          draws: how many transitions will be drawn; if there are more rows than that, each is encoded as it is drawn.
+        """
+        if self.budget.frozen_shift or draws < len(data.state):
+            return data
+        dtype = torch.bfloat16 if self.budget.precision == "bfloat16" else torch.float32
+        return data.encoded(encoder, dtype, lambda share: self.tick(f"encoding, {share:.0%}", 0))
+
+    def _score_own(self, own: OwnAgent) -> dict[str, Any]:
+        """Score a user's own agent: its policy is trained by the user's code, if at all."""
+        started, cell, budget = time.perf_counter(), self.cell, self.budget
+        data, views = self.data(pixels=False), "agents" if own.pixels else ()
+        sources = []
+        for part in cell.policy:
+            episodes, held = choose_episodes(self.release[part.subset], part, budget.seed)
+            sources.append(StepSource(self.release[part.subset], episodes[~held], views, own.stack))
+        policy = own.policy(AgentData(tuple(sources), cell.task, cell.setting, budget.seed))
+        trained = time.perf_counter() - started
+        with self._evaluator(own.pixels, own.stack) as evaluator:
+            score = evaluator.score(policy)
+        self._save_shots(score)
+        curve = [{"step": 0, "seconds": trained + score.seconds, "score": score.facts()}]
+        return self._facts(data, curve, 0.0) | {"pretraining": None, "inspection": None}
+
+    # -- evaluation
+
+    @contextlib.contextmanager
+    def _evaluator(self, pixels: bool, stack: int) -> Iterator[Evaluator]:
+        evaluator = Evaluator(
+            self._subset,
+            pixels=pixels,
+            stack=stack,
+            episodes=self.budget.episodes,
+            max_steps=self.budget.episode_steps,
+            pair=goal_cells(self._subset, self.cell.policy[0].goal_pair),
+            backgrounds=self.budget.backgrounds,
+            threads=self.budget.threads,
+        )
+        try:
+            yield evaluator
+        finally:
+            evaluator.close()
+
+    def _save_shots(self, score: Score) -> None:
+        if score.pictures is not None:
+            _save_sheet(self.path(".rollout.png"), [score.pictures])
+
+    def _facts(self, data: TrainingData, curve: Curve, looking: float) -> dict[str, Any]:
+        """The facts of a result, without encoder and inspection, which took so many seconds."""
+        cell, budget, subset = self.cell, self.budget, self._subset
+        evaluations = [point for point in curve if "score" in point]
+        best = max(evaluations, key=lambda point: point["score"]["mean"])
+        evaluating = sum(point["score"]["seconds"] for point in evaluations)
+        paper = BENCHMARKS.get(cell.benchmark).paper_score(cell)
+        return {
+            "labels": {"policy": cell.policy_label, "encoder": cell.pretrain_label},
+            "score": best["score"] | {"step": best["step"]},
+            "final": evaluations[-1]["score"],
+            "evaluations": len(evaluations),
+            "paper": paper and {"mean": paper[0], "stderr": paper[1]},
+            "data": {key: value for key, value in data_score(subset, data).facts().items() if key != "returns"},
+            "digests": data_digests(self.release, cell),
+            "episodes": len(data.lengths),
+            "transitions": len(data),
+            "evaluation": evaluation_of(self.release, budget, cell),
+            "renderers": {"data": subset.record.renderer["name"], "evaluation": renderer_choice(subset)["name"]},
+            "curve": [_thin(point) for point in curve],
+            "seconds": {
+                "training": curve[-1]["seconds"] - evaluating,
+                "evaluation": evaluating,
+                "inspection": looking,
+                "all": curve[-1]["seconds"] + looking,
+            },
+            "machine": {"device": budget.device, "threads": budget.threads, "torch": torch.__version__},
+            "generator": f"dmcvb-gen {__version__}",
+        }
+
+    # -- what an encoder knows
+
+    def inspect(self, encoder: nn.Module, data: TrainingData) -> dict[str, Any]:
+        """Measure what a frozen encoder still knows: test errors of decoders of its latents (section 5.1)."""
+        budget, steps = self.budget, self.budget.readout_steps
+        torch.manual_seed(budget.seed)  # of the readouts' weights, also where training has just been resumed
+        readouts = {
+            "observation": ObservationProbe(encoder, data.sizes, budget.network),
+            "state": StateProbe(encoder, data.sizes),
+        }
+        draws = len(readouts) * steps * budget.batch_size + min(len(data.hold_out_rows), INSPECTED)
+        data, curves = self._encoded(encoder, data, draws), {}
+        for name, learner in readouts.items():
+            learner.to(budget.device)
+            curves[name] = self._fit(learner, data, steps, budget.frozen_shift, f"{name} decoder", folder=name)
+        errors, held_out = self.test_errors(readouts, data), len(data.hold_out_rows) > 0
+        batch = draw(readouts["observation"], data, 8, budget.seed, 0, hold_out=held_out)
+        with torch.no_grad(), readouts["observation"].precision():
+            seen = readouts["observation"].predict(batch).float()
+        newest = slice(-data.frames.channels, None)
+        rows = [_to_pictures(pictures[:, newest][:, :3]) for pictures in (batch.observation, seen)]
+        _save_sheet(self.path(".decoder.png"), rows)
+        return {**errors, "curves": curves, "held_out": held_out}
+
+    @torch.no_grad()
+    def test_errors(self, readouts: dict[str, Any], data: TrainingData) -> dict[str, Any]:
+        """Errors of decoders on held-out transitions, at most 150,000 of them, evenly spread, each encoded once.
+
+        Returns:
+          "observation_mse" and "state_mse": mean squared errors. "state_l1": state field -> mean absolute error, in
+          the standard deviations of `state_units`. All None if nothing is held out.
+        """
+        rows = data.hold_out_rows
+        rows = rows[:: max(1, -(-len(rows) // INSPECTED))]
+        if not len(rows):
+            return {"observation_mse": None, "state_mse": None, "state_l1": None}
+        squared, absolute = dict.fromkeys(readouts, 0.0), torch.zeros(data.state.shape[1], device=data.device)
+        for few in rows.split(self.budget.batch_size):
+            self.tick("test errors of the decoders", 0)
+            batch = data.transitions(few)
+            with readouts["state"].precision():
+                if batch.latent is None:
+                    batch = dataclasses.replace(batch, latent=readouts["state"].encoder(batch.observation))
+                for name, learner in readouts.items():
+                    squared[name] += float(learner.losses(batch)["loss"]) * len(few)
+                absolute += (readouts["state"].predict(batch) - batch.state).abs().sum(dim=0)
+        scale = data.normalization.std.cpu() / state_units(self.release, self.cell.task)
+        each = absolute.cpu() * scale / len(rows)
+        fields = {name: float(each[part].mean()) for name, part in get_task(self.cell.task).state_slices.items()}
+        return {f"{name}_mse": total / len(rows) for name, total in squared.items()} | {"state_l1": fields}
+
+
+def _load_encoder(path: Path, encoder: nn.Module) -> None:
+    try:
+        encoder.load_state_dict(load_file(str(path)))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise DmcvbError(f"cannot read the encoder {path} ({error}); delete it and run again") from None
+
+
+def data_score(subset: Subset, data: TrainingData) -> Score:
+    """The score of training data, in the measures that policies are scored in."""
+    task = get_task(subset.task)
+    success = speed = None
+    part = task.state_slices.get("target_vector")
+    if part is not None:
+        ends = np.cumsum(data.lengths + 1) - 1
+        first = torch.as_tensor(ends - data.lengths, device=data.device)
+        normal = data.normalization
+        to_goal = data.state[first][:, part].cpu() * normal.std[part].cpu() + normal.mean[part].cpu()
+        distance = to_goal.norm(dim=1).numpy()
+        reached = (data.discount[torch.as_tensor(ends - 1, device=data.device)] == 0).cpu().numpy()
+        success, speed = float(reached.mean()), goal_speed(distance, data.lengths, reached, task)
+    return Score.of(data.returns, success=success, speed=speed, limit=subset.record.max_steps)
+
+
+def state_units(release: Release, task: str) -> torch.Tensor:
+    """(state,) standard deviations of a task's states over all levels of the release, floored at 1e-3.
+
+    One normalization for all levels, so that errors of agents that learned from different levels compare. A level
+    counts by up to 100 episodes of its first setting, as the settings of a level often share their trajectories.
+    """
+    first: dict[str, Subset] = {}
+    for subset in release.subsets.values():
+        if subset.task == task:
+            first.setdefault(subset.level, subset)
+    parts = []
+    for subset in first.values():
+        few, lengths = subset.episodes[:UNIT_EPISODES], subset.lengths[:UNIT_EPISODES]
+        states = subset.read("state", few)
+        parts += [values[: length + 1] for values, length in zip(states, lengths, strict=True)]
+    return Normalization.of(torch.from_numpy(np.concatenate(parts)).float()).std
+
+
+def _thin(point: dict[str, Any]) -> dict[str, Any]:
+    """A point of the curve without the returns of every episode."""
+    if "score" not in point:
+        return point
+    return point | {"score": {key: value for key, value in point["score"].items() if key != "returns"}}
+
+
+def _to_pictures(values: torch.Tensor) -> np.ndarray:
+    return ((values.float() + 0.5).clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+
+
+def _save_sheet(path: Path, rows: Sequence[np.ndarray]) -> None:
+    """Rows of (picture, size, size, 3) uint8 as one PNG."""
+    sheet = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+    with replacing(path) as temporary:
+        Image.fromarray(sheet).save(temporary, format="PNG")
+
+
+# -- many cells -------------------------------------------------------------------------------------
+
+
+def run_cells(
+    root: str | Path,
+    out: str | Path,
+    budget: Budget,
+    cells: Sequence[Cell],
+    workers: Workers = 1,
+    tick: ProgressCallback = ignore,
+) -> Iterator[tuple[Cell, dict[str, Any]]]:
+    """Results of cells as they come; those that need no encoder are run beside the encoders' training.
+
+    A cell that cannot be run has a result of {"error": one line}; what it raised lies in its log, and the others go on.
+
+    Args:
+      workers: processes (started fresh, never forked), which share the memory for pictures; 1: all in this one; or a
+        Ray cluster whose nodes see the release and the report's folder.
+      tick: called with what is trained and the number of Adam steps made.
+
+    Raises:
+      StoreError: a worker was killed; finished cells are kept.
+    """
+    if workers == 1:
+        torch.set_num_threads(budget.threads)
+    elif isinstance(workers, int):
+        memory = default_memory(budget.device) if budget.memory is None else budget.memory
+        budget = dataclasses.replace(budget, memory=memory // workers)
+    needs = Needs(cpus=budget.threads, gpus=1)  # the bound is of the accelerator's memory, which a cell has alone
+    if budget.device == "cpu":
+        needs = Needs(cpus=budget.threads, memory=budget.memory)
+    kept = "finished cells are kept: rerun the same command"
+    with open_pool(workers, threads=budget.threads, tick=tick, kept=kept, needs=needs) as pool:
+        share = pool.memory_each()
+        if budget.memory is None and share is not None and budget.device == "cpu":
+            budget = dataclasses.replace(budget, memory=share // 2)  # pictures take half, as they do if one is alone
+        waiting = [cell for cell in cells if cell.encoder]
+        for cell in (*dict.fromkeys(cell.encoder for cell in waiting), *cells):
+            if cell and cell not in waiting:
+                pool.submit(cell, try_cell, root, out, budget, cell)
+        for cell, result in pool.results():
+            if cell.benchmark != ENCODER:
+                yield cell, result
+                continue
+            for later in [one for one in waiting if one.encoder == cell]:
+                if "error" in result:
+                    yield later, {"error": result["error"]}
+                else:
+                    pool.submit(later, try_cell, root, out, budget, later)
+
+
+def try_cell(
+    root: str | Path, out: str | Path, budget: Budget, cell: Cell, tick: ProgressCallback = ignore
+) -> dict[str, Any]:
+    """The result of a cell, its errors as a result."""
+    folder = "encoders" if cell.benchmark == ENCODER else "cells"
+    log, paced = Path(out) / folder / f"{cell.id}.log", _Pace(tick)
+    try:
+        result = CellRun(root, out, budget, cell, paced).result()
+    except DmcvbError as error:
+        return {"error": str(error)}
+    except Exception as error:  # one cell's bug or lack of memory must not cost the hours of the others
+        write_text(log, traceback.format_exc())
+        first = (str(error).splitlines() or [""])[0]
+        return {"error": f"{type(error).__name__}: {first} (all of it in {log})"}
+    finally:
+        paced.tell()
+    log.unlink(missing_ok=True)
+    return result
+
+
+class _Pace:
+    """A tick that adds steps up and passes them on a few times a second."""
+
+    def __init__(self, tick: ProgressCallback):
+        self._tick, self._what, self._steps, self._told = tick, "", 0, time.monotonic()
+
+    def __call__(self, what: str, steps: int) -> None:
+        if what != self._what:
+            self.tell()
+        self._what, self._steps = what, self._steps + steps
+        if time.monotonic() - self._told > TICK_SECONDS:
+            self.tell()
+
+    def tell(self) -> None:
+        if self._what:
+            self._tick(self._what, self._steps)
+        self._steps, self._told = 0, time.monotonic()
+
+
+def planned_steps(budget: Budget, cells: Sequence[Cell]) -> int:
+    """Adam steps of cells, their encoders and decoders."""
+    encoders = {cell.encoder for cell in cells} - {None}
+    decoders = sum(2 * budget.readout_steps for cell in cells if not (cell.agent.sees_state or cell.agent.own))
+    policies = sum(policy_steps(budget, cell.agent) for cell in cells)
+    return policies + decoders + len(encoders) * budget.pretrain_steps
+
+
+def default_workers(device: str) -> int:
+    """Cells side by side: two of one thread each are faster than one of two. An accelerator is not shared."""
+    return min(2, usable_cores()) if device == "cpu" else 1
+
+
+def default_threads(workers: int) -> int:
+    """Threads of each of `workers` processes."""
+    return max(1, usable_cores() // workers)

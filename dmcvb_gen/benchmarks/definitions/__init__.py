@@ -1,1 +1,0 @@
-"""One file per benchmark; each registers itself, as docs/extending.md shows."""

@@ -1,0 +1,615 @@
+"""What is trained: a release's subsets enter, the cells of benchmarks and the budgets of their trainings leave.
+
+A benchmark registers itself by name; `plan_benchmark` gives the cells of one. B1, B2, B3 and the ablations are the
+paper's sections 5.1 to 5.3 and its appendix.
+"""
+
+from __future__ import annotations
+
+import abc
+import csv
+import functools
+import itertools
+import re
+import shlex
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.agents.catalog import Agent, parse_agent
+from dmcvb_gen.agents.data import Slice, part_count
+from dmcvb_gen.agents.networks import PATCHES
+from dmcvb_gen.agents.trainer import Budget
+from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.inputs import BUILTIN, video_source
+from dmcvb_gen.policies.bundled import bundled_levels
+from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task
+from dmcvb_gen.registry import Registry
+from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.spec import (
+    ANT_MAZE,
+    DISTRACTOR_KINDS,
+    FIXED,
+    HIDDEN,
+    LEVELS,
+    MAZE_TRAINED_LEVELS,
+    VISIBLE,
+    is_maze,
+    select,
+    subset_name,
+    task_folder,
+)
+from dmcvb_gen.tasks import get_task
+
+FIXED_GOALS = 5
+"""Fixed (start, goal) pairs a layout, as the paper made them."""
+DEFAULT_EPISODES = 100
+"""Episodes that a command asks for if the release has none to go by."""
+DEFAULT_SIZE = 64
+"""Pixels a side if a rollout is not told another size."""
+
+# Encoders and policies take as many steps as BC does end to end, so that agents are compared at equal updates; a policy
+# on a frozen encoder costs a seventh of an update, as its latents are computed once.
+BUDGETS = {
+    budget.name: budget
+    for budget in (
+        Budget(
+            "smoke",
+            pixel_steps=3,
+            pretrain_steps=3,
+            frozen_steps=3,
+            state_steps=3,
+            readout_steps=2,
+            evaluations=1,
+            episodes=2,
+            batch_size=16,
+            state_batch_size=16,
+            muon=True,
+            episode_steps=10,
+            scores=False,
+            note="smoke: a few steps to see that everything runs; its numbers are not scores",
+        ),
+        Budget(
+            "brief",
+            pixel_steps=5_000,
+            pretrain_steps=5_000,
+            frozen_steps=5_000,
+            state_steps=10_000,
+            readout_steps=500,
+            evaluations=1,
+            batch_size=64,
+            network=PATCHES,
+            rate=2.0,
+            shift_from=10.0,
+            frozen_shift=False,
+            decay=True,
+            note="brief: a small network of 4x4 patches and frame differences, 0.3 % of the paper's samples (2.5 % of "
+            "states), random shifts only from ten passes over the data on, twice the rate, falling; scores are not "
+            "comparable with the paper's",
+        ),
+        Budget(
+            "quick",
+            pixel_steps=16_000,
+            pretrain_steps=16_000,
+            frozen_steps=16_000,
+            state_steps=40_000,
+            readout_steps=500,
+            evaluations=1,
+            batch_size=64,
+            network=PATCHES,
+            shift_from=10.0,
+            frozen_shift=False,
+            decay=True,
+            muon=True,
+            note="quick: a small network of 4x4 patches and frame differences, 1 % of the paper's samples (10 % of "
+            "states), Muon instead of Adam, a falling rate, random shifts only from ten passes over the data on; "
+            "scores are not comparable with the paper's",
+        ),
+        Budget("paper", note="paper: 400k steps, batch 256, 30 episodes every 20k steps, as published"),
+    )
+}
+
+
+def get_budget(name: str) -> Budget:
+    """The budget of a name.
+
+    Raises:
+      UnknownNameError: there is none.
+    """
+    if name not in BUDGETS:
+        raise UnknownNameError("profile", name, BUDGETS)
+    return BUDGETS[name]
+
+
+# -- cells ------------------------------------------------------------------------------------------
+
+ENCODER = "encoder"
+"""The benchmark of cells that train an encoder alone."""
+
+
+def slug(text: str) -> str:
+    """A piece of a file name."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "-", text.replace("%", "pc")).strip("-")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of a benchmark: an agent, what its encoder and what its policy learns from.
+
+    Attributes:
+      benchmark: its name; `ENCODER` for an encoder alone, which several cells share.
+      policy: slices that the policy learns from; it is evaluated in the task and setting of the first.
+      pretrain: slices that the encoder learns from; the policy's, if empty.
+    """
+
+    benchmark: str
+    task: str
+    setting: str
+    agent: Agent
+    policy: tuple[Slice, ...]
+    pretrain: tuple[Slice, ...] = ()
+
+    @property
+    def id(self) -> str:
+        """A file name, different for every cell of a release."""
+        parts = [self.benchmark, self.task, self.setting, self.agent.name, self.policy_label]
+        parts += ["from " + "+".join(part.label for part in self.pretrain)] if self.pretrain else []
+        return "_".join(slug(part) for part in parts)
+
+    @property
+    def policy_label(self) -> str:
+        return "+".join(part.label for part in self.policy)
+
+    @property
+    def pretrain_label(self) -> str:
+        """Name the encoder's data, with its setting if that is another one; "" for the policy's data."""
+        labels = []
+        for part in self.pretrain:
+            setting = part.subset.split("/")[-1]
+            labels.append(part.label if setting == self.setting else f"{part.label}, {setting}")
+        return "+".join(labels)
+
+    @property
+    def place(self) -> str:
+        """Task, what the policy learns from and setting, as the report names them."""
+        return f"{task_folder(self.task)}/{self.policy_label}/{self.setting}"
+
+    @property
+    def label(self) -> str:
+        """Its name among the cells of its place: the agent, and what else its encoder learned from."""
+        return f"{self.agent.name} (encoder: {self.pretrain_label})" if self.pretrain else self.agent.name
+
+    @property
+    def subsets(self) -> tuple[str, ...]:
+        encoder = self.pretrain if self.agent.pretrain else ()
+        return tuple(dict.fromkeys(part.subset for part in (*encoder, *self.policy)))
+
+    @property
+    def encoder(self) -> Cell | None:
+        """The cell of its encoder's pre-training; None if it is trained with the policy, or comes from a file."""
+        if self.benchmark == ENCODER or self.agent.pretrain is None or self.agent.ready_encoder:
+            return None
+        parts = self.pretrain or self.policy
+        return Cell(ENCODER, self.task, parts[0].subset.split("/")[-1], self.agent.pretraining, parts)
+
+    def facts(self) -> dict[str, Any]:
+        """Everything that decides the cell, as plain values."""
+        return {**vars(self), "agent": self.agent.name} | {
+            name: [asdict(part) for part in getattr(self, name)] for name in ("policy", "pretrain")
+        }
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Cell:
+        """The cell of its facts.
+
+        Raises:
+          DmcvbError, LookupError, TypeError: they name an agent that is not known here, or are no cell's.
+        """
+        parts = {name: tuple(Slice(**part) for part in facts[name]) for name in ("policy", "pretrain")}
+        places = {name: facts[name] for name in ("benchmark", "task", "setting")}
+        return cls(agent=parse_agent(facts["agent"]), **places, **parts)
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Subsets that a part of a benchmark needs besides.
+
+    Attributes:
+      subsets: those that the release lacks.
+      command: command that gets those.
+      left_out: those that the release has and the user left out.
+    """
+
+    benchmark: str
+    task: str
+    subsets: tuple[str, ...]
+    command: str
+    left_out: tuple[str, ...] = ()
+
+
+def only(release: Release, patterns: Sequence[str]) -> Release:
+    """A release with the subsets that match, e.g. "walker-walk/expert/*".
+
+    Raises:
+      DmcvbError: a pattern matches none.
+    """
+    names = select([record.name for record in release.manifest.subsets], list(patterns))
+    records = tuple(record for record in release.manifest.subsets if record.name in names)
+    manifest = release.manifest.model_copy(update={"subsets": records})
+    return Release(release.root, manifest, {name: subset for name, subset in release.subsets.items() if name in names})
+
+
+class SubsetFinder:
+    """The subsets of a release by (task, level, setting); remembers what was asked for in vain."""
+
+    def __init__(self, release: Release):
+        self.release = release
+        self._names = {(s.task, s.level, s.setting): name for name, s in release.subsets.items()}
+        self._records = {name: subset.record for name, subset in release.subsets.items()}
+        self.tasks = tuple(dict.fromkeys(subset.task for subset in release.subsets.values()))
+        self._asked: dict[str, list[tuple[str, str]]] = {}
+        self._partial: dict[str, tuple[int, ...]] = {}
+
+    def settings(self, task: str) -> list[str]:
+        """Settings of a task: those there are, in the paper's order, other difficulties last."""
+        have = dict.fromkeys(setting for t, _, setting in self._names if t == task)
+        order = {setting: index for index, setting in enumerate(DISTRACTOR_KINDS)}
+        return sorted(have, key=lambda s: (order.get(s, len(order)), s))
+
+    def levels(self, task: str, setting: str) -> list[str]:
+        """Levels that there are of a task and setting, best first."""
+        return [level for level in LEVELS if (task, level, setting) in self._names]
+
+    def find(self, task: str, levels: Iterable[str], setting: str) -> tuple[str, ...] | None:
+        """Names of the subsets, or None if one is missing (which is then noted)."""
+        lacking = [(level, setting) for level in levels if (task, level, setting) not in self._names]
+        if lacking:
+            self._asked.setdefault(task, []).extend(lacking)
+            return None
+        return tuple(self._names[task, level, setting] for level in levels)
+
+    def parts(self, task: str, levels: Iterable[str], setting: str, **share: Any) -> tuple[Slice, ...] | None:
+        names = self.find(task, levels, setting)
+        return names and tuple(Slice(name, **share) for name in names)
+
+    def first(self, task: str, level: str, setting: str, most: int) -> tuple[Slice, ...] | None:
+        """Some episodes of a subset, all of them if it has no more than that."""
+        names = self.find(task, [level], setting)
+        return names and tuple(Slice(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
+
+    def pairs(self, name: str) -> tuple[int, ...]:
+        """The goal pairs of a fixed-goal subset whose episodes are all there; the others are noted."""
+        whole, partial = goal_pairs(self.release[name])
+        if partial:
+            self._partial[name] = partial
+        return whole
+
+    def missing(self, benchmark: str, left_out: Collection[str]) -> list[Missing]:
+        found = []
+        for task, asked in self._asked.items():
+            names = {subset_name(task, level, setting): (level, setting) for level, setting in asked}
+            excluded = tuple(name for name in names if name in left_out)
+            names = {name: where for name, where in names.items() if name not in left_out}
+            command = self._command(benchmark, task, list(names.values())) if names else ""
+            found.append(Missing(benchmark, task, tuple(names), command, excluded))
+        for name, pairs in self._partial.items():
+            lacking = f"{name}, episodes of goal pairs {', '.join(map(str, pairs))}"
+            task = self._records[name].task
+            found.append(Missing(benchmark, task, (lacking,), "fetch them, or run the release's rollout again"))
+        return found
+
+    def _command(self, benchmark: str, task: str, lacking: list[tuple[str, str]]) -> str:
+        """Return the command that rolls out a task with what is missing and what the release has of it."""
+        have = [(level, setting) for t, level, setting in self._names if t == task]
+        levels = dict.fromkeys(level for level, _ in have + lacking)
+        settings = dict.fromkeys(setting for _, setting in have + lacking)
+        counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
+        count = max(counts, default=DEFAULT_EPISODES)
+        shape = self._shape(task) + self._sources(task, levels)
+        rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
+        out = f"--out releases/{slug(benchmark)}"
+        if not is_maze(task):
+            return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count}{shape} {out}"
+        goals = [setting for setting in settings if setting != FIXED]
+        asked = [f"--goal {setting}" for setting in goals] + [f"--episodes {count}"] * bool(goals)
+        asked += [f"--fixed-goals {FIXED_GOALS}"] * (FIXED in settings)
+        return f"{rollout} {' '.join(asked)}{shape} {out}"
+
+    def _sources(self, task: str, levels: Iterable[str]) -> str:
+        """Options for policies and videos that the package does not bring, with names to be filled in."""
+        sources = {video_source(self.release.root, r) for r in self._records.values() if r.task == task}
+        brought = {"random", *bundled_levels(task)}
+        return " --behaviour RUN" * (not set(levels) <= brought) + " --backgrounds FOLDER" * bool(sources - {BUILTIN})
+
+    def _shape(self, task: str) -> str:
+        """Options that give new subsets the images' size and the time limit of what there is of a task."""
+        shapes = {(r.size, r.max_steps) for r in self._records.values() if r.task == task}
+        if len(shapes) != 1:
+            return ""
+        size, limit = shapes.pop()
+        options = f" --size {size}" if size != DEFAULT_SIZE else ""
+        return options + (f" --max-steps {limit}" if limit != get_task(task).max_steps else "")
+
+
+# -- fixed goals of a maze --------------------------------------------------------------------------
+
+
+def goal_pairs(subset: Subset) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Indices of the (start, goal) pairs whose every episode is there, and of the others.
+
+    The subset's record decides, never how much of it is at hand: a part of a release is scored on the starts and goals
+    of the whole one. If the record does not say it (imported data), the episodes' own labels do.
+    """
+    per_goal = subset.record.episodes_per_goal
+    if per_goal is None:
+        return tuple(int(pair) for pair in np.unique(subset.read("goal_pair")) if pair >= 0), ()
+    count, have = subset.record.episodes, set(map(int, subset.episodes))
+    firsts = dict(enumerate(range(0, count, per_goal)))
+    whole = [p for p, first in firsts.items() if have.issuperset(range(first, min(first + per_goal, count)))]
+    return tuple(whole), tuple(pair for pair in firsts if pair not in whole)
+
+
+def goal_cells(subset: Subset, pair: int | None) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """(row, column) of a pair's start and of its goal, as its first episode shows them; None without a pair.
+
+    Raises:
+      DmcvbError: no episode of the pair is there.
+    """
+    if pair is None:
+        return None
+    task = get_task(subset.task)
+    known = subset.episodes[subset.read("goal_pair") == pair]
+    if not len(known):
+        raise DmcvbError(f"{subset.name} has no episodes of goal pair {pair}; fetch or roll them out")
+    state = subset.read("state", known[:1])[0, 0]
+    floor = np.array(task.layout.free)
+
+    def cell(field: str) -> tuple[int, int]:
+        place = task.layout.grid(state[task.state_slices[field]][:2])
+        row, column = floor[np.square(floor - place).sum(axis=1).argmin()]
+        return int(row), int(column)
+
+    return cell("walker_position"), cell("target_position")
+
+
+# -- the paper's scores -----------------------------------------------------------------------------
+
+
+@functools.cache
+def _paper_table() -> dict[tuple[str, str, str, str], tuple[float, float]]:
+    path = resources.files("dmcvb_gen.benchmarks") / "data" / "paper_benchmark1_locomotion.csv"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return {
+        (row["task"], row["level"], row["distractor"], row["agent"]): (float(row["mean"]), float(row["stderr"]))
+        for row in csv.DictReader(lines)
+    }
+
+
+def paper_score(task: str, level: str, setting: str, agent: str | None) -> tuple[float, float] | None:
+    """(mean, standard error) of the published score of B1; None if the paper has none.
+
+    Args:
+      level: "expert", ..., or "expert+medium".
+      setting: "none", "static" or "dynamic" at the paper's difficulty; BC(state) and data have one row for all.
+      agent: a column of the paper's table, `Agent.paper_name`, or "data".
+    """
+    table = _paper_table()
+    return table.get((task, level, setting, agent or "")) or table.get((task, level, "any", agent or ""))
+
+
+# -- benchmarks -------------------------------------------------------------------------------------
+
+
+class Benchmark(abc.ABC):
+    """A benchmark: which cells a release has the data for, and what their scores are set beside.
+
+    Attributes:
+      name: name that it is registered under. title: title of its table in the report.
+      agents: names of the agents that it runs unless others are asked for.
+      compares_encoders: its agents are those with a pre-trained encoder; it sets BC beside them by itself.
+    """
+
+    name: str
+    title: str
+    agents: tuple[str, ...]
+    compares_encoders = False
+
+    @abc.abstractmethod
+    def cells(self, data: SubsetFinder, agents: Sequence[Agent]) -> Iterator[Cell]:
+        """The cells that the data allow; what `data` is asked for in vain is reported as missing."""
+
+    def paper_score(self, cell: Cell) -> tuple[float, float] | None:
+        """(mean, standard error) that the paper has of a cell."""
+        return None
+
+    def reference(self, cell: Cell) -> str:
+        """Name what a cell's score is compared with; by default the paper's appendix "Dataset size study"."""
+        return f"BC on all of expert/{_whole_setting(cell)}"
+
+    def is_reference(self, other: Cell, cell: Cell) -> bool:
+        """Return True if another cell of the same task is that reference."""
+        return (other.setting, other.agent.name, other.policy_label) == (_whole_setting(cell), "bc", "expert")
+
+    def group(self, cell: Cell) -> tuple[str, str] | None:
+        """(mazes, policy learns from) of the maze cells that the report takes the mean of; None: of others."""
+        row = paper_task(cell.task)
+        return (row, cell.policy_label) if row in MAZE_GROUPS.values() else None
+
+    def warnings(self, release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
+        """List what makes its scores say less than they seem to."""
+        return iter(())
+
+
+def _whole_setting(cell: Cell) -> str:
+    return VISIBLE if is_maze(cell.task) else DISTRACTOR_KINDS[0]
+
+
+BENCHMARKS: Registry[Benchmark] = Registry("benchmark", "dmcvb_gen.benchmarks.plan", "dmcvb_gen.benchmarks")
+
+
+def register_benchmark(name: str) -> Callable[[type[Benchmark]], type[Benchmark]]:
+    """Class decorator that makes a benchmark known by name.
+
+    Raises:
+      DmcvbError: another class has that name already.
+    """
+
+    def register(benchmark: type[Benchmark]) -> type[Benchmark]:
+        benchmark.name = name
+        BENCHMARKS.add(name, benchmark(), code=benchmark)
+        return benchmark
+
+    return register
+
+
+def plan_benchmark(
+    name: str, release: Release, agents: Sequence[str] = (), left_out: Collection[str] = ()
+) -> tuple[list[Cell], list[Missing]]:
+    """The cells that a release has the data for, and what is missing for the others.
+
+    Args:
+      name: name of a registered benchmark.
+      agents: names instead of the benchmark's own. B2 and B3 compare encoders: of these, they take those that have one
+        of their own, beside BC without.
+      left_out: subsets that are there but that the user left out of `release`.
+
+    Raises:
+      DmcvbError: no such benchmark or agent.
+    """
+    benchmark, data = BENCHMARKS.get(name), SubsetFinder(release)
+    chosen = [parse_agent(agent) for agent in agents or benchmark.agents]
+    if benchmark.compares_encoders:
+        chosen = [agent for agent in chosen if agent.pretrain]
+    cells = list(benchmark.cells(data, chosen))
+    return list(dict.fromkeys(cells)), data.missing(name, left_out)
+
+
+@register_benchmark("b1")
+class PolicyLearning(Benchmark):
+    """Every agent on every level and distractor; beside BC(state) on the same data (section 5.1)."""
+
+    title = "B1: policies on every level and distractor"
+    agents = ("state-bc", "bc", "td3-bc", "id+bc", "lfd+bc", "ae+bc", "state+bc")  # DINO's needs weights: ask for it
+    level_sets = (("expert",), ("medium",), ("expert", "medium"), ("mixed",), ("random",))
+
+    def cells(self, data, agents):
+        for task in data.tasks:
+            if is_maze(task):
+                others = [level for level in data.levels(task, VISIBLE) if level not in MAZE_TRAINED_LEVELS]
+                settings, sets = [VISIBLE], [(level,) for level in (*MAZE_TRAINED_LEVELS, *others)]
+            else:
+                settings, sets = list(dict.fromkeys([*DISTRACTOR_KINDS, *data.settings(task)])), list(self.level_sets)
+            for levels in sets:
+                yield from self._set(data, agents, task, settings, levels)
+
+    def _set(self, data: SubsetFinder, agents, task: str, settings: list[str], levels) -> Iterator[Cell]:
+        state_done = False
+        for setting in settings:
+            parts = data.parts(task, levels, setting)
+            if not parts:
+                continue
+            for agent in agents:
+                if not (agent.sees_state and state_done):  # states know of no distractors: one cell serves all
+                    yield Cell(self.name, task, setting, agent, parts)
+            state_done = True
+
+    def paper_score(self, cell):
+        return paper_score(cell.task, cell.policy_label, cell.setting, cell.agent.paper_name)
+
+    def reference(self, cell):
+        return "BC(state)"
+
+    def is_reference(self, other, cell):
+        return other.agent.name == "state-bc" and other.policy_label == cell.policy_label
+
+
+@register_benchmark("b2")
+class FewEpisodes(Benchmark):
+    """Encoders from all mixed episodes beside BC on 20 experts, alone and with the mixed; beside BC on all experts."""
+
+    title = "B2: encoders from mixed data, policies from few expert episodes"
+    agents = ("id+bc", "bc+bc", "lfd+bc", "ae+bc")
+    compares_encoders = True
+    few = 20  # 1 % of the paper's expert subset of 2,000 episodes
+
+    def cells(self, data, agents):
+        bc = parse_agent("bc")
+        for task in [task for task in data.tasks if not is_maze(task)]:
+            full = data.parts(task, ["expert"], "none")
+            if full:
+                yield Cell(self.name, task, "none", bc, full)  # scores are shares of this one
+            for setting in data.settings(task):
+                few = data.first(task, "expert", setting, self.few)
+                mixed = data.parts(task, ["mixed"], setting)
+                if not few:
+                    continue
+                yield Cell(self.name, task, setting, bc, few)
+                if mixed:
+                    yield Cell(self.name, task, setting, bc, few + mixed)
+                    for agent in agents:
+                        yield Cell(self.name, task, setting, agent, few, mixed)
+
+    def warnings(self, release, cells):
+        for name in dict.fromkeys(p.subset for cell in cells for p in cell.policy if p.episodes is not None):
+            there = len(release[name].episodes)
+            if there <= self.few:
+                text = f"b2 learns from {self.few} expert episodes, and {there} are all there are; roll out more"
+                yield Issue("learning", name, text)
+
+
+@register_benchmark("b3")
+class FixedGoals(Benchmark):
+    """Policies of each (start, goal) pair's episodes, on encoders of hidden random goals and on their own."""
+
+    title = "B3: encoders from hidden random goals, policies from the episodes of one fixed goal"
+    agents = ("bc+bc", "id+bc")
+    compares_encoders = True
+
+    def cells(self, data, agents):
+        mazes = [task for task in data.tasks if is_maze(task)]
+        for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
+            for level in data.levels(task, FIXED) or ["expert"]:
+                fixed, hidden = data.find(task, [level], FIXED), data.parts(task, [level], HIDDEN)
+                for pair in data.pairs(fixed[0]) if fixed else ():
+                    ten = (Slice(fixed[0], goal_pair=pair),)
+                    yield Cell(self.name, task, FIXED, parse_agent("bc"), ten)
+                    for agent in agents if hidden else ():
+                        yield Cell(self.name, task, FIXED, agent, ten, hidden)
+
+    def reference(self, cell):
+        return "BC on these episodes"
+
+    def is_reference(self, other, cell):
+        return other.agent.name == "bc" and other.policy == cell.policy
+
+    def group(self, cell):
+        return task_folder(cell.task), cell.policy_label.partition(" goal ")[0]
+
+
+@register_benchmark("ablations")
+class Ablations(Benchmark):
+    """Agents on expert data, and BC on shares of it; beside BC on all of expert/none (appendix)."""
+
+    title = "Ablations"
+    # Inverse dynamics over more steps stand beside pre-training by BC, which the paper sees them tend to.
+    agents = ("bc:frames=1", "bc", "bc+bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10,sample")
+    shares = (0.01, 0.05, 0.1, 0.25, 0.5)
+
+    def cells(self, data, agents):
+        for task in data.tasks:
+            for setting in [VISIBLE] if is_maze(task) else data.settings(task):
+                parts = data.parts(task, ["expert"], setting)
+                if not parts:
+                    continue
+                for agent in agents:
+                    yield Cell(self.name, task, setting, agent, parts)
+                by_pictures = [agent for agent in agents if agent.name == "bc"]
+                episodes = len(data.release[parts[0].subset].episodes)
+                counts = {part_count(share, episodes): share for share in self.shares}  # one share of equal counts
+                shares = [share for count, share in counts.items() if count < episodes]
+                for share, agent in itertools.product(shares, by_pictures):
+                    yield Cell(self.name, task, setting, agent, (Slice(parts[0].subset, share=share),))
