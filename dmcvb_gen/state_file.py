@@ -18,8 +18,6 @@ from dmcvb_gen.errors import DmcvbError
 
 STATE = "state.safetensors"
 """The file's name in a run's `resume` folder."""
-OLD_STATE = "state.pt"
-"""Ending of the files that versions up to 0.1 wrote."""
 
 
 def pack_state(state: Any) -> bytes:
@@ -29,11 +27,15 @@ def pack_state(state: Any) -> bytes:
       TypeError: anything else is in it.
     """
     tensors: dict[str, torch.Tensor] = {}
+    memory: set[int] = set()
 
     def tree(value: Any) -> Any:
         if isinstance(value, torch.Tensor):
             name = str(len(tensors))
-            tensors[name] = value.detach().cpu().contiguous().clone()  # a file's tensors share no memory
+            value = value.detach().cpu().contiguous()
+            place = value.untyped_storage().data_ptr()
+            tensors[name] = value.clone() if place in memory else value  # a file's tensors share no memory
+            memory.add(place)
             return {"tensor": name}
         if isinstance(value, dict):
             return {"dict": [[key, tree(inner)] for key, inner in value.items()]}
@@ -44,23 +46,6 @@ def pack_state(state: Any) -> bytes:
         raise TypeError(f"a saved state cannot hold a {type(value).__name__}")
 
     return safetensors.torch.save(tensors, metadata={"state": json.dumps(tree(state))})
-
-
-def read_state(folder: str | Path) -> dict[str, Any] | None:
-    """Read the state that a run saved in its folder; None if it has saved nothing yet.
-
-    Raises:
-      DmcvbError: the file is damaged, or an older version's.
-    """
-    path = Path(folder) / "resume" / STATE
-    if not path.exists():
-        old = path.with_name(OLD_STATE)
-        if old.exists():
-            raise DmcvbError(
-                f"{old} was written by an older dmcvb-gen and cannot be read; give a policy file, or start again"
-            )
-        return None
-    return read_state_file(path, "start again with another --out")
 
 
 def read_state_file(path: str | Path, otherwise: str) -> Any:

@@ -9,7 +9,6 @@ of 2. Core-minutes are processor time of one thread, evaluations and compilation
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import datetime
 import shlex
 import subprocess
@@ -27,12 +26,11 @@ from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT
-from dmcvb_gen.training.defaults import parse_settings, run_config
-from dmcvb_gen.training.training import open_run
+from dmcvb_gen.training.behaviour import run_config
+from dmcvb_gen.training.run import open_run
+from dmcvb_gen.training.settings import parse_settings
 
 SHARE, EPISODES, SEED = 0.95, 100, 20_000
-CLOSE = 2000
-"""Agent steps between evaluations near the goal; training takes no notice of them."""
 
 
 class Reached(Exception):
@@ -58,7 +56,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(given.out or scratch) / "run"
         config = run_config(given.task, "sac", settings, steps=given.steps, seed=given.seed)
-        run = open_run(folder, dataclasses.replace(config, evaluate_sparse=CLOSE), False)
+        run = open_run(folder, config, False)
         began = time.process_time()
 
         def report(progress) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import math
 import shutil
 from pathlib import Path
 
@@ -28,19 +27,19 @@ from dmcvb_gen.training.behaviour import train_behaviour as train
 def train_behaviour(as_json, list_settings, **options):
     """Train a behaviour policy online on states.
 
-    Ctrl-C saves the run and prints the command that resumes it. A process that is killed loses half a minute at most,
-    and the evaluation that it was in.
+    Ctrl-C saves the run, leaves a checkpoint that --behaviour RUN@latest takes, and prints the command that resumes
+    it. A process that is killed loses ten minutes at most.
 
     \b
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
-    dmcvb-gen train-behaviour cheetah-run --algo tqc --list-settings
-    dmcvb-gen train-behaviour cheetah-run --algo tqc --set gradient_steps=8 --out runs/cheetah-tqc
+    dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --list-settings
+    dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --set gradient_steps=8 --out runs/cheetah-tqc
     dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant-maze-medium7x7a
     dmcvb-gen train-behaviour --layout ring.txt --out runs/ring
     dmcvb-gen select-checkpoints runs/walker-walk
     """
-    from dmcvb_gen.training.runs import Stopped
+    from dmcvb_gen.training.run import Stopped
     from dmcvb_gen.training.selection import selection_json
 
     if list_settings:
@@ -74,8 +73,7 @@ def _list_settings(as_json, *, task, layout, algo, settings, config, **others):
     """Print every setting, its value for the task and what it means."""
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.training.behaviour import task_of
-    from dmcvb_gen.training.defaults import default_run, parse_settings
-    from dmcvb_gen.training.settings import check_settings, describe_settings
+    from dmcvb_gen.training.settings import check_settings, default_run, describe_settings, parse_settings
 
     refuse(click.get_current_context(), tuple(others), "--list-settings trains nothing")
     task, algorithm = get_task(task_of(task, layout)).id, algo or ("guided" if layout else "sac")
@@ -126,10 +124,7 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
 def _show_picks(picked, run):
     from dmcvb_gen.spec import task_folder
 
-    end = picked.convergence
-    state = "converged" if end.converged else f"not converged ({end.reason})"
-    error = "" if math.isnan(end.error) else f" +- {end.error:.1f}"
-    click.echo(f"{task_folder(picked.task)}: return at convergence {end.value:.1f}{error}, {state}")
+    click.echo(f"{task_folder(picked.task)}: return at convergence {picked.convergence.standing}")
     picks = [pick for level in picked.picks.values() for pick in level]
     if picks:
         print_table(

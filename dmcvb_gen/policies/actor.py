@@ -98,7 +98,7 @@ class Policy:
         _affine(x, weight, self._biases[f"{name}.bias"], out)
         return out
 
-    def heading(self, observation: np.ndarray) -> np.ndarray:
+    def predict_waypoint(self, observation: np.ndarray) -> np.ndarray:
         """(n, observation) -> (n, 2) float32 meters: where a policy that knows the way heads, seen from the ant."""
         x = places(np.asarray(observation)) / PLACE_SCALE
         last = 2 * len(self.header.way or ())
@@ -109,7 +109,7 @@ class Policy:
     def _features(self, observation: np.ndarray) -> np.ndarray:
         header, weights = self.header, self.weights
         if header.way is not None:
-            observation = open_maze_observation(observation, self.heading(observation))
+            observation = open_maze_observation(observation, self.predict_waypoint(observation))
         limit = np.float32(header.clip_observation)
         x = (np.asarray(observation, np.float32) - weights["observation_mean"]) / weights["observation_std"]
         x = np.ascontiguousarray(np.clip(x, -limit, limit))

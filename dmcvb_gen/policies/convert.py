@@ -152,7 +152,9 @@ def convert(
     distribution = layout.distribution or distribution
     if activation is None or distribution is None:
         raise PolicyFileError(f"{path} does not say its activation and its actions; give --activation and --actions")
-    weights = _weights(path, state, body, mean, layout.log_std, distribution)
+    weights = _weights(path, task, state, body, mean, layout.log_std, distribution)
+    if distribution == "gaussian" and len(weights["mean.bias"]) == task.action_size:
+        _scaled(weights, task)
     sizes = weights["body.0.weight" if body else "mean.weight"].shape[1], weights["mean.weight"].shape[0]
     widths = tuple(int(weights[f"body.{2 * index}.weight"].shape[0]) for index in range(len(body)))
     _check_sizes(path, task, sizes, widths, hidden)
@@ -270,11 +272,24 @@ def _check_sizes(
 
 def _check_actions(path: Path, task: Task, low: np.ndarray, high: np.ndarray) -> None:
     """Refuse an actor whose actions have other bounds than the task's, as nobody says how its environment took them."""
-    if (low != -1).any() or (high != 1).any():
-        raise PolicyFileError(
-            f"{path} acts from {np.round(low, 6).tolist()} to {np.round(high, 6).tolist()}, {task.id} takes actions "
-            "from -1 to 1; train it with the task's own bounds"
+    if not (np.allclose(low, task.action_low) and np.allclose(high, task.action_high)):
+        given, own = (
+            [np.round(bound, 6).tolist() for bound in bounds]
+            for bounds in ((low, high), (task.action_low.astype(float), task.action_high.astype(float)))
         )
+        raise PolicyFileError(
+            f"{path} acts from {given[0]} to {given[1]}, {task.id} takes actions from {own[0]} to {own[1]}; train it "
+            "with the task's own bounds"
+        )
+
+
+def _scaled(weights: dict[str, np.ndarray], task: Task) -> None:
+    """Bring a mean in the task's bounds to [-1, 1], where policy files act."""
+    low, high = (np.asarray(bound, np.float64) for bound in (task.action_low, task.action_high))
+    middle, half = (low + high) / 2, (high - low) / 2
+    weights["mean.weight"] = (weights["mean.weight"] / half[:, None]).astype(np.float32)
+    weights["mean.bias"] = ((weights["mean.bias"] - middle) / half).astype(np.float32)
+    weights["log_std_vector"] = (weights["log_std_vector"] - np.log(half)).astype(np.float32)
 
 
 def _order(path: Path, task: Task, facts: Facts) -> np.ndarray:
@@ -305,7 +320,10 @@ def _compare(
     theirs = predict(facts, actor, header.distribution, header.hidden, seen)
     plain = header.model_copy(update={"clip_observation": UNCLIPPED})
     ours = Policy(plain, {**weights, **_normalization(None, size)}, "").act(seen, deterministic=True)
-    off = 0.0 if theirs is None else float(np.abs(ours - theirs).max())
+    if theirs is None:
+        return
+    unit = 2 * (theirs - facts.low) / (facts.high - facts.low) - 1
+    off = float(np.abs(ours - unit).max())
     if off > AGREEMENT:
         raise PolicyFileError(
             f"{path} acts by {off:.2g} otherwise than Stable-Baselines3 does; it has a part that is not known here, so "
@@ -314,7 +332,13 @@ def _compare(
 
 
 def _weights(
-    path: Path, state: Mapping[str, np.ndarray], body: Sequence[str], mean: str, log_std: str | None, distribution: str
+    path: Path,
+    task: Task,
+    state: Mapping[str, np.ndarray],
+    body: Sequence[str],
+    mean: str,
+    log_std: str | None,
+    distribution: str,
 ) -> dict[str, np.ndarray]:
     """The actor's weights by our names, without normalization of observations."""
     names = {f"body.{2 * index}": layer for index, layer in enumerate(body)} | {"mean": mean}
@@ -329,9 +353,9 @@ def _weights(
             weights["log_std_vector"] = state[log_std].reshape(size) if log_std else np.full(size, NO_NOISE, np.float32)
     except (KeyError, ValueError, TypeError) as error:
         raise PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict") from None
-    scale, bias = state.get("action_scale"), state.get("action_bias")
-    if (scale is not None and (scale != 1).any()) or (bias is not None and (bias != 0).any()):
-        raise PolicyFileError(f"{path} scales its actions; train it on actions in [-1, 1], as the task's are")
+    scale, bias = (state[name].ravel() if name in state else None for name in ("action_scale", "action_bias"))
+    if scale is not None and bias is not None and len(scale) == len(bias) == task.action_size:
+        _check_actions(path, task, bias - scale, bias + scale)
     return weights
 
 

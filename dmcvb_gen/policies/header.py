@@ -28,10 +28,6 @@ ORIGINS = {
     "sac": "by soft actor-critic (SAC)",
     "mpo": "by maximum a posteriori policy optimization (MPO)",
     "guided": "on a policy of the open maze, by imitation of a guide that knows the way (DAgger)",
-    "sb3-sac": "by Stable-Baselines3's SAC",
-    "td3": "by Stable-Baselines3's TD3",
-    "tqc": "by sb3-contrib's TQC",
-    "ppo": "by Stable-Baselines3's PPO",
     "sb3": "by Stable-Baselines3, outside of this package",
     "cleanrl": "by CleanRL, outside of this package",
     "torch": "by other programs (a torch state dict)",
@@ -120,7 +116,8 @@ class PolicyHeader(_Model):
 
 def origin_of(algorithm: str) -> str:
     """Say how policies of an algorithm are trained, in a few words that follow "trained ..."."""
-    return ORIGINS.get(algorithm, f"by {algorithm}")
+    program, _, name = algorithm.partition(":")
+    return f"by Stable-Baselines3's {name}" if name and program == "sb3" else ORIGINS.get(algorithm, f"by {algorithm}")
 
 
 def _without_local_paths(value: Any) -> Any:

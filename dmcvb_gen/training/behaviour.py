@@ -1,6 +1,9 @@
 """Train a behaviour policy: from what a person gives to a finished run, its curve and, for an own maze, its picks."""
 
 import contextlib
+import dataclasses
+import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +16,18 @@ from dmcvb_gen.spec import MazeName, task_folder
 from dmcvb_gen.text import as_names, quoted
 
 if TYPE_CHECKING:
+    from dmcvb_gen.training.run import Run, RunConfig
     from dmcvb_gen.training.selection import Selection
 
 
 SELECTION_EPISODES = 100
 """Fresh episodes that each pick of an own maze is measured on."""
+PROBE_SECONDS = 2.0
+"""How long a run is tried to say how long it will take."""
+PROBED_STEPS = 10_000
+"""Shorter runs are not: they are over soon."""
+PAUSE = 10.0
+"""Seconds without a step, as while updates are compiled, that say nothing of the time left."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +88,16 @@ def train_behaviour(
       out: Folder of the run. [default: runs/TASK; with --layout: runs/LAYOUT]
       steps: Agent steps (at action repeat 2). [default: the task's]
       seed: Random seed. [default: 0]
-      algo: sac, mpo, guided (mazes), or SB3's sb3-sac, td3, tqc, ppo. [default: sac; --layout: guided]
+      algo: sac, mpo, guided (mazes), or any of SB3 and sb3-contrib, e.g. sb3:TQC. [default: sac; --layout: guided]
       settings (KEY=VALUE): Override a setting, e.g. learning_rate=0.0003.
       config (FILE): A YAML file of settings.
-      init_from (RUN|FILE): Run or policy file to start from; guided: the guide.
-      evaluate_every: Agent steps between evaluations while returns are low.
+      init_from (RUN|FILE): Run or policy file to start from; guided: the policy that walks.
+      evaluate_every: Agent steps between evaluations, and so between checkpoints. [default: the task's]
       precision: sac: precision of hidden layers; auto takes what the processor has instructions for.
       resume: Resume the run in --out with its own settings.
 
-    `notify` is called with what the person should know: the precision, a resumed run without a saved state, a stop.
-    For a layout one bar counts the steps of training, evaluations and selection together.
+    `notify` is called with what the person should know: what the run will do, a resumed run without a saved state, a
+    stop. For a layout one bar counts the steps of training, evaluations and selection together.
 
     Raises:
       Stopped: by Ctrl-C; the run is saved, and the message has the command that goes on.
@@ -95,63 +105,195 @@ def train_behaviour(
     """
 
     from dmcvb_gen.policies.paper import paper_returns
-    from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.tasks import get_task
-    from dmcvb_gen.training.defaults import parse_settings, run_config
-    from dmcvb_gen.training.runs import read_config
-    from dmcvb_gen.training.selection import MAZE_CHECKPOINTS, plot_curve
-    from dmcvb_gen.training.training import open_run
+    from dmcvb_gen.training.run import open_run, read_config
+    from dmcvb_gen.training.selection import plot_curve
 
     task = task_of(task, layout)
-    max_steps = get_task(task).max_steps
+    get_task(task)
     named = MazeName.parse(task)
-    maze = named if layout else None
     folder = Path(out or Path("runs") / (named.layout if named and (layout or named.rows) else task))
     found = read_config(folder) if resume else None
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
     algorithm = algo or (found.algorithm if found else "guided" if layout else "sac")
-    source = None if init_from is None else str(init_from)
-    given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=source)
-    changed = parse_settings(as_names(settings), config, algorithm)
-    chosen = _precision(precision, algorithm, changed, found)
-    configuration = run_config(task, algorithm, changed | chosen, found, **given)  # type: ignore[arg-type]
-    run = open_run(folder, configuration, resume)
-    if chosen and precision == "auto":
-        name, has = ("bfloat16", "has") if chosen["bfloat16"] else ("float32", "has no")
-        notify(f"Computing in {name}: this processor {has} instructions for bfloat16.")
-    saved, expert = run.saved(), paper_returns(task, "expert")
+    given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from and str(init_from))
+    asked = _settings(algorithm, as_names(settings), config, precision, found)
+    run = open_run(folder, run_config(task, algorithm, asked, found, **given), resume)  # type: ignore[arg-type]
+    saved = run.saved()
+    done = saved["step"] if saved else 0
+    _check_end(run, found, done, notify)
     if resume and not saved:
         notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
-    done, name = saved["step"] if saved else 0, task_folder(task)
-    total = configuration.steps
+    for line in plan_of(run, done):
+        notify(line)
+    picked = _train(run, done, bool(layout), progress, notify)
+    expert = paper_returns(task, "expert")
+    curve = folder / "curve.png" if picked else plot_curve(folder, expert and expert["mean"])
+    return TrainedRun(folder, curve, run.step, run.seconds, picked)
+
+
+def run_config(
+    task_id: str, algorithm: str, settings: dict[str, Any], found: "RunConfig | None" = None, **given: Any
+) -> "RunConfig":
+    """Return the config of a run: the given values, else those of the run to resume, else the task's defaults.
+
+    Args:
+      settings: given settings, checked.
+      found: the configuration of the run to go on with. If `given` differs from it the result does too, and
+        `open_run` refuses it.
+      given: steps, seed, evaluate_every, init_from; None if not given.
+    """
+    from dmcvb_gen.training.run import RunConfig
+    from dmcvb_gen.training.settings import default_run
+
+    given = {name: value for name, value in given.items() if value is not None}
+    if found and found.algorithm == algorithm:
+        return dataclasses.replace(found, task=task_id, settings=found.settings | settings, **given)
+    defaults = default_run(task_id, algorithm) | {"seed": 0} | given
+    return RunConfig(task=task_id, algorithm=algorithm, **defaults | {"settings": defaults["settings"] | settings})
+
+
+def task_of(task: str | None, layout: str | Path | None) -> str:
+    """The id of the task that a person asked for, whose code may run from now on.
+
+    Raises:
+      DmcvbError: a task and a maze are given, or neither.
+    """
+    from dmcvb_gen.own_code import allow
+    from dmcvb_gen.tasks.ant_maze import layout_task_id
+
+    if (task is None) == (layout is None):
+        raise DmcvbError("give a TASK, or the file of a maze with --layout")
+    task = task or layout_task_id(layout or "")
+    allow([task])  # a person typed its name
+    return task
+
+
+def _settings(algorithm: str, pairs: tuple[str, ...], config: Any, precision: str, found: Any) -> dict[str, Any]:
+    """The settings that were given, with the one that --precision decides."""
+    from dmcvb_gen.precision import choose_precision
+    from dmcvb_gen.training.settings import parse_settings
+
+    settings = parse_settings(pairs, config, algorithm)
+    if algorithm != "sac":
+        if precision != "auto":
+            raise DmcvbError(f"--precision has no effect with --algo {algorithm}: remove it")
+        return settings
+    if precision != "auto" and "bfloat16" in settings:
+        raise DmcvbError("give --precision or --set bfloat16, not both")
+    if precision == "auto" and (found or "bfloat16" in settings):
+        return settings
+    return settings | {"bfloat16": choose_precision(precision) == "bfloat16"}
+
+
+def _check_end(run: "Run", found: "RunConfig | None", done: int, notify: Callable[[str], None]) -> None:
+    """Refuse an end that is behind a run already, and say if it comes sooner than was planned."""
+    total = run.config.steps
     if found and total < min(done, found.steps):  # a finished run is a few steps past its own number
-        raise DmcvbError(f"{folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
+        raise DmcvbError(f"{run.folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
     if found and total < found.steps:
         notify(f"The run ends at step {total:,} now, not at {found.steps:,}.")
-    work: dict[str, float] = dict(total=total, initial=done)
-    if maze:  # evaluations and selection take most of its time, so their steps count as well
-        each = 1 + run.evaluation_steps()
-        selecting = MAZE_CHECKPOINTS * SELECTION_EPISODES * max_steps
-        work = dict(total=total * each + selecting, initial=done * each, smoothing=0)  # by turns they have other paces
-    picked = None
+
+
+def plan_of(run: "Run", done: int = 0) -> list[str]:
+    """What a run will do, a sentence a line: its steps, how many are random, its core time, the return to expect.
+
+    Args:
+      done: agent steps that it has made already.
+    """
+    from dmcvb_gen.policies.bundled import bundled_names, bundled_policies
+    from dmcvb_gen.policies.policy_file import read_header
+
+    config, settings = run.config, run.settings
+    random = 0 if config.init_from else getattr(settings, "warmup_steps", getattr(settings, "learning_starts", 0))
+    steps = f"{config.steps:,} agent steps" + (f", {done:,} of which are done" if done else "")
+    chance = f", the first {random:,} with random actions" if random > done else ""
+    precision = ""
+    if hasattr(settings, "bfloat16"):
+        precision = f", in {'bfloat16' if settings.bfloat16 else 'float32'}"
+    lines = [f"{task_folder(config.task)} with {config.algorithm}: {steps}{chance}{precision}."]
+    if config.steps - done >= PROBED_STEPS:
+        lines.append(
+            f"About {_minutes(probe(run) * (config.steps - done))} of one core at the pace of a two-second try, in "
+            "which nothing was compiled and evaluated."
+        )
+    if bundled_names(config.task, "expert"):
+        known = read_header(bundled_policies(config.task, "expert")[0])
+        if known.evaluation:
+            lines.append(
+                f"To expect: {known.evaluation.mean:.0f}, as the package's own expert has after {known.agent_step:,} "
+                "agent steps."
+            )
+    return lines
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
+
+
+class _Enough(Exception):
+    """A try has lasted long enough."""
+
+
+def probe(run: "Run") -> float:
+    """Seconds an agent step of a run that learns, measured on its own loop in a folder that goes."""
+    from dmcvb_gen.training.run import Run
+
+    names = {field.name for field in dataclasses.fields(run.settings)}
+    early = dict(compile=False, warmup_steps=run.settings.simulations, learning_starts=run.settings.simulations)
+    settings = run.config.settings | {name: value for name, value in early.items() if name in names}
+    config = dataclasses.replace(run.config, settings=settings, evaluate_every=10**12, init_from=None)
+    began: list[float] = []
+
+    def tick(steps: int) -> None:
+        began.append(time.perf_counter())
+        if began[-1] - began[0] > PROBE_SECONDS:
+            raise _Enough
+
+    with tempfile.TemporaryDirectory() as folder:
+        tried = Run(folder, config)
+        tried.tick = tick
+        with contextlib.suppress(_Enough):
+            tried.algorithm.train(tried)
+    return (began[-1] - began[0]) / max(len(began) - 1, 1) / run.settings.simulations
+
+
+def _train(run: "Run", done: int, select: bool, progress: bool, notify: Callable[[str], None]) -> "Selection | None":
+    """Train a run under a bar, and select its checkpoints if asked to."""
+    from dmcvb_gen.policies.paper import paper_returns
+    from dmcvb_gen.progress import ProgressBar
+    from dmcvb_gen.training.selection import MAZE_CHECKPOINTS
+
+    total, episode = run.config.steps, run.task.max_steps
+    work: dict[str, float] = dict(total=total, initial=done, smoothing=0)
+    if select:  # evaluations and selection take most of its time, so their steps count as well
+        each = 1 + run.evaluation_steps
+        work |= dict(total=total * each + MAZE_CHECKPOINTS * SELECTION_EPISODES * episode, initial=done * each)
+    name, expert = task_folder(run.config.task), paper_returns(run.config.task, "expert")
     with ProgressBar(progress, **work, unit=" steps", unit_scale=True, desc=name) as bar:
+        last = time.monotonic()
+
+        def tick(steps: int) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if now - last > PAUSE and not bar.disable:
+                bar.unpause()
+            bar.update(steps)
+            last = now
 
         def report(progress: Any) -> None:
             bar.set_postfix_str(_standing(progress, expert), refresh=False)
-            if maze:
-                bar.update(progress.evaluation.episodes * max_steps)
+            if select:
+                tick(progress.evaluation.episodes * episode)
 
-        run.train(report, bar.update, lambda: notify("\nStopping: the run is being saved."))
-        if maze:
-            picked = _select(folder, name, bar, SELECTION_EPISODES * max_steps)
-    curve = picked and folder / "curve.png"
-    return TrainedRun(folder, curve or plot_curve(folder, expert and expert["mean"]), run.step, run.seconds, picked)
+        run.train(report, tick, lambda: notify("\nStopping: the run is being saved."))
+        return _select(run.folder, name, bar, SELECTION_EPISODES * episode) if select else None
 
 
 def _select(folder: Path, name: str, bar: Any, steps: int) -> "Selection":
     """Select a run's checkpoints; the bar goes on by `steps` for each one that is measured."""
-    from dmcvb_gen.training.runs import Stopped
+    from dmcvb_gen.training.run import Stopped
     from dmcvb_gen.training.selection import select_checkpoints
 
     before = bar.n
@@ -177,34 +319,3 @@ def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:
         return f"return {mean:.1f}, {pace}"
     share = f" ({100 * mean / expert['mean']:.0f} %)" if expert["mean"] > 0 else ""  # mazes' returns are costs
     return f"return {mean:.1f} of the paper's {expert['mean']:.0f}{share}, {pace}"
-
-
-def task_of(task: str | None, layout: str | Path | None) -> str:
-    """The id of the task that a person asked for, whose code may run from now on.
-
-    Raises:
-      DmcvbError: a task and a maze are given, or neither.
-    """
-    from dmcvb_gen.own_code import allow
-    from dmcvb_gen.tasks.ant_maze import layout_task_id
-
-    if (task is None) == (layout is None):
-        raise DmcvbError("give a TASK, or the file of a maze with --layout")
-    task = task or layout_task_id(layout or "")
-    allow([task])  # a person typed its name
-    return task
-
-
-def _precision(asked: str, algorithm: str, settings: Mapping[str, Any], found: Any) -> dict[str, bool]:
-    """The setting that --precision decides; none if a run is resumed or has one of its own."""
-    from dmcvb_gen.precision import choose_precision
-
-    if algorithm != "sac":
-        if asked != "auto":
-            raise DmcvbError(f"--precision has no effect with --algo {algorithm}: remove it")
-        return {}
-    if asked == "auto" and (found or "bfloat16" in settings):
-        return {}
-    if "bfloat16" in settings:
-        raise DmcvbError("give --precision or --set bfloat16, not both")
-    return {"bfloat16": choose_precision(asked) == "bfloat16"}

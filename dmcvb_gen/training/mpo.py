@@ -6,7 +6,8 @@ policy is fitted to them within trust regions of its own for mean and standard d
 
 What differs from the papers: the Gaussian lives before a tanh, as in this package's policy files. KL divergences do
 not change under tanh and its Jacobian does not depend on the policy, so every equation stays as it is. The critics
-learn from one-step targets instead of Retrace. The covariance is diagonal.
+learn from one-step targets instead of Retrace. The covariance is diagonal. Critics, buffer and statistics are those of
+`sac`.
 """
 
 from __future__ import annotations
@@ -15,29 +16,43 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import nn
 from torch.nn.functional import softplus
 
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import PolicyHeader
-from dmcvb_gen.training.sac import CriticEnsemble, ReplayLearner
-from dmcvb_gen.training.settings import Count, Positive, ReplaySettings
+from dmcvb_gen.training.episodes import RewardedEpisodeSettings
+from dmcvb_gen.training.run import Run
+from dmcvb_gen.training.sac import Collector, CriticEnsemble, Learner, check_replay, network
+from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, Positive, Share
+
+__all__ = ["Mpo", "Settings", "check", "network", "train"]
 
 SMALLEST = 1e-8
 """Added to temperature and multipliers, which must not be zero."""
 
 
 @dataclass(frozen=True)
-class MpoSettings(ReplaySettings):
-    """Settings of `Mpo`.
+class Settings(RewardedEpisodeSettings):
+    """Settings of MPO.
 
     Attributes:
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
+      warmup_steps: agent steps of uniform random actions before the first update.
+      buffer_size: agent steps remembered.
+      batch_size: transitions an update.
+      actor_hidden: widths of the policy's hidden layers.
+      critic_hidden: widths of each critic's hidden layers.
       critics: number of critics; their mean is used.
+      learning_rate: learning rate of policy and critics.
+      discount: discount of an agent step.
       n_step: rewards summed before a target bootstraps, on the way that the episode really took.
       reward_scale: multiplies rewards before learning.
+      greedy_fraction: share of the simulations that act by the mean, as data are made.
       action_samples: actions drawn from the target policy for each state.
       epsilon: bound on the KL divergence of the weighted actions from the target policy (E-step).
       epsilon_mean, epsilon_std: bound on the M-step's KL divergence through the mean, and through the deviation.
@@ -46,12 +61,21 @@ class MpoSettings(ReplaySettings):
         deviation, at the start; it is learned.
       dual_learning_rate: learning rate of temperature and multipliers.
       target_period: updates after which the target networks become copies of policy and critics.
+      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
-    learning_rate: Positive = 3e-4
     updates_per_step: Positive = 0.5
+    warmup_steps: Natural = 5000
+    buffer_size: Count = 1_000_000
+    batch_size: Count = 256
+    actor_hidden: Hidden = (256, 256)
+    critic_hidden: Annotated[Hidden, Field(min_length=1)] = (256, 256)
+    critics: Count = 2
+    learning_rate: Positive = 3e-4
+    discount: Decay = 0.99
     n_step: Count = 1
     reward_scale: Positive = 1.0
+    greedy_fraction: Share = 0.0
     action_samples: Count = 20
     epsilon: Positive = 0.1
     epsilon_mean: Positive = 0.01
@@ -61,6 +85,7 @@ class MpoSettings(ReplaySettings):
     initial_multiplier_std: Positive = 10.0
     dual_learning_rate: Positive = 1e-2
     target_period: Count = 100
+    compile: bool = True
 
 
 def temperature_loss(values: torch.Tensor, temperature: torch.Tensor, epsilon: float) -> torch.Tensor:
@@ -94,16 +119,19 @@ def kl_of_stds(std: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
     return (0.5 * (ratio**2 - 1) - ratio.log()).sum(-1).mean()
 
 
-class Mpo(ReplayLearner):
-    """The learner: policy, critics, their targets, temperature, multipliers; `update` does one step of all of them."""
+class Mpo(Learner):
+    """Policy, critics, their targets, temperature, multipliers; `update` does one step of all of them."""
 
-    def __init__(self, header: PolicyHeader, settings: MpoSettings, seed: int):
+    parts = ("actor", "critic", "target", "target_actor")
+    optimizers = ("actor_optimizer", "critic_optimizer", "dual_optimizer")
+
+    def __init__(self, header: PolicyHeader, settings: Settings, seed: int):
         super().__init__(header, settings, seed)
         sizes = (header.observation_size, header.action_size, settings.critic_hidden, False, settings.critics)
         self.critic, self.target_actor = CriticEnsemble(*sizes), copy.deepcopy(self.actor)
         self.target = copy.deepcopy(self.critic)
-        for network in (self.target, self.target_actor):
-            network.requires_grad_(False)
+        for target in (self.target, self.target_actor):
+            target.requires_grad_(False)
         # Softplus of these: they stay positive whatever the optimizer does.
         starts = (settings.initial_temperature, settings.initial_multiplier_mean, settings.initial_multiplier_std)
         self.duals = nn.Parameter(torch.tensor([value + math.log(-math.expm1(-value)) for value in starts]))
@@ -111,6 +139,7 @@ class Mpo(ReplayLearner):
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.learning_rate, fused=True)
         self.dual_optimizer = torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True)
         self._loss = compiled(self.loss) if settings.compile else self.loss
+        self._logged: torch.Tensor | None = None
 
     def loss(self, observation, action, reward, discount, next_observation):
         """The sum of all losses, (1): critics', policy's, temperature's and multipliers'; and what is to be logged."""
@@ -165,20 +194,15 @@ class Mpo(ReplayLearner):
         for name in ("observation_mean", "observation_std"):  # else the target would see other numbers than the policy
             getattr(self.target_actor, name).copy_(getattr(self.actor, name))
 
-    _logged: torch.Tensor | None = None
-
     def metrics(self) -> dict[str, float]:
         """Losses, temperature, KL divergences and mean deviation of the last update."""
         names = ("critic_loss", "actor_loss", "temperature", "kl_mean", "kl_std", "std")
         return {} if self._logged is None else dict(zip(names, self._logged.tolist(), strict=True))
 
-    _parts = ("actor", "critic", "target", "target_actor")
-    _optimizers = ("actor_optimizer", "critic_optimizer", "dual_optimizer")
-
     def state(self) -> dict[str, Any]:
         return super().state() | {"duals": self.duals.detach()}
 
-    def load_networks(self, state: dict[str, Any]) -> None:
+    def load_networks(self, state: Mapping[str, Any]) -> None:
         super().load_networks(state)
         with torch.no_grad():
             self.duals.copy_(state["duals"])
@@ -186,3 +210,23 @@ class Mpo(ReplayLearner):
     def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
         super().load_actor(weights)
         self.target_actor.load_state_dict(self.actor.state_dict())  # it draws what the actor is fitted to
+
+
+def check(run: Run) -> None:
+    """Refuse, before anything is written, a run that would learn nothing, or that its start does not fit."""
+    check_replay(run, Mpo)
+
+
+def train(run: Run) -> None:
+    """Train until the run's last step, or until it is stopped."""
+    learner = Mpo(run.header, run.settings, run.config.seed)
+    collector = Collector(run, learner)
+    while run.step < run.config.steps:
+        collector.step()
+        learner.sync_norm()
+        for batch in collector.batches():
+            learner.update(batch)
+        if run.evaluation_is_due():
+            run.record(learner.actor.state_dict(), learner.updates, learner.metrics())
+        run.checkpoint_if_due(collector.state, learner.actor.state_dict)
+    run.save(collector.state())

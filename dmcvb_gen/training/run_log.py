@@ -1,7 +1,6 @@
 """The log of a run: it writes evaluations to progress.csv and TensorBoard.
 
-`progress.csv` has a row an evaluation. It outlives the checkpoints, which are thinned, so it is what the learning
-curve is read from.
+`progress.csv` has a row an evaluation.
 """
 
 from __future__ import annotations

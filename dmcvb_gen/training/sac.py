@@ -1,76 +1,112 @@
-"""Soft actor-critic on batched simulations, with a squashed Gaussian actor.
+"""Soft actor-critic with distributional critics on batched simulations: settings, learner and loop, top to bottom.
 
-SAC (Haarnoja et al. 2018) with what makes humanoids learnable and CPUs fast: running observation
-normalization, LayerNorm in the critics, both critics as one batched product, bfloat16 products if the
-processor has them, compiled updates.
+SAC (Haarnoja et al. 2018, arXiv 1812.05905): a squashed Gaussian actor, critics with targets that follow slowly, and a
+learned weight of the entropy. What is taken from elsewhere:
+
+- Critics give a distribution over returns and learn it by cross-entropy with smoothed targets: HL-Gauss (Farebrother et
+  al. 2024, "Stop Regressing", arXiv 2403.03950). They have LayerNorm after each hidden layer.
+- Rewards are divided by the spread of discounted returns (SimbaV2, Lee et al. 2025, arXiv 2502.15280), observations by
+  their own.
+- Targets leave out the entropy bonus, so that their range does not depend on the action size, and the actor follows the
+  critics' mean, not the smaller one.
+- A falling share of the targets sums three rewards before it bootstraps, and learning rates fall; both are our own.
+
+All critics are one batched product, in bfloat16 if the processor has it, and updates are compiled.
 """
 
 from __future__ import annotations
 
-import abc
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import nn
 
 from dmcvb_gen.compilation import compiled
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
+from dmcvb_gen.training.episodes import Episodes, Moment, RewardedEpisodeSettings
 from dmcvb_gen.training.networks import Actor
-from dmcvb_gen.training.row_files import map_rows, rows_in
-from dmcvb_gen.training.settings import Count, Decay, Natural, NonNegative, Positive, ReplaySettings
+from dmcvb_gen.training.run import Run, start_from, too_few_updates
+from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, NonNegative, Positive, Share
+
+# -- settings -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class SacSettings(ReplaySettings):
-    """Settings of `Sac`; the defaults of a task are in data/defaults.yaml.
+class Settings(RewardedEpisodeSettings):
+    """Settings of SAC; those of mazes are in defaults.yaml.
 
     Attributes:
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
+      warmup_steps: agent steps of uniform random actions before the first update.
+      buffer_size: agent steps remembered.
+      batch_size: transitions an update.
+      actor_hidden: widths of the policy's hidden layers.
+      critic_hidden: widths of each critic's hidden layers.
+      critics: number of critics.
+      learning_rate: learning rate of policy and critics.
+      rate_half_life: agent steps after which learning rates have fallen to 1 / sqrt(2); they fall with the square root
+        of the steps (0: never).
+      weight_decay: weight decay of AdamW, on actor and critics.
+      discount: discount of an agent step.
       actor_every: an actor update every so many critic updates.
       target_decay: share of the target critics that an update keeps.
-      initial_temperature: weight of the entropy bonus at the start; it is learned.
-      target_entropy_scale: the target entropy is minus this times the action size.
-      sharpen_after: agent steps after which the target entropy is that of `sharp_entropy_scale` and the learning rate
-        `sharp_learning_rate` (0: never). A policy that explores loses return to its own noise, one that learns fast
-        swings from checkpoint to checkpoint; the end of a run can do without both.
-      sharp_entropy_scale: see `sharpen_after`.
-      sharp_learning_rate: see `sharpen_after`; 0: as before.
+      clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
+        tasks want).
+      soft_values: targets hold the entropy bonus of later steps, as in SAC. Without it critics give returns alone, so
+        that their range does not depend on the action size, and entropy only regularizes the actor.
+      bins: critics give a distribution over so many returns and learn it by cross-entropy; 0: they give a number and
+        learn by squared error.
+      reward_scale: multiplies rewards before learning; 0: the inverse of the spread of discounted returns, as it grows.
       n_step: rewards summed before a target bootstraps, on the way that the episode really took.
       n_step_half_life: the share of such targets is 1 / (1 + agent steps / this), others look one step ahead (0: all of
         them always). They learn faster at first, and what old actions earned misleads them later.
-      bins: critics give a distribution over so many returns and learn it by cross-entropy (Farebrother et al. 2024,
-        "Stop Regressing"); 0: they give a number and learn by squared error.
-      reward_scale: multiplies rewards before learning; 0: the inverse of the spread of discounted returns, as it grows.
-      soft_values: targets hold the entropy bonus of later steps, as in SAC. Without it critics give returns alone, so
-        that their range does not depend on the action size, and entropy only regularizes the actor.
-      rate_half_life: agent steps after which learning rates have fallen to 1 / sqrt(2); they fall with the square root
-        of the steps (0: never).
-      clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
-        tasks want).
-      weight_decay: weight decay of AdamW, on actor and critics.
+      initial_temperature: weight of the entropy bonus at the start; it is learned.
+      target_entropy_scale: the target entropy is minus this times the action size.
+      anneal_after: agent steps after which the target entropy is that of `final_entropy_scale` and the learning rate
+        `final_learning_rate` (0: never). A policy that explores loses return to its own noise, one that learns fast
+        swings from checkpoint to checkpoint; the end of a run can do without both.
+      final_entropy_scale: see `anneal_after`.
+      final_learning_rate: see `anneal_after`; 0: as before.
+      greedy_fraction: share of the simulations that act by the mean, as data are made: a policy that only ever collects
+        with noise never sees the places where its mean stands still.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
+      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
+    updates_per_step: Positive = 1.0
+    warmup_steps: Natural = 5000
+    buffer_size: Count = 1_000_000
+    batch_size: Count = 256
+    actor_hidden: Hidden = (256, 256)
+    critic_hidden: Annotated[Hidden, Field(min_length=1)] = (256, 256)
+    critics: Count = 2
+    learning_rate: Positive = 1e-3
+    rate_half_life: Natural = 100_000
+    weight_decay: NonNegative = 0.0
+    discount: Decay = 0.99
     actor_every: Count = 2
     target_decay: Decay = 0.995
-    initial_temperature: Positive = 0.1
-    target_entropy_scale: float = 0.5
-    sharpen_after: Natural = 0
-    sharp_entropy_scale: float = 1.5
-    sharp_learning_rate: NonNegative = 0.0
-    n_step: Count = 1
-    n_step_half_life: Natural = 0
-    bins: Natural = 0
-    reward_scale: NonNegative = 0.5
-    soft_values: bool = True
-    rate_half_life: Natural = 0
-    clipped: bool = True
-    weight_decay: NonNegative = 0.0
+    clipped: bool = False
+    soft_values: bool = False
+    bins: Natural = 101
+    reward_scale: NonNegative = 0.0
+    n_step: Count = 3
+    n_step_half_life: Natural = 10_000
+    initial_temperature: Positive = 0.01
+    target_entropy_scale: float = 1.0
+    anneal_after: Natural = 0
+    final_entropy_scale: float = 1.5
+    final_learning_rate: NonNegative = 0.0
+    greedy_fraction: Share = 0.0
     bfloat16: bool = False
+    compile: bool = True
 
 
 RETURN_LIMIT = 5.0
@@ -81,143 +117,79 @@ SMOOTHING = 0.75
 """Standard deviation of a target's smoothing over bins, in bins (Farebrother et al. 2024, section 3)."""
 
 
+# -- what is learned from: statistics and memory --------------------------------------------------
+
+
+class RunningNorm:
+    """Mean and variance of all observations seen (Welford, batched)."""
+
+    def __init__(self, size: int):
+        self.count, self.mean, self.m2 = 1e-4, np.zeros(size), np.ones(size) * 1e-4
+
+    def update(self, values: np.ndarray) -> None:
+        count, mean = len(values), values.mean(axis=0)
+        delta, total = mean - self.mean, self.count + count
+        self.m2 += values.var(axis=0) * count + delta**2 * self.count * count / total
+        self.mean += delta * count / total
+        self.count = total
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(self.m2 / self.count).clip(1e-2)
+
+    def state(self) -> dict[str, Any]:
+        """Return the state that it continues from."""
+        return {"count": self.count, "mean": torch.tensor(self.mean), "m2": torch.tensor(self.m2)}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state()`."""
+        self.count = float(state["count"])
+        self.mean, self.m2 = state["mean"].numpy().copy(), state["m2"].numpy().copy()
+
+
 class ReturnScale:
     """The factor by which rewards are scaled: the inverse of the spread of the discounted returns that were seen.
 
-    Follows SimbaV2 (Lee et al. 2025): divides by the standard deviation, or by the largest return over `RETURN_LIMIT`
-    if that is more. Rewards of any task then need no scale of their own.
+    Divides by the standard deviation, or by the largest return over `RETURN_LIMIT` if that is more. Rewards of any task
+    then need no scale of their own.
     """
 
     def __init__(self, simulations: int, discount: float):
         self._discount, self._running = discount, np.zeros(simulations)
-        self._norm, self.largest = RunningNorm(1), 0.0
+        self._norm, self._largest = RunningNorm(1), 0.0
 
     def update(self, reward: np.ndarray, ended: np.ndarray) -> None:
         """Take in a step's rewards, (simulation,), and which episodes ended with it."""
         self._running = self._discount * self._running + reward
         self._norm.update(self._running[:, None])
-        self.largest = max(self.largest, float(np.abs(self._running).max()))
+        self._largest = max(self._largest, float(np.abs(self._running).max()))
         self._running[ended] = 0
 
     def __float__(self) -> float:
-        spread = max(float(np.sqrt(self._norm.m2 / self._norm.count)[0]), self.largest / RETURN_LIMIT)
+        spread = max(float(np.sqrt(self._norm.m2 / self._norm.count)[0]), self._largest / RETURN_LIMIT)
         return 1 / max(spread, 1e-3)
 
-    def state(self) -> dict[str, torch.Tensor]:
+    def state(self) -> dict[str, Any]:
         """Return the state that it continues from."""
-        numbers = [self._norm.count, float(self._norm.mean[0]), float(self._norm.m2[0]), self.largest]
-        running = torch.from_numpy(self._running.copy())
-        return {"numbers": torch.tensor(numbers, dtype=torch.float64), "running": running}
+        return {"norm": self._norm.state(), "largest": self._largest, "running": torch.tensor(self._running)}
 
-    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+    def load_state(self, state: Mapping[str, Any]) -> None:
         """Continue from `state()`."""
-        count, mean, m2, self.largest = state["numbers"].tolist()
-        self._norm.count, self._norm.mean, self._norm.m2 = count, np.array([mean]), np.array([m2])
-        self._running = state["running"].numpy().copy()
-
-
-class CriticEnsemble(nn.Module):
-    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer.
-
-    Args:
-      bins: outputs of a critic's head, see `SacSettings.bins`.
-    """
-
-    def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        hidden: tuple[int, ...],
-        bfloat16: bool,
-        critics: int = 2,
-        bins: int = 0,
-    ):
-        super().__init__()
-        self.bfloat16, self.bins = bfloat16, bins
-        sizes = (observation_size + action_size, *hidden)
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
-        for i, o in zip(sizes[:-1], sizes[1:], strict=True):
-            self.weights.append(nn.Parameter(torch.stack([_init(i, o) for _ in range(critics)])))
-            self.biases.append(nn.Parameter(torch.zeros(critics, 1, o)))
-            self.scales.append(nn.Parameter(torch.ones(critics, 1, o)))
-            self.shifts.append(nn.Parameter(torch.zeros(critics, 1, o)))
-        outputs = max(bins, 1)
-        self.head = nn.Parameter(torch.stack([_init(sizes[-1], outputs) for _ in range(critics)]) * 0.1)
-        self.head_bias = nn.Parameter(torch.zeros(critics, 1, outputs))
-        if bins:
-            edges = torch.linspace(-SUPPORT, SUPPORT, bins + 1)
-            self.register_buffer("edges", edges, persistent=False)
-            self.register_buffer("centers", (edges[1:] + edges[:-1]) / 2, persistent=False)
-
-    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """(n, observation), (n, action) -> (critic, n) values."""
-        outputs = self.outputs(observation, action)
-        if not self.bins:
-            return outputs.squeeze(-1)
-        return (outputs.softmax(dim=-1) * self.centers).sum(dim=-1)
-
-    def loss(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """(1): squared error, or cross-entropy, of targets (n,), its mean over rows and sum over critics."""
-        outputs = self.outputs(observation, action)
-        if not self.bins:
-            return ((outputs.squeeze(-1) - target) ** 2).mean(dim=1).sum()
-        width = 2 * SUPPORT / self.bins
-        target = target.clamp(-SUPPORT + width, SUPPORT - width)
-        below = torch.erf((self.edges - target[:, None]) / (math.sqrt(2) * SMOOTHING * width))
-        wanted = (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])  # (n, bin), one in sum
-        return -(wanted * outputs.log_softmax(dim=-1)).sum(dim=-1).mean(dim=1).sum()
-
-    def outputs(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """(n, observation), (n, action) -> (critic, n, max(bins, 1))."""
-        x = torch.cat([observation, action], dim=1).expand(len(self.head), -1, -1)
-        for weight, bias, scale, shift in zip(self.weights, self.biases, self.scales, self.shifts, strict=True):
-            if self.bfloat16:
-                x = torch.bmm(x.bfloat16(), weight.bfloat16()).float() + bias
-            else:
-                x = torch.baddbmm(bias, x, weight)
-            x = nn.functional.layer_norm(x, x.shape[-1:]) * scale + shift
-            x = nn.functional.relu(x)
-        return torch.baddbmm(self.head_bias, x, self.head)
-
-
-def _init(inputs: int, outputs: int) -> torch.Tensor:
-    bound = math.sqrt(3.0 / inputs)
-    return torch.empty(inputs, outputs).uniform_(-bound, bound)
+        self._norm.load_state(state["norm"])
+        self._largest, self._running = state["largest"], state["running"].numpy().copy()
 
 
 class RowBuffer:
-    """The latest rows of named float32 fields, in memory-mapped files, so that a killed run finds them again.
+    """A ring of the latest rows of named float32 fields.
 
     Args:
       size: rows kept.
       shapes: name -> shape of one row of the field.
-      folder: folder of the files; None keeps them in memory.
     """
 
-    def __init__(self, size: int, shapes: Mapping[str, tuple[int, ...]], folder: Path | None = None):
-        self.position, self.full = 0, False
-        self.found = 0
-        """Rows that the files held before they were opened."""
-        if folder is None:
-            self.arrays = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
-        else:
-            paths = {name: folder / f"{name}.f32" for name in shapes}
-            self.found = min(rows_in(paths[name], shape) for name, shape in shapes.items())
-            size = max(size, self.found)
-            self.arrays = {name: map_rows(paths[name], size, shape)[:size] for name, shape in shapes.items()}
-        self.size = size
-
-    def restore(self, position: int, full: bool, rows: int) -> None:
-        """Continue where a run was saved, whose buffer had `rows` rows."""
-        # A full buffer that has grown since is not full any more: what is new lies behind the old rows.
-        self.position, self.full = (rows, False) if full and self.size > rows else (position, full)
-
-    def flush(self) -> None:
-        """Hand everything to the disk."""
-        for array in self.arrays.values():
-            if isinstance(array, np.memmap):
-                array.flush()
+    def __init__(self, size: int, shapes: Mapping[str, tuple[int, ...]]):
+        self.size, self.position, self.full = size, 0, False
+        self.arrays = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
 
     def __len__(self) -> int:
         return self.size if self.full else self.position
@@ -236,6 +208,20 @@ class RowBuffer:
         rows = rng.integers(0, len(self), count)
         return {name: torch.from_numpy(np.asarray(array[rows])) for name, array in self.arrays.items()}
 
+    def state(self) -> dict[str, Any]:
+        """Return the state that it continues from: the rows that are filled, not copied."""
+        rows = {name: torch.from_numpy(array[: len(self)]) for name, array in self.arrays.items()}
+        return {"rows": rows, "position": self.position, "full": self.full}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state()`; a ring that has grown begins with the oldest row."""
+        found = len(next(iter(state["rows"].values())))
+        grown = state["full"] and self.size > found
+        for name, array in self.arrays.items():
+            rows = state["rows"][name].numpy()
+            array[:found] = np.roll(rows, -state["position"], axis=0) if grown else rows
+        self.position, self.full = (found, False) if grown else (state["position"], state["full"])
+
 
 class ReplayBuffer(RowBuffer):
     """Transitions of simulations side by side; rows of one simulation lie `simulations` rows apart.
@@ -244,26 +230,10 @@ class ReplayBuffer(RowBuffer):
       simulations: rows of an `add`.
     """
 
-    def __init__(
-        self, size: int, observation_size: int, action_size: int, simulations: int, folder: Path | None = None
-    ):
+    def __init__(self, size: int, observation_size: int, action_size: int, simulations: int):
         self._simulations = simulations
-        shapes = {
-            "observation": (observation_size,),
-            "next_observation": (observation_size,),
-            "action": (action_size,),
-            "reward": (),
-            "terminated": (),
-            "ended": (),
-        }
-        super().__init__(size, shapes, folder)
-
-    def restore(self, position: int, full: bool, rows: int) -> None:
-        super().restore(position, full, rows)
-        # If it has grown after it wrapped, rows do not follow each other any more where the ring was closed.
-        if full and not self.full and position:
-            for end in (position, rows):
-                self.arrays["ended"][max(end - self._simulations, 0) : end] = 1
+        seen = {"observation": (observation_size,), "next_observation": (observation_size,), "action": (action_size,)}
+        super().__init__(size, {**seen, "reward": (), "terminated": (), "ended": ()})
 
     def sample_steps(
         self, rng: np.random.Generator, count: int, steps: int, discount: float, share: float = 1.0
@@ -302,52 +272,100 @@ class ReplayBuffer(RowBuffer):
         return {name: torch.from_numpy(np.asarray(value)) for name, value in values.items()}
 
 
-class RunningNorm:
-    """Mean and variance of all observations seen (Welford, batched)."""
-
-    def __init__(self, size: int):
-        self.count, self.mean, self.m2 = 1e-4, np.zeros(size), np.ones(size) * 1e-4
-
-    def update(self, values: np.ndarray) -> None:
-        count, mean = len(values), values.mean(axis=0)
-        delta, total = mean - self.mean, self.count + count
-        self.m2 += values.var(axis=0) * count + delta**2 * self.count * count / total
-        self.mean += delta * count / total
-        self.count = total
-
-    @property
-    def std(self) -> np.ndarray:
-        return np.sqrt(self.m2 / self.count).clip(1e-2)
+# -- critics --------------------------------------------------------------------------------------
 
 
-class ReplayLearner(abc.ABC):
-    """Base of learners from a replay buffer: an actor, running statistics of observations, and what `update` needs.
+class CriticEnsemble(nn.Module):
+    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer.
 
-    Attributes of subclasses:
-      _parts, _optimizers: names of the networks and optimizers that `state` holds.
+    Args:
+      bins: outputs of a critic's head, see `Settings.bins`.
     """
 
-    _parts: tuple[str, ...]
-    _optimizers: tuple[str, ...]
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        hidden: tuple[int, ...],
+        bfloat16: bool,
+        critics: int = 2,
+        bins: int = 0,
+    ):
+        super().__init__()
+        self.bfloat16, self.bins = bfloat16, bins
+        sizes = (observation_size + action_size, *hidden)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
+        for i, o in zip(sizes[:-1], sizes[1:], strict=True):
+            self.weights.append(nn.Parameter(torch.stack([_init(i, o) for _ in range(critics)])))
+            self.biases.append(nn.Parameter(torch.zeros(critics, 1, o)))
+            self.scales.append(nn.Parameter(torch.ones(critics, 1, o)))
+            self.shifts.append(nn.Parameter(torch.zeros(critics, 1, o)))
+        outputs = max(bins, 1)
+        self.head = nn.Parameter(torch.stack([_init(sizes[-1], outputs) for _ in range(critics)]) * 0.1)
+        self.head_bias = nn.Parameter(torch.zeros(critics, 1, outputs))
+        if bins:
+            edges = torch.linspace(-SUPPORT, SUPPORT, bins + 1)
+            self.register_buffer("edges", edges, persistent=False)
+            self.register_buffer("centers", (edges[1:] + edges[:-1]) / 2, persistent=False)
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(n, observation), (n, action) -> (critic, n) values."""
+        outputs = self.outputs(observation, action)
+        if not self.bins:
+            return outputs.squeeze(-1)
+        return (outputs.softmax(dim=-1) * self.centers).sum(dim=-1)
+
+    def loss(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """(1): cross-entropy of targets (n,), or squared error, its mean over rows and sum over critics.
+
+        HL-Gauss: a target is a Gaussian around it, of which each bin holds its part.
+        """
+        outputs = self.outputs(observation, action)
+        if not self.bins:
+            return ((outputs.squeeze(-1) - target) ** 2).mean(dim=1).sum()
+        width = 2 * SUPPORT / self.bins
+        target = target.clamp(-SUPPORT + width, SUPPORT - width)
+        below = torch.erf((self.edges - target[:, None]) / (math.sqrt(2) * SMOOTHING * width))
+        wanted = (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])  # (n, bin), one in sum
+        return -(wanted * outputs.log_softmax(dim=-1)).sum(dim=-1).mean(dim=1).sum()
+
+    def outputs(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(n, observation), (n, action) -> (critic, n, max(bins, 1))."""
+        x = torch.cat([observation, action], dim=1).expand(len(self.head), -1, -1)
+        for weight, bias, scale, shift in zip(self.weights, self.biases, self.scales, self.shifts, strict=True):
+            if self.bfloat16:
+                x = torch.bmm(x.bfloat16(), weight.bfloat16()).float() + bias
+            else:
+                x = torch.baddbmm(bias, x, weight)
+            x = nn.functional.layer_norm(x, x.shape[-1:]) * scale + shift
+            x = nn.functional.relu(x)
+        return torch.baddbmm(self.head_bias, x, self.head)
+
+
+def _init(inputs: int, outputs: int) -> torch.Tensor:
+    bound = math.sqrt(3.0 / inputs)
+    return torch.empty(inputs, outputs).uniform_(-bound, bound)
+
+
+# -- the learner ----------------------------------------------------------------------------------
+
+
+class Learner:
+    """An actor with the running statistics of its observations, and the state of all networks beside it.
+
+    Attributes of subclasses:
+      parts, optimizers: names of the networks and optimizers that `state` holds.
+    """
+
+    parts: tuple[str, ...]
+    optimizers: tuple[str, ...]
 
     def __init__(self, header: PolicyHeader, settings: Any, seed: int):
         torch.manual_seed(seed)
         self.settings, self.actor = settings, Actor(header)
         self.norm = RunningNorm(header.observation_size)
-        self.returns = ReturnScale(settings.simulations, settings.discount)
         self.updates = 0
-
-    @abc.abstractmethod
-    def update(self, batch: dict[str, torch.Tensor]) -> None:
-        """One gradient step on rows of the buffer."""
-
-    @abc.abstractmethod
-    def metrics(self) -> dict[str, float]:
-        """Numbers of the last update, for the log."""
-
-    def begin_round(self, step: int) -> None:
-        """Called at every agent step of the simulations, before its updates."""
-        self.sync_norm()
 
     def sync_norm(self) -> None:
         """Put the running statistics into the actor, where every network reads them."""
@@ -359,56 +377,50 @@ class ReplayLearner(abc.ABC):
         with torch.no_grad():
             mean, std = self.actor(torch.from_numpy(np.ascontiguousarray(observation, np.float32)))
             noise = torch.randn_like(mean)
-            noise[: round(self.settings.mean_share * len(noise))] = 0
+            noise[: round(self.settings.greedy_fraction * len(noise))] = 0
             return torch.tanh(mean + std * noise).numpy()
 
     def state(self) -> dict[str, Any]:
         """Everything that learning continues from (tensors and plain numbers)."""
-        norm = {
-            "count": self.norm.count,
-            "mean": torch.from_numpy(self.norm.mean),
-            "m2": torch.from_numpy(self.norm.m2),
-        }
-        states = {name: getattr(self, name).state_dict() for name in (*self._parts, *self._optimizers)}
-        numbers = {"norm": norm, "returns": self.returns.state(), "updates": self.updates}
-        return states | numbers | {"torch_rng": torch.get_rng_state()}
+        states = {name: getattr(self, name).state_dict() for name in (*self.parts, *self.optimizers)}
+        return states | {"norm": self.norm.state(), "updates": self.updates, "torch_rng": torch.get_rng_state()}
 
-    def load_state(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: Mapping[str, Any]) -> None:
         """Continue from `state()`."""
         self.load_networks(state)
-        for name in self._optimizers:
+        for name in self.optimizers:
             getattr(self, name).load_state_dict(state[name])
-        self.returns.load_state(state["returns"])
         self.updates = int(state["updates"])
         torch.set_rng_state(state["torch_rng"])
 
+    def load_networks(self, state: Mapping[str, Any]) -> None:
+        """Take networks and normalization of `state()`, but no optimizer or random state.
+
+        Raises:
+          RuntimeError: they have other shapes.
+        """
+        for name in self.parts:
+            getattr(self, name).load_state_dict(state[name])
+        self.norm.load_state(state["norm"])
+
     def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
-        """Take the weights of a policy file.
+        """Take the weights of a policy file, and its normalization as if 100,000 observations had been seen.
 
         Raises:
           RuntimeError: they have other shapes.
         """
         self.actor.load_state_dict(weights)
-
-    def load_networks(self, state: dict[str, Any]) -> None:
-        """Take networks, temperature and normalization of `state()`, but no optimizer or random state.
-
-        Raises:
-          RuntimeError: they have other shapes.
-        """
-        for name in self._parts:
-            getattr(self, name).load_state_dict(state[name])
-        self.norm.count = float(state["norm"]["count"])
-        self.norm.mean, self.norm.m2 = state["norm"]["mean"].numpy().copy(), state["norm"]["m2"].numpy().copy()
+        self.norm.mean, self.norm.count = self.actor.observation_mean.numpy().astype(float), 1e5
+        self.norm.m2 = self.actor.observation_std.numpy().astype(float) ** 2 * self.norm.count
 
 
-class Sac(ReplayLearner):
-    """The learner: networks, optimizers, temperature; `update` does one step of all of them."""
+class Sac(Learner):
+    """Networks, optimizers, temperature; `update` does one step of all of them."""
 
-    _parts = ("actor", "critic", "target")
-    _optimizers = ("actor_optimizer", "critic_optimizer", "alpha_optimizer")
+    parts = ("actor", "critic", "target")
+    optimizers = ("actor_optimizer", "critic_optimizer", "alpha_optimizer")
 
-    def __init__(self, header: PolicyHeader, settings: SacSettings, seed: int):
+    def __init__(self, header: PolicyHeader, settings: Settings, seed: int):
         super().__init__(header, settings, seed)
         observation, action = header.observation_size, header.action_size
         sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics, settings.bins)
@@ -416,37 +428,32 @@ class Sac(ReplayLearner):
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
+        self.returns = ReturnScale(settings.simulations, settings.discount)
         self.target_entropy = -settings.target_entropy_scale * action
-        self._sharp_entropy = -settings.sharp_entropy_scale * action
+        self._final_entropy = -settings.final_entropy_scale * action
         rate = settings.learning_rate
         decay = {"weight_decay": settings.weight_decay, "fused": True}
         self.actor_optimizer = torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay)
         self.critic_optimizer = torch.optim.AdamW(self.critic.parameters(), lr=rate, **decay)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
         self._losses: dict[str, torch.Tensor] = {}
-        self._critic_loss, self._actor_loss = self.critic_loss, self.actor_loss
-        if settings.compile:
-            self._critic_loss = compiled(self.critic_loss)
-            self._actor_loss = compiled(self.actor_loss)
+        self._critic_loss = compiled(self.critic_loss) if settings.compile else self.critic_loss
+        self._actor_loss = compiled(self.actor_loss) if settings.compile else self.actor_loss
 
-    def begin_round(self, step: int) -> None:
-        super().begin_round(step)
-        if self.settings.rate_half_life:
-            rate = self.settings.learning_rate / math.sqrt(1 + step / self.settings.rate_half_life)
-            for optimizer in (self.actor_optimizer, self.critic_optimizer):
-                for group in optimizer.param_groups:
-                    group["lr"] = rate
-        self.sharpen(step)  # last, as its rate stands in for the falling one
-
-    def sharpen(self, step: int) -> None:
-        """Aim at the lower entropy, by smaller steps, from the agent step on that the settings name."""
-        settings = self.settings
-        if not settings.sharpen_after or step < settings.sharpen_after:
-            return
-        self.target_entropy = self._sharp_entropy
-        for optimizer in (self.actor_optimizer, self.critic_optimizer, self.alpha_optimizer):
+    def schedule(self, step: int) -> None:
+        """Set learning rates and target entropy of an agent step."""
+        settings, rate = self.settings, self.settings.learning_rate
+        if settings.rate_half_life:
+            rate /= math.sqrt(1 + step / settings.rate_half_life)
+        annealed = settings.anneal_after and step >= settings.anneal_after
+        networks = [self.actor_optimizer, self.critic_optimizer]
+        if annealed:
+            self.target_entropy, rate = self._final_entropy, settings.final_learning_rate or rate
+            if settings.final_learning_rate:
+                networks.append(self.alpha_optimizer)
+        for optimizer in networks:
             for group in optimizer.param_groups:
-                group["lr"] = settings.sharp_learning_rate or group["lr"]
+                group["lr"] = rate
 
     def sample_action(self, normalized: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Reparametrized action and its log probability, (n, action), (n,)."""
@@ -480,7 +487,7 @@ class Sac(ReplayLearner):
         return self.critic.loss(self.actor.normalize(observation), action, target)
 
     def actor_loss(self, observation):
-        """E[alpha log pi - min Q] and the mean log probability."""
+        """E[alpha log pi - Q] and the mean log probability."""
         observation = self.actor.normalize(observation)
         action, log_prob = self.sample_action(observation)
         value = self.reduce(self.critic(observation, action))
@@ -521,9 +528,121 @@ class Sac(ReplayLearner):
         }
 
     def state(self) -> dict[str, Any]:
-        return super().state() | {"log_alpha": self.log_alpha.detach()}
+        return super().state() | {"log_alpha": self.log_alpha.detach(), "returns": self.returns.state()}
 
-    def load_networks(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        super().load_state(state)
+        self.returns.load_state(state["returns"])
+
+    def load_networks(self, state: Mapping[str, Any]) -> None:
         super().load_networks(state)
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
+
+
+# -- the run --------------------------------------------------------------------------------------
+
+
+class Collector:
+    """Episodes of a learner's actor, at random until there is something to learn from, and the batches to learn from.
+
+    It continues where the run was saved, or begins with what the run starts from; `state` is all that the run goes on
+    from, the learner's included.
+    """
+
+    def __init__(self, run: Run, learner: Learner):
+        settings, config, task = run.settings, run.config, run.task
+        self.run, self.learner, self._owed = run, learner, 0.0  # updates that are due
+        self.rng = np.random.default_rng([config.seed, 0xB0FF])
+        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
+        self.buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, settings.simulations)
+        self.episodes = Episodes(task, settings, config.seed, self.rng)
+        if saved := run.saved():
+            learner.load_state(saved["learner"])
+            self.buffer.load_state(saved["buffer"])
+            self.episodes.restore(saved["episodes"])
+            self.rng.bit_generator.state, self._owed = json.loads(saved["rng"]), saved["owed"]
+        elif config.init_from:
+            start_from(learner, run)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the run continues from."""
+        parts = {"learner": self.learner.state(), "buffer": self.buffer.state(), "episodes": self.episodes.saved()}
+        return parts | {"rng": json.dumps(self.rng.bit_generator.state), "owed": self._owed}
+
+    def step(self) -> Moment:
+        """One agent step of every simulation, into the buffer."""
+        settings, observation = self.run.settings, self.episodes.observation
+        self.learner.norm.update(observation)
+        if len(self.buffer) < settings.warmup_steps and not self.run.config.init_from:
+            action = self.rng.uniform(-1, 1, (settings.simulations, self.run.task.action_size)).astype(np.float32)
+        else:
+            action = self.learner.act(observation)
+        moment = self.episodes.step(action)
+        self.buffer.add(observation=observation, action=action, **vars(moment))
+        self.run.advance(settings.simulations)
+        return moment
+
+    def batches(self, share: float = 1.0) -> Iterator[dict[str, torch.Tensor]]:
+        """A batch for each update that the last steps are worth.
+
+        Args:
+          share: share of the rows with rewards of several steps, see `ReplayBuffer.sample_steps`.
+        """
+        settings = self.run.settings
+        if len(self.buffer) < settings.warmup_steps:
+            return
+        self._owed += settings.updates_per_step * settings.simulations
+        while self._owed >= 1:
+            self._owed -= 1
+            yield self.buffer.sample_steps(self.rng, settings.batch_size, settings.n_step, settings.discount, share)
+
+
+def check_replay(run: Run, kind: Callable[..., Learner], updates: int = 1) -> None:
+    """Refuse a run of a learner that would learn nothing, or that its start does not fit.
+
+    Args:
+      kind: makes the learner. updates: until its policy changes.
+    """
+    settings = run.settings
+    if settings.buffer_size < settings.warmup_steps:
+        raise DmcvbError(
+            f"buffer_size {settings.buffer_size} holds fewer steps than warmup_steps {settings.warmup_steps}, so "
+            "nothing would ever be learned; give --set buffer_size of at least that"
+        )
+    too_few_updates(run, settings.warmup_steps, updates)
+    if run.config.init_from and not run.begun:
+        start_from(kind(run.header, settings, run.config.seed), run)
+
+
+def network(run: Run) -> dict[str, Any]:
+    """The header's fields that say how the actor is built."""
+    return {"hidden": tuple(run.settings.actor_hidden)}
+
+
+def check(run: Run) -> None:
+    """Refuse, before anything is written, a run that would learn nothing, or that its start does not fit.
+
+    Raises:
+      DmcvbError: what is wrong and the cure.
+    """
+    check_replay(run, Sac, run.settings.actor_every)
+
+
+def train(run: Run) -> None:
+    """Train until the run's last step, or until it is stopped."""
+    settings = run.settings
+    learner = Sac(run.header, settings, run.config.seed)
+    collector = Collector(run, learner)
+    while run.step < run.config.steps:
+        moment = collector.step()
+        learner.returns.update(moment.reward, moment.ended)
+        learner.sync_norm()
+        learner.schedule(run.step)
+        half_life = settings.n_step_half_life
+        for batch in collector.batches(1 / (1 + run.step / half_life) if half_life else 1.0):
+            learner.update(batch)
+        if run.evaluation_is_due():
+            run.record(learner.actor.state_dict(), learner.updates, learner.metrics())
+        run.checkpoint_if_due(collector.state, learner.actor.state_dict)
+    run.save(collector.state())

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -33,8 +34,7 @@ from dmcvb_gen.storage.remote import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.text import pluralize
-from dmcvb_gen.training.run_log import read_rows
-from dmcvb_gen.training.runs import read_config
+from dmcvb_gen.training.run import read_config
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,8 +57,8 @@ CLOSE_ENOUGH = 0.2
 """Share of the tolerance within which no nearer checkpoint is looked for."""
 SMOOTHING = 5
 """Evaluations in the moving median of the curve."""
-MIN_POINTS = 8
-"""Evaluations below which no convergence is claimed."""
+SURE_POINTS = 8
+"""Evaluations below which a curve says little of where it ends."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +67,23 @@ class Convergence:
 
     Attributes:
       value: return at convergence, the mean of the best stretch of a quarter of the curve.
-      error: its standard error.
-      converged: False if there are too few evaluations, if the return never rose, or if the best quarter is the last
+      error: its standard error; of a few evaluations, how much their second half differs from the first.
+      converged: False if there is one evaluation, if the return never rose, or if the best quarter is the last
         and lies more than 5 % of the way above the quarter before.
-      reason: why not.
+      reason: why not, or why it is not sure.
     """
 
     value: float
     error: float
     converged: bool
     reason: str = ""
+
+    @property
+    def standing(self) -> str:
+        """How sure it is, in words."""
+        state = "converged" if self.converged else "not converged"
+        error = "" if math.isnan(self.error) else f" +- {self.error:.1f}"
+        return f"{self.value:.1f}{error}, {state}" + (f" ({self.reason})" if self.reason else "")
 
 
 @dataclass(frozen=True)
@@ -122,13 +129,8 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
     was reached once can be picked.
     """
     steps, curve = np.asarray(steps, float), smooth(returns)
-    if len(curve) < MIN_POINTS:
-        return Convergence(
-            float(curve[-1]) if len(curve) else float("nan"),
-            float("nan"),
-            False,
-            f"{pluralize(len(curve), 'evaluations')}, at least {MIN_POINTS} are needed",
-        )
+    if len(curve) < SURE_POINTS:
+        return _of_few(np.asarray(returns, float), base)
     grid = np.linspace(steps[0], steps[-1], 64)
     even = np.interp(grid, steps, curve)
     means = np.convolve(even, np.ones(16) / 16, mode="valid")  # every stretch of a quarter
@@ -138,9 +140,7 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
     error = float(stretch.std() / np.sqrt(len(stretch) / SMOOTHING))
     way = value - base
     if way <= 0:
-        return Convergence(
-            value, error, False, f"the return ({value:.1f}) never rose above where it started ({base:.1f})"
-        )
+        return Convergence(value, error, False, _never_rose(value, base))
     if best == len(means) - 1:
         before = float(even[max(0, best - 16) : best].mean())
         if value - before > 0.05 * way:
@@ -150,26 +150,39 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
     return Convergence(value, error, True)
 
 
-Point = tuple[int, float, Path | None]
-"""Agent step, return, policy file; None if the file was thinned away."""
+def _of_few(returns: np.ndarray, base: float) -> Convergence:
+    """The convergence of fewer evaluations than `SURE_POINTS`: their second half, beside the first."""
+    count, half = len(returns), len(returns) // 2
+    if not half:
+        value = float(returns[-1]) if count else math.nan
+        return Convergence(value, math.nan, False, f"{pluralize(count, 'evaluations')}, at least 2 are needed")
+    value, before = float(returns[half:].mean()), float(returns[:half].mean())
+    if value <= base:
+        return Convergence(value, abs(value - before), False, _never_rose(value, base))
+    doubt = f"from {count} evaluations, so a longer run may end higher; {SURE_POINTS} say more"
+    return Convergence(value, abs(value - before), True, doubt)
 
 
-def read_curve(folder: Path) -> list[Point]:
-    """Every evaluation of a run, in order of steps: those of progress.csv and of the checkpoints' own headers.
+def _never_rose(value: float, base: float) -> str:
+    return f"the return ({value:.1f}) never rose above where it started ({base:.1f})"
 
-    A checkpoint that is being written while we look is left out.
+
+Point = tuple[int, float, Path]
+"""Agent step, return, policy file."""
+
+
+def read_curve(folder: str | Path) -> list[Point]:
+    """Every evaluation of a run, in order of steps, as the checkpoints' headers have them.
+
+    A checkpoint that is being written while we look is left out, and one where the run was stopped, too.
     """
-    curve: dict[int, Point] = {
-        int(row["step"]): (int(row["step"]), float(row["return_mean"]), None) for row in read_rows(folder)
-    }
-    for path in (Path(folder) / "checkpoints").glob("*.safetensors"):
-        try:
+    curve: list[Point] = []
+    for path in sorted((Path(folder) / "checkpoints").glob("*.safetensors")):
+        with contextlib.suppress(PolicyFileError):
             header = read_header(path)
-        except PolicyFileError:
-            continue
-        if header.evaluation is not None:
-            curve[header.agent_step] = (header.agent_step, header.evaluation.mean, path)
-    return [curve[step] for step in sorted(curve)]
+            if header.evaluation is not None:
+                curve.append((header.agent_step, header.evaluation.mean, path))
+    return sorted(curve)
 
 
 def pick_checkpoints(
@@ -193,7 +206,6 @@ def pick_checkpoints(
       costs: returns are negative, as in mazes: an expert's is `convergence` over the share, not so much of the way.
     """
     way, check = convergence.value - base, functools.cache(measure)
-    curve = [point for point in curve if point[2] is not None]
     if not curve or not way > 0:
         return Selection(task, base, convergence, {}, dict.fromkeys(levels, _nothing(curve, base, convergence)))
     found: dict[str, tuple[Pick, ...] | str] = {}
@@ -294,10 +306,9 @@ def select_checkpoints(
     """
     folder = Path(folder)
     curve = read_curve(folder)
-    files = [path for _, _, path in curve if path]
-    if not files:
+    if not curve:
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
-    task = get_task(read_header(files[0]).task)
+    task = get_task(read_header(curve[0][2]).task)
     mazes = is_maze(task.id)
     _make_place(folder)
     base = _base(task, episodes, seed)
@@ -311,23 +322,11 @@ def select_checkpoints(
             measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic, streams=FRESH)[0]
         return measured[path][1]
 
-    def pick() -> Selection:
-        end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
-        if converged is not None:
-            end = Convergence(converged, 0.0, True)
-        levels = MAZE_TRAINED_LEVELS if mazes else TRAINED_LEVELS
-        return pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id), mazes)
-
-    for attempt in range(5):
-        try:
-            selection = pick()
-            break
-        except PolicyFileError:
-            curve, before = read_curve(folder), files
-            files = [path for _, _, path in curve if path]
-            # The run may have thinned a checkpoint away since the curve was read; a damaged one is a real error.
-            if attempt == 4 or set(before) <= set(files):
-                raise
+    end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
+    if converged is not None:
+        end = Convergence(converged, 0.0, True)
+    levels = MAZE_TRAINED_LEVELS if mazes else TRAINED_LEVELS
+    selection = pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id), mazes)
     expect(progress, len(measured))
     with storage_errors(folder, "write to"):
         _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -17,15 +16,15 @@ from dmcvb_gen.tasks.base import Task
 def _spaces(task: Task) -> tuple[spaces.Box, spaces.Box]:
     return (
         spaces.Box(-np.inf, np.inf, (task.behaviour_size,), np.float32),
-        spaces.Box(-1.0, 1.0, (task.action_size,), np.float32),
+        spaces.Box(task.action_low, task.action_high, dtype=np.float32),
     )
 
 
 class TaskVecEnv(VecEnv):
     """`size` episodes side by side, each restarted when it ends.
 
-    Observations are (size, behaviour_size) float32, actions in [-1, 1] are scaled to the task's bounds, rewards are
-    (size,) float32 summed over the control steps.
+    Observations are (size, behaviour_size) float32, actions lie in the task's bounds, rewards are (size,) float32
+    summed over the control steps.
     At an episode's end `infos[i]["terminal_observation"]` is its last observation (the one returned belongs to
     the next episode), and `infos[i]["TimeLimit.truncated"]` is true if only the time limit ended it, so that
     a learner bootstraps there and nowhere else. `infos[i]["episode"]` has its return "r" and length "l".
@@ -67,7 +66,7 @@ class TaskVecEnv(VecEnv):
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        result = self.batch.step(self.task.from_unit(self._actions))
+        result = self.batch.step(self._actions)
         observation = self.batch.behaviour_observation()
         self._length += 1
         self._return += result.reward
@@ -82,17 +81,6 @@ class TaskVecEnv(VecEnv):
             self._start(ended)
             observation[ended] = self.batch.behaviour_observation()[ended]
         return observation, result.reward.astype(np.float32), done, infos
-
-    def saved(self) -> dict[str, Any]:
-        """The state that decides all later episodes: tensors and numbers."""
-        parts = {"physics": self.batch.physics(), "length": self._length, "return": self._return}
-        return {name: torch.from_numpy(part.copy()) for name, part in parts.items()} | {"started": self._started}
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from `saved()`, bit for bit."""
-        self.batch.set_physics(saved["physics"].numpy())
-        self._length, self._return = saved["length"].numpy().copy(), saved["return"].numpy().copy()
-        self._started = saved["started"]
 
     def close(self) -> None:
         """Nothing to free: the simulations live in memory."""

@@ -16,7 +16,7 @@ def ask(*words: str):
     return CliRunner().invoke(main, ["train-behaviour", *words, "--list-settings"])
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", [*ALGORITHMS, "sb3:SAC", "sb3:PPO", "sb3:TQC"])
 @pytest.mark.parametrize("task", ["walker-walk", "humanoid-walk", "ant-maze-empty7x7"])
 def test_every_setting_of_every_algorithm_has_a_meaning(algorithm, task):
     found = json.loads(ask(task, "--algo", algorithm, "--json").stdout)

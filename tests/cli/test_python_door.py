@@ -133,7 +133,7 @@ def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
         begun.append(json.dumps(dataclasses.asdict(config)))
         raise DmcvbError("enough")
 
-    monkeypatch.setattr("dmcvb_gen.training.training.open_run", stop)
+    monkeypatch.setattr("dmcvb_gen.training.run.open_run", stop)
     with pytest.raises(DmcvbError, match="enough"):
         dmcvb_gen.train_behaviour("walker-walk", out=tmp_path / "run", init_from=tmp_path / "other", progress=False)
     assert str(tmp_path / "other") in begun[0]

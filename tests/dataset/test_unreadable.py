@@ -24,8 +24,7 @@ from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import check_files
 from dmcvb_gen.storage import base as storage
-from dmcvb_gen.training.runs import RunConfig
-from dmcvb_gen.training.training import open_run
+from dmcvb_gen.training.run import RunConfig, open_run
 from tests.faults import store_ops
 
 NAME = store_ops.NAMES[0]

@@ -101,8 +101,7 @@ def _report(root):
 
 
 def _train(root):
-    from dmcvb_gen.training.runs import RunConfig
-    from dmcvb_gen.training.training import open_run
+    from dmcvb_gen.training.run import RunConfig, open_run
 
     open_run(URL, RunConfig("walker-walk", "sac", 1, 0, {}), resume=False)
 

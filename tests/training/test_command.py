@@ -17,8 +17,8 @@ from dmcvb_gen.policies.bundled import bundled_levels, bundled_policies
 from dmcvb_gen.policies.evaluation import maze_scores, running_speed
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task, task_ids
-from dmcvb_gen.training.defaults import default_run, parse_settings
-from dmcvb_gen.training.training import RunConfig, command_of
+from dmcvb_gen.training.run import RunConfig, command_of
+from dmcvb_gen.training.settings import default_run, parse_settings
 
 
 @pytest.mark.parametrize("init_from", [None, "runs/my stand run"])

@@ -13,21 +13,20 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.open_maze import open_maze_observation, places
-from dmcvb_gen.policies.policy_file import load_policy, read_header
+from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
-from dmcvb_gen.training import runs
-from dmcvb_gen.training.guided import EVALUATION_STEPS, Student, draw_places
+from dmcvb_gen.training import run as runs
+from dmcvb_gen.training.guided import EVALUATION_STEPS, Student, base_policy, draw_places
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays
-from dmcvb_gen.training.runs import RunConfig
-from dmcvb_gen.training.training import open_run
+from dmcvb_gen.training.run import RunConfig, open_run
 
 
 def config(task="ant-maze-easy7x7a", steps=640, **changes):
     settings = dict(simulations=8, batch_size=64, updates_per_step=0.5) | changes.pop("settings", {})
-    fields = dict(algorithm="guided", seed=0, evaluate_every=steps, evaluate_sparse=steps)
+    fields = dict(algorithm="guided", seed=0, evaluate_every=steps)
     return RunConfig(task=task, steps=steps, settings=settings, **fields | changes)
 
 
@@ -40,7 +39,7 @@ def test_a_run_goes_on_when_its_guide_is_gone(tmp_path, monkeypatch):
     guide.unlink()
     run = open_run(tmp_path / "run", dataclasses.replace(asked, steps=32), True)
     run.train()
-    assert run.step == 32 and run.walker.digest == run.header.training["walker"]
+    assert run.step == 32 and base_policy(run).digest == run.header.training["walker"]
 
 
 def walked(task, steps=30, size=6):
@@ -83,14 +82,15 @@ def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
 def test_the_actor_and_the_network_that_learns_agree(tmp_path):
     run = open_run(tmp_path / "run", config(), False)
     (tmp_path / "run" / "resume").mkdir(parents=True, exist_ok=True)
-    student = Student(run)
+    base = base_policy(run)
+    student = Student(run, base)
     policy = Policy(run.header, as_arrays(student.weights()), "")
     seen = walked(run.task).behaviour_observation()
     with torch.no_grad():
         learned = student.way(torch.from_numpy(places(seen))).numpy()
-    np.testing.assert_allclose(policy.heading(seen), learned, atol=1e-5)
-    plain = Policy(run.walker.header, run.walker.weights, "")
-    wanted = plain.act(open_maze_observation(seen, policy.heading(seen)), deterministic=True)
+    np.testing.assert_allclose(policy.predict_waypoint(seen), learned, atol=1e-5)
+    plain = Policy(base.header, base.weights, "")
+    wanted = plain.act(open_maze_observation(seen, policy.predict_waypoint(seen)), deterministic=True)
     np.testing.assert_array_equal(policy.act(seen, deterministic=True), wanted)
 
 
@@ -119,9 +119,9 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
     run.train()
     path = next((tmp_path / "run" / "checkpoints").iterdir())
     header, policy = read_header(path), load_policy(path, run.task)
-    assert header.algorithm == "guided" and header.training["walker"] == run.walker.digest
+    assert header.algorithm == "guided" and header.training["walker"] == base_policy(run).digest
     assert "--algo guided" in header.command and header.way == (256, 256, 256)
-    for name, value in run.walker.weights.items():
+    for name, value in base_policy(run).weights.items():
         np.testing.assert_array_equal(policy.weights[name], value)
 
     place = draw_places(run.task.layout, np.random.default_rng(9), 500)
@@ -147,7 +147,7 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
         return known, None
 
     monkeypatch.setattr(runs, "evaluate", counted)
-    run = open_run(tmp_path / "run", config(steps=192, evaluate_every=64, evaluate_sparse=64), False)
+    run = open_run(tmp_path / "run", config(steps=192, evaluate_every=64), False)
     run.train()
     assert asked == [4 * 600] * 3 and sum(asked) <= EVALUATION_STEPS * 192
     run.step += 100_000
@@ -156,7 +156,7 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
 
 def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 1)
-    rare = dict(evaluate_every=10_000, evaluate_sparse=10_000)
+    rare = dict(evaluate_every=10_000)
     open_run(tmp_path / "run", config(steps=128, **rare), False).train()
     open_run(tmp_path / "run", config(steps=256, **rare), True).train()
     open_run(tmp_path / "whole", config(steps=256, **rare), False).train()
@@ -166,9 +166,10 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):
 
 def test_a_run_does_not_go_on_with_another_walker(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
-    open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000, evaluate_sparse=10_000), False).train()
-    longer = open_run(tmp_path / "run", config(steps=128, evaluate_every=10_000, evaluate_sparse=10_000), True)
-    longer.walker.digest = "another"
+    open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000), False).train()
+    longer = open_run(tmp_path / "run", config(steps=128, evaluate_every=10_000), True)
+    other = load_policy(bundled_policies("ant-maze-empty7x7", "medium")[0])
+    save_policy(tmp_path / "run/resume/base_policy.safetensors", other.header, other.weights)
     with pytest.raises(DmcvbError, match="another walking policy"):
         longer.train()
 
@@ -177,5 +178,5 @@ def test_what_cannot_be_guided(tmp_path):
     with pytest.raises(DmcvbError, match="for ant mazes"):
         open_run(tmp_path / "run", config(task="walker-walk"), False)
     with pytest.raises(DmcvbError, match="unknown setting of guided"):
-        open_run(tmp_path / "run", config(settings={"progress": 1.0}), False)
+        open_run(tmp_path / "run", config(settings={"path_reward_scale": 1.0}), False)
     assert not (tmp_path / "run").exists()

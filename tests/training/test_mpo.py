@@ -16,10 +16,9 @@ from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import mpo
-from dmcvb_gen.training.mpo import Mpo, MpoSettings
-from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.mpo import Mpo, Settings
+from dmcvb_gen.training.run import RunConfig, open_run
 from dmcvb_gen.training.settings import check_settings
-from dmcvb_gen.training.training import open_run
 
 SMALL = dict(actor_hidden=[16], critic_hidden=[16], batch_size=32, warmup_steps=64, simulations=4, compile=False)
 
@@ -66,7 +65,7 @@ def test_the_dual_finds_the_temperature_whose_weights_keep_their_distance():
 
 def learner(**changes):
     header = PolicyHeader(task="x", observation_size=3, action_size=2, algorithm="mpo", agent_step=0, hidden=(16,))
-    return Mpo(header, MpoSettings(**SMALL | changes), 0)
+    return Mpo(header, Settings(**SMALL | changes), 0)
 
 
 def batch_of(count=64, seed=3):
@@ -123,7 +122,7 @@ def test_from_a_policy_file_the_targets_draw_its_actions():
 
 
 def test_its_policies_roll_out(tmp_path):
-    config = RunConfig("walker-walk", "mpo", 128, 0, SMALL, evaluate_every=128, evaluate_sparse=128)
+    config = RunConfig("walker-walk", "mpo", 128, 0, SMALL, evaluate_every=128)
     run = open_run(tmp_path / "run", config, False)
     run.train()
     path = tmp_path / "run" / "checkpoints" / f"{run.step:010d}.safetensors"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -18,14 +16,14 @@ from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.policy_file import save_policy
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.training import runs
-from dmcvb_gen.training.defaults import default_run, parse_settings, run_config
+from dmcvb_gen.training import run as runs
+from dmcvb_gen.training.behaviour import run_config
 from dmcvb_gen.training.episodes import standing_states
+from dmcvb_gen.training.mpo import Mpo
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays
-from dmcvb_gen.training.pruning import prunable_checkpoints
-from dmcvb_gen.training.runs import RunConfig, check_same
-from dmcvb_gen.training.sac import SUPPORT, CriticEnsemble, ReplayBuffer, ReturnScale, RunningNorm, Sac, SacSettings
-from dmcvb_gen.training.training import MpoRun, SacRun, open_run
+from dmcvb_gen.training.run import Run, RunConfig, check_same, open_run
+from dmcvb_gen.training.sac import SUPPORT, CriticEnsemble, ReplayBuffer, ReturnScale, RunningNorm, Sac, Settings
+from dmcvb_gen.training.settings import default_run, parse_settings
 
 torch.set_num_threads(1)
 TINY = dict(warmup_steps=64, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4)
@@ -34,13 +32,19 @@ TINY |= dict(train_episode_steps=20, bfloat16=False)
 
 def config(**changes):
     fields = dict(task="cheetah-run", algorithm="sac", steps=160, seed=0, settings=TINY, evaluate_every=80)
-    return RunConfig(**fields | {"evaluate_sparse": 80} | changes)
+    return RunConfig(**fields | changes)
 
 
 def learner(**changes):
     header = PolicyHeader(task="x", observation_size=3, action_size=2, algorithm="sac", agent_step=0, hidden=(8, 8))
-    settings = SacSettings(**dict(compile=False, bfloat16=False, critic_hidden=(8, 8)) | changes)
+    plain = dict(bins=0, reward_scale=0.5, soft_values=True, clipped=True, rate_half_life=0, n_step=1)
+    settings = Settings(**plain | dict(compile=False, critic_hidden=(8, 8), initial_temperature=0.1) | changes)
     return Sac(header, settings, 0)
+
+
+def learner_of(folder, asked):
+    run = Run(folder, asked)
+    return Sac(run.header, run.settings, asked.seed)
 
 
 def batch_of(count=64):
@@ -140,7 +144,7 @@ def test_a_distribution_over_bins_that_fits_a_target_has_its_mean(target, bins):
 def test_learning_rates_fall_with_the_root_of_the_steps():
     sac = learner(rate_half_life=1000, learning_rate=1e-3)
     for step, rate in ((0, 1e-3), (1000, 1e-3 / 2**0.5), (8000, 1e-3 / 3)):
-        sac.begin_round(step)
+        sac.schedule(step)
         groups = [optimizer.param_groups[0]["lr"] for optimizer in (sac.actor_optimizer, sac.critic_optimizer)]
         assert groups == pytest.approx([rate, rate])
 
@@ -192,41 +196,25 @@ def test_steps_that_follow_are_summed_as_far_as_an_episode_goes_on(data):
         assert batch["next_observation"][i, 0] == at * simulations + k + 0.5
 
 
-def test_a_buffer_that_grew_does_not_chain_what_did_not_follow(tmp_path):
-    tmp_path.joinpath("resume").mkdir()
-    small = ReplayBuffer(6, 1, 1, 2, tmp_path / "resume")
-    for start in range(0, 10, 2):  # rows 6 to 9 lie over 0 to 3
-        value = np.arange(start, start + 2, dtype=float)[:, None]
-        zero = np.zeros(2)
-        small.add(observation=value, next_observation=value, action=value, reward=zero + 1, terminated=zero, ended=zero)
-    small.flush()
-    large = ReplayBuffer(12, 1, 1, 2, tmp_path / "resume")
-    large.restore(small.position, small.full, small.size)
-    assert not large.full and len(large) == 6
-    batch = large.sample_steps(np.random.default_rng(0), 40, 3, 1.0)
-    led = dict(zip(batch["observation"][:, 0].tolist(), batch["next_observation"][:, 0].tolist(), strict=True))
-    assert led == {4: 4, 5: 5, 6: 8, 7: 9, 8: 8, 9: 9}  # 4 and 5 are followed by 6 and 7, which lie before them
-
-
-def test_a_sharpened_policy_is_paid_less_for_its_entropy():
+def test_an_annealed_policy_is_paid_less_for_its_entropy():
     entropies, temperatures = [], []
-    for sharpen_after in (0, 10):
-        settings = dict(target_entropy_scale=-0.5, sharp_entropy_scale=4.0, learning_rate=3e-3)
-        sac, batch = learner(sharpen_after=sharpen_after, **settings), batch_of()
+    for anneal_after in (0, 10):
+        settings = dict(target_entropy_scale=-0.5, final_entropy_scale=4.0, learning_rate=3e-3)
+        sac, batch = learner(anneal_after=anneal_after, **settings), batch_of()
         for step in range(600):
-            sac.sharpen(step)
-            assert sac.target_entropy == (-8.0 if sharpen_after and step >= sharpen_after else 1.0)  # two actions
+            sac.schedule(step)
+            assert sac.target_entropy == (-8.0 if anneal_after and step >= anneal_after else 1.0)  # two actions
             sac.update(batch)
         entropies.append(sac.metrics()["entropy"])
         temperatures.append(sac.metrics()["temperature"])
     assert temperatures[1] < 0.7 * temperatures[0] and entropies[1] < entropies[0]
 
 
-def test_a_sharpened_learner_takes_smaller_steps():
-    sac = learner(sharpen_after=10, sharp_learning_rate=1e-5)
-    sac.sharpen(9)
+def test_an_annealed_learner_takes_smaller_steps():
+    sac = learner(anneal_after=10, final_learning_rate=1e-5)
+    sac.schedule(9)
     assert sac.critic_optimizer.param_groups[0]["lr"] > 1e-4
-    sac.sharpen(10)
+    sac.schedule(10)
     optimizers = (sac.actor_optimizer, sac.critic_optimizer, sac.alpha_optimizer)
     assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == [1e-5] * 3
     before = sac.critic.head.clone()
@@ -234,11 +222,11 @@ def test_a_sharpened_learner_takes_smaller_steps():
     assert 0 < (sac.critic.head - before).abs().max() < 1.1e-5  # Adam's first step is the learning rate
 
 
-def test_the_sharp_rate_stands_in_for_the_falling_one():
-    sac = learner(sharpen_after=10, sharp_learning_rate=1e-5, rate_half_life=1000)
-    sac.begin_round(9)
+def test_the_final_rate_stands_in_for_the_falling_one():
+    sac = learner(anneal_after=10, final_learning_rate=1e-5, rate_half_life=1000)
+    sac.schedule(9)
     assert 9e-4 < sac.actor_optimizer.param_groups[0]["lr"] < sac.settings.learning_rate
-    sac.begin_round(100)
+    sac.schedule(100)
     optimizers = (sac.actor_optimizer, sac.critic_optimizer, sac.alpha_optimizer)
     assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == [1e-5] * 3
 
@@ -299,18 +287,11 @@ def test_a_run_folder_is_not_mixed_up(tmp_path):
         open_run(tmp_path / "other", config(), True)
 
 
-def test_a_task_whose_returns_have_no_bounds_is_pruned_by_its_curve():
-    """Own tasks and lqr: long trainings of them once died at their 241st checkpoint."""
-    curve = {step: -3.0 + (step % 7) for step in range(1, 400)}
-    gone = prunable_checkpoints(curve, (-math.inf, math.inf))
-    assert 0 < len(gone) < 399 and not {step for step in curve if step > 379} & set(gone)
-    assert prunable_checkpoints(dict.fromkeys(curve, 2.0), (-math.inf, math.inf))  # all alike
-
-
 def test_multipliers_of_any_size_begin_as_they_were_set(tmp_path):
     starts = dict(initial_temperature=1e-3, initial_multiplier_mean=1.0, initial_multiplier_std=1000.0)
     run = RunConfig(task="cheetah-run", algorithm="mpo", steps=96, seed=0, settings=starts | dict(compile=False))
-    duals = MpoRun(tmp_path, run).learner().duals
+    made = Run(tmp_path, run)
+    duals = Mpo(made.header, made.settings, 0).duals
     np.testing.assert_allclose(torch.nn.functional.softplus(duals).detach().numpy(), list(starts.values()), rtol=1e-3)
 
 
@@ -328,14 +309,21 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
     "arguments, words",
     [
         (["walker-fly"], "walker-walk"),
-        (["walker-walk", "--algo", "dreamer"], "Known: guided, mpo, ppo, sac, sb3-sac, td3, tqc."),
-        (["walker-walk", "--set", "speed=3"], "learning_rate"),
-        (["walker-walk", "--algo", "ppo", "--set", "buffer_size=3"], "clip_range"),
-        (["walker-walk", "--set", "foo=1"], "clipped, compile and 25 more; --list-settings lists them all."),
+        (["walker-walk", "--algo", "dreamer"], "Known: guided, mpo, sac, sb3:PPO, sb3:SAC, sb3:TD3."),
+        (["walker-walk", "--set", "learning_rat=3"], "Did you mean 'learning_rate'?"),
+        (["walker-walk", "--algo", "sb3:PPO", "--set", "buffer_size=3"], "clip_range"),
+        (["walker-walk", "--algo", "sb3:PPPO"], "Did you mean 'PPO'?"),
+        (["walker-walk", "--set", "foo=1"], "clipped and 25 more; --list-settings lists them all."),
         (["walker-walk", "--set", "speed"], "key=value"),
         (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),
         (["walker-walk", "--set", "actor_hidden=wide"], "the default is (256, 256)"),
-        (["walker-walk", "--algo", "td3", "--set", "batch_size=0"], "greater than 0"),
+        (
+            ["walker-walk", "--algo", "sb3:DQN", "--steps", "80"],
+            "sb3:DQN does not accept this: The algorithm only supports",
+        ),
+        (["walker-walk", "--algo", "sb3:RecurrentPPO", "--steps", "80"], "does not accept this"),
+        (["walker-walk", "--algo", "sb3:CrossQ", "--steps", "80"], "which is no part of a plain MLP"),
+        (["walker-walk", "--algo", "sb3:SAC", "--init-from", POLICY], "--init-from has no effect"),
         (
             ["walker-walk", "--set", "critic_hidden=[]"],
             "setting critic_hidden of sac is []: tuple should have",
@@ -345,7 +333,6 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
         (["walker-walk", "--steps", "0"], "x>=1"),
         (["walker-walk", "--steps", "100"], "all warm-up (5000 steps)"),
         (["walker-walk", "--steps", "4000", "--init-from", POLICY], "or less warm-up: --set warmup_steps=N"),
-        (["walker-walk", "--algo", "td3", "--steps", "4000"], "or less warm-up: --set learning_starts=N"),
         (["walker-walk", "--steps", "5080", "--set", "updates_per_step=0.01"], "come to 0.88 updates"),
         (["walker-walk", "--steps", "5001", "--set", "simulations=1", "--set", "actor_every=9"], "changes after 9"),
         (["ant-maze-easy7x7a", "--algo", "guided", "--steps", "9", "--set", "simulations=3"], "come to 0.54 updates"),
@@ -378,14 +365,14 @@ def test_a_resumed_run_keeps_what_is_not_given_and_refuses_what_differs():
         run_config("cheetah-run", "sac", {}, found, seed=5),
         run_config("cheetah-run", "sac", {"discount": 0.9}, found),
         run_config("walker-walk", "sac", {}, found),
-        run_config("cheetah-run", "td3", {}, found),
+        run_config("cheetah-run", "mpo", {}, found),
     ):
         with pytest.raises(DmcvbError, match="holds a run with"):
             check_same("runs/x", found, changed)
 
 
 def test_the_class_and_the_config_name_the_same_run(tmp_path):
-    assert SacRun(tmp_path, config()).header.command.startswith(
+    assert Run(tmp_path, config()).header.command.startswith(
         "dmcvb-gen train-behaviour cheetah-run --algo sac --steps 160"
     )
 
@@ -393,7 +380,7 @@ def test_the_class_and_the_config_name_the_same_run(tmp_path):
 def test_a_policy_says_what_it_started_from_but_not_where_that_lay(tmp_path):
     source = tmp_path / "home of somebody" / "own.safetensors"
     source.parent.mkdir()
-    actor = SacRun(tmp_path / "actor", config()).learner().actor
+    actor = learner_of(tmp_path, config()).actor
     save_policy(source, actor.header, as_arrays(actor.state_dict()))
     first = sha256_file(source)
     run = open_run(tmp_path / "run", config(init_from=str(source)), resume=False)
@@ -414,7 +401,7 @@ def test_a_policy_says_what_it_started_from_but_not_where_that_lay(tmp_path):
 
 
 def test_a_policy_that_does_not_fit_begins_no_run(tmp_path):
-    actor = SacRun(tmp_path / "actor", config(settings=TINY | {"actor_hidden": [24]})).learner().actor
+    actor = learner_of(tmp_path, config(settings=TINY | {"actor_hidden": [24]})).actor
     save_policy(tmp_path / "wide.safetensors", actor.header, as_arrays(actor.state_dict()))
     with pytest.raises(DmcvbError, match="do not fit"):
         open_run(tmp_path / "run", config(init_from=str(tmp_path / "wide.safetensors")), resume=False)
@@ -439,7 +426,7 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
         return evaluate(policy, task, 2, **given)
 
     monkeypatch.setattr(runs, "evaluate", counted)
-    run = open_run(tmp_path / "run", config(task=task_id, steps=1600, evaluate_every=400, evaluate_sparse=400), False)
+    run = open_run(tmp_path / "run", config(task=task_id, steps=1600, evaluate_every=400), False)
     run.train()
     share = runs.EVALUATION_STEPS[run.task.family]
     assert len(asked) == 4 and all(run.task.max_steps <= steps <= share * 400 for steps in asked)
@@ -451,8 +438,8 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
 @pytest.mark.parametrize(
     ("task", "setting", "words"),
     [
-        ("walker-walk", "sunken_starts", "only for ant mazes"),
-        ("cheetah-run", "progress", "only for ant mazes"),
+        ("walker-walk", "low_spawn_fraction", "only for ant mazes"),
+        ("cheetah-run", "path_reward_scale", "only for ant mazes"),
         ("cheetah-run", "shaping", "only for humanoid-walk and ant mazes"),
         ("ant-maze-easy7x7b", "standing_starts", "only for bodies that move freely"),
         ("cartpole-swingup", "standing_starts", "only for bodies that move freely"),
@@ -469,11 +456,11 @@ def test_a_setting_that_the_task_has_no_use_for_begins_no_run(tmp_path, task, se
 
 def test_what_only_mazes_have(tmp_path):
     """Ants may start sunken in the floor, walkers may not; a share of the simulations acts by the mean."""
-    settings = TINY | dict(mean_share=0.5, sunken_starts=1.0, shaping=1.0, train_episode_steps=6)
+    settings = TINY | dict(greedy_fraction=0.5, low_spawn_fraction=1.0, shaping=1.0, train_episode_steps=6)
     asked = config(task="ant-maze-easy7x7a", steps=96, evaluate_every=96, settings=settings)
     open_run(tmp_path / "run", asked, False).train()
     assert len(list((tmp_path / "run" / "checkpoints").iterdir())) == 1
-    sac = learner(mean_share=0.5)
+    sac = learner(greedy_fraction=0.5)
     observation = np.zeros((8, 3), np.float32)
     first, second = sac.act(observation), sac.act(observation)
     np.testing.assert_array_equal(first[:4], second[:4])

@@ -1,0 +1,511 @@
+"""A run's folder: its configuration, log, checkpoints and the state that it resumes from, whatever trains it.
+
+A run folder holds
+
+    run.json                              what is trained; only its number of steps changes
+    checkpoints/<agent step>.safetensors  a policy file an evaluation, and one where the run was stopped
+    progress.csv, tensorboard/            a row, a point an evaluation
+    resume/state.safetensors              learner, replay buffer, simulations, random states
+    selected/, selection.json, curve.png  written by the selection
+
+The state is saved every ten minutes, at Ctrl-C and at the end, aside and renamed, so that a process that dies or a disk
+that fills up leaves the previous one. What was logged after it is dropped when a run goes on, and made again: with the
+same versions of torch and numpy, the same processor and one thread, a run of the package's own algorithms that was
+stopped or killed gives the same bits as one that never was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import shlex
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import filelock
+import numpy as np
+import torch
+
+from dmcvb_gen.dataset.manifest import environment, write_json_atomically
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import remove_partial, sha256_file, write_bytes
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.evaluation import evaluate
+from dmcvb_gen.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, MazeName
+from dmcvb_gen.state_file import STATE, pack_state, read_state_file
+from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training.episodes import useless_setting
+from dmcvb_gen.training.networks import as_arrays, as_tensors
+from dmcvb_gen.training.run_log import RunLog, read_rows
+from dmcvb_gen.training.settings import algorithm_module, check_settings
+
+EVALUATION_EPISODES = 20
+"""Episodes of an evaluation along the way, at most; selection evaluates its picks again on 100."""
+EVALUATION_STEPS = {LOCOMOTION: 8.0, ANT_MAZE: 4.0}
+"""Agent steps simulated in evaluations for each one trained, at most: about a fifth of a run's time. Counted in steps,
+not in seconds, so that a run gives the same bits however busy its machine is."""
+SAVE_SECONDS = 600
+"""Seconds after which the state to resume from is saved again: a process that is killed loses these."""
+
+FREE = ("steps", "settings", "init_sha256")
+"""Fields of a run's configuration in which one that goes on need not be written as it was."""
+
+Weights = Mapping[str, torch.Tensor]
+Report = Callable[["Progress"], None]
+ProgressCallback = Callable[[int], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """Config of a run, in its run.json; a run that goes on must have the same, but for `FREE`.
+
+    Attributes:
+      steps: agent steps (at action repeat 2) to train; a resumed run may have more.
+      evaluate_every: agent steps between evaluations, and so between checkpoints.
+      init_from: policy file or run whose actor, critics and normalization it starts from.
+      init_sha256: of that file as it was when the run began, if it is a file.
+    """
+
+    task: str
+    algorithm: str
+    steps: int
+    seed: int
+    settings: dict[str, Any]
+    evaluate_every: int = 2_000
+    init_from: str | None = None
+    init_sha256: str | None = None
+
+    @property
+    def init_name(self) -> str | None:
+        """Return the last name of the path that a run starts from; the rest is private to the machine."""
+        return self.init_from and Path(os.path.abspath(self.init_from)).name
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """One evaluation along the way; seconds are of training, evaluations left out."""
+
+    step: int
+    evaluation: Evaluation
+    seconds: float
+    steps_per_second: float
+    updates_per_second: float = 0.0
+
+
+class Stopped(DmcvbError):
+    """A run that was asked to stop, and that saved all it had."""
+
+
+def command_of(config: RunConfig) -> str:
+    """The command line that trains this run again."""
+    parts = [f"dmcvb-gen train-behaviour {shlex.quote(config.task)} --algo {config.algorithm} --steps {config.steps}"]
+    parts.append(f"--seed {config.seed}")
+    parts.append(f"--evaluate-every {config.evaluate_every}")
+    if config.init_from:
+        parts.append(f"--init-from {shlex.quote(config.init_from)}")
+    pairs = (f"{name}={json.dumps(value)}" for name, value in sorted(config.settings.items()))
+    parts += [f"--set {shlex.quote(pair)}" for pair in pairs]
+    return " ".join(parts)
+
+
+def read_config(folder: str | Path) -> RunConfig | None:
+    """Return the config of the run in a folder; None if there is no run.
+
+    Raises:
+      DmcvbError: run.json is damaged, or an older version's.
+    """
+    path = Path(folder) / "run.json"
+    if not path.exists():
+        return None
+    try:
+        return RunConfig(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise DmcvbError(
+            f"{path} is not a run's configuration ({error}); choose another --out, or go on with "
+            "the version that began it"
+        ) from None
+
+
+def read_state(folder: str | Path) -> dict[str, Any] | None:
+    """Read the state that a run saved in its folder; None if it has saved nothing yet.
+
+    Raises:
+      DmcvbError: the file is damaged.
+    """
+    path = Path(folder) / "resume" / STATE
+    return read_state_file(path, "start again with another --out") if path.exists() else None
+
+
+def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:
+    """Refuse to mix two configurations in one folder; only `steps` may differ.
+
+    What the run started from is as it was then, whatever lies there by now. Settings are compared with their defaults
+    filled in, so that naming a default is no difference.
+    """
+    was, now = (
+        {name: value for name, value in vars(config).items() if name not in FREE}
+        | dataclasses.asdict(check_settings(config.algorithm, config.settings))
+        for config in (found, asked)
+    )
+    for name in was | now:
+        if was.get(name) != now.get(name):
+            raise DmcvbError(
+                f"{folder} holds a run with {name} {was.get(name)!r}, asked for {now.get(name)!r}; "
+                "choose another --out, or repeat its settings"
+            )
+
+
+class Run:
+    """A run in a folder; `train` starts it or goes on.
+
+    Attributes:
+      settings: the algorithm's checked settings.
+      header: header of its policy files, without evaluation and agent step.
+      step: agent steps so far.
+      seconds: seconds of training so far, without evaluations.
+      tick: called with the agent steps made since the last call.
+      episodes_at_most, evaluation_steps: of an evaluation; agent steps simulated in evaluations for each one trained.
+    """
+
+    def __init__(self, folder: str | Path, config: RunConfig):
+        self.folder, self.config = Path(folder), config
+        self.task = get_task(config.task)
+        self.algorithm = algorithm_module(config.algorithm)
+        self.settings = check_settings(config.algorithm, config.settings)
+        self.evaluation_steps = getattr(self.algorithm, "EVALUATION_STEPS", EVALUATION_STEPS[self.task.family])
+        self.episodes_at_most = EVALUATION_EPISODES * getattr(self.algorithm, "TIMES_MORE_EPISODES", 1)
+        network = self.algorithm.network(self)
+        origin = {"init_from": config.init_name}
+        if config.init_sha256:
+            origin["init_sha256"] = config.init_sha256
+        settings = dataclasses.asdict(self.settings)
+        self.header = PolicyHeader(
+            task=self.task.id,
+            observation=self.task.observation,
+            observation_size=self.task.behaviour_size,
+            action_size=self.task.action_size,
+            algorithm=config.algorithm,
+            agent_step=0,
+            training={"settings": settings, "seed": config.seed, **origin, "environment": environment()}
+            | network.pop("training", {}),
+            command=command_of(dataclasses.replace(config, init_from=config.init_name)),
+            **network,
+        )
+        self.step, self.seconds, self._step_before = 0, 0.0, 0
+        self._began = self._last_saved = time.time()
+        self._asked_to_stop = False
+        self._log: RunLog | None = None
+        self._report: Report = lambda progress: None
+        self.tick: ProgressCallback = lambda steps: None
+
+    @property
+    def begun(self) -> bool:
+        """True if there is a state to resume from; such a run never reads again what it started from."""
+        return (self.folder / "resume" / STATE).exists()
+
+    def saved(self) -> dict[str, Any] | None:
+        """The state to resume from (tensors, numbers and texts only), None if nothing is saved yet."""
+        return read_state(self.folder)
+
+    # -- what callers use -------------------------------------------------------------------
+
+    def train(
+        self,
+        report: Report = lambda progress: None,
+        tick: ProgressCallback = lambda steps: None,
+        stopping: Callable[[], Any] = lambda: None,
+    ) -> None:
+        """Train until `config.steps` agent steps, or until Ctrl-C or SIGTERM, which save the run.
+
+        Args:
+          report: called with every evaluation.
+          tick: called with the agent steps made since the last call.
+          stopping: called when a signal asks the run to stop; it saves after the step that it is at.
+
+        Raises:
+          Stopped: a signal asked for it; everything is saved.
+          DmcvbError: another process trains in the folder, or its disk is full (the last saved state is whole).
+        """
+        self._report, self.tick = report, tick
+        with self._writing():
+            for name in ("checkpoints", "resume"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+            with self._alone():
+                self.write_config()
+                saved = self.saved()
+                if not saved:
+                    self._refuse_lost_state()
+                self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
+                self._drop_later_checkpoints()
+                self._log = RunLog(self.folder, self.step)
+                self._began = self._last_saved = time.time()
+                try:
+                    with self._stopping_on_signals(stopping):
+                        self.algorithm.train(self)
+                finally:
+                    self._log.close()
+
+    def write_config(self) -> None:
+        """Write run.json.
+
+        Raises:
+          DmcvbError: another process has begun another run in the folder.
+        """
+        if found := read_config(self.folder):
+            check_same(self.folder, found, self.config)
+        write_json_atomically(self.folder / "run.json", json.loads(json.dumps(dataclasses.asdict(self.config))))
+
+    def resume_command(self) -> str:
+        """The command line that resumes this run."""
+        what = [self.config.task]
+        maze = MazeName.parse(self.config.task)
+        if maze and maze.rows and not maze.reward:  # the layout's name is short, its rows are not
+            path = self.folder / f"{maze.layout}.txt"
+            path.write_text(maze.rows.replace("/", "\n").replace(".", " ") + "\n")
+            what = ["--layout", str(path)]
+        return shlex.join(["dmcvb-gen", "train-behaviour", *what, "--out", str(self.folder), "--resume"])
+
+    # -- what algorithms use ----------------------------------------------------------------
+
+    def advance(self, steps: int) -> None:
+        """Count agent steps that were just made."""
+        self._step_before, self.step = self.step, self.step + steps
+        self.tick(steps)
+
+    def evaluation_is_due(self) -> bool:
+        """True if the last steps passed a multiple of `evaluate_every`, or the end."""
+        every = self.config.evaluate_every
+        return self.step >= self.config.steps or self.step // every > self._step_before // every
+
+    def record(self, weights: Weights, updates: int, metrics: Mapping[str, float]) -> None:
+        """Evaluate the actor's `weights`, write them as a checkpoint, log; evaluations are not training time."""
+        assert self._log is not None
+        self.seconds += time.time() - self._began
+        policy = Policy(self.header, as_arrays(weights), "")
+        evaluation, _ = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
+        self._write_checkpoint(policy, evaluation)
+        self._log.add(self.step, evaluation, self.seconds, updates, metrics)
+        seconds = max(self.seconds, 1e-9)
+        self._report(Progress(self.step, evaluation, self.seconds, self.step / seconds, updates / seconds))
+        self._began = time.time()
+
+    def evaluation_episodes(self) -> int:
+        """Episodes of the evaluation after the steps trained since the one before, so that all keep to their share."""
+        before = self._log.curve if self._log else {}
+        since = self.step - max((step for step in before if step < self.step), default=0)
+        return int(np.clip(self.evaluation_steps * since / self.task.max_steps, 1, self.episodes_at_most))
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Put the state to resume from in place of the previous one, whole or not at all."""
+        seconds = self.seconds + time.time() - self._began
+        write_bytes(self.folder / "resume" / STATE, pack_state(state | {"step": self.step, "seconds": seconds}))
+        self._last_saved = time.time()
+
+    def checkpoint_if_due(self, state: Callable[[], dict[str, Any]], weights: Callable[[], Weights]) -> None:
+        """Save the run if it is time to, or if it was asked to stop; called where a resumed run can begin.
+
+        Args:
+          state: gives what `save` takes. weights: gives the actor's weights.
+
+        Raises:
+          Stopped: it was asked to stop; its state is saved, and a checkpoint of this step is there.
+        """
+        if not self._asked_to_stop:
+            if time.time() - self._last_saved > SAVE_SECONDS:
+                self.save(state())
+            return
+        self.save(state())
+        if not self._checkpoint(self.step).exists():
+            self._write_checkpoint(Policy(self.header, as_arrays(weights()), ""), None)
+        command = f"--behaviour {shlex.quote(str(self.folder))}@latest"
+        raise Stopped(
+            f"stopped at step {self.step:,}, and saved; resume: {self.resume_command()}; "
+            f"{command} takes this checkpoint"
+        )
+
+    # -- the folder -------------------------------------------------------------------------
+
+    def _checkpoint(self, step: int) -> Path:
+        return self.folder / "checkpoints" / f"{step:010d}.safetensors"
+
+    def _write_checkpoint(self, policy: Policy, evaluation: Evaluation | None) -> None:
+        trained = policy.header.training | {"seconds": round(self.seconds, 1)}
+        facts = {"agent_step": self.step, "evaluation": evaluation, "training": trained}
+        save_policy(self._checkpoint(self.step), policy.header.model_copy(update=facts), policy.weights)
+
+    def _drop_later_checkpoints(self) -> None:
+        for path in (self.folder / "checkpoints").glob("[0-9]*.safetensors"):
+            if int(path.stem) > self.step:
+                path.unlink()
+        for folder in ("checkpoints", "resume"):
+            for path in (self.folder / folder).glob("*.partial"):
+                path.unlink()
+            remove_partial(self.folder / folder)
+
+    def _refuse_lost_state(self) -> None:
+        """Raise if a run has trained for longer than it takes to save it, and its saved state is gone."""
+        rows = read_rows(self.folder)
+        if rows and float(rows[-1]["seconds"] or 0) > 2 * SAVE_SECONDS:
+            raise DmcvbError(
+                f"{self.folder} has checkpoints, but nothing to resume from (resume/{STATE} is gone); choose another "
+                "--out, or delete checkpoints/ and progress.csv to begin anew"
+            )
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """One process a folder; the lock ends with the process, however that ends."""
+        lock = filelock.FileLock(self.folder / "resume" / "lock", timeout=0)
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            raise DmcvbError(f"another process trains in {self.folder}; wait for it, or choose another --out") from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DmcvbError(
+                f"cannot write the run in {self.folder}: {error.strerror or error}; the previous saved state is whole, "
+                "make room and go on with --resume"
+            ) from None
+
+    @contextlib.contextmanager
+    def _stopping_on_signals(self, stopping: Callable[[], Any]) -> Iterator[None]:
+        """Ctrl-C and SIGTERM ask the run to stop; more of them change nothing, so a save is never cut off."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def stop(*_: Any) -> None:
+            if not self._asked_to_stop:
+                stopping()
+            self._asked_to_stop = True
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def too_few_updates(run: Run, warmup: int, needed: int = 1) -> None:
+    """Refuse a run whose steps are all warm-up, or whose updates come to less than the policy needs to change once.
+
+    Args:
+      warmup: agent steps before the first update; `updates_per_step` come for every one after.
+      needed: updates until the policy changes.
+    """
+    steps, together, rate = run.config.steps, run.settings.simulations, run.settings.updates_per_step
+    if steps <= warmup:
+        raise DmcvbError(
+            f"{steps} steps are all warm-up ({warmup} steps), nothing would be learned; give more --steps, or less "
+            "warm-up: --set warmup_steps=N"
+        )
+    rounds = -(-steps // together) - max(-(-warmup // together), 1) + 1
+    if rounds * together * rate < needed:
+        raise DmcvbError(
+            f"{steps} steps come to {rounds * together * rate:.3g} updates and the policy changes after {needed}, so "
+            "nothing would be learned; give more --steps, or a higher --set updates_per_step"
+        )
+
+
+def start_from(learner: Any, run: Run) -> None:
+    """Take networks and normalization of the run that `init_from` names, or the actor alone of a policy file.
+
+    Raises:
+      DmcvbError: their shapes differ, the policy's network computes something else, or nothing is saved there.
+    """
+    source = str(run.config.init_from)
+    try:
+        if not Path(source).is_dir():
+            learner.load_actor(as_tensors(policy_to_start_from(source, run.header).weights))
+            return
+        config = read_config(source)
+        saved = read_state(source) if config and config.algorithm == run.config.algorithm else None
+        if not saved:
+            raise DmcvbError(
+                f"--init-from {source}: no run of {run.config.algorithm} is saved there; give its folder or a "
+                "policy file"
+            )
+        learner.load_networks(saved["learner"])
+    except (RuntimeError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DmcvbError(f"--init-from {source}: its networks do not fit these settings and task ({reason})") from None
+
+
+def policy_to_start_from(source: str | Path, header: PolicyHeader) -> Policy:
+    """The policy file that a run starts from.
+
+    Args:
+      header: of the run's own policies.
+
+    Raises:
+      DmcvbError: its network computes something else than the run's, though its weights may fit.
+    """
+    policy = load_policy(source)
+    for field in ("activation", "layer_norm", "way"):
+        theirs, ours = getattr(policy.header, field), getattr(header, field)
+        if theirs != ours:
+            raise DmcvbError(
+                f"--init-from {source}: its network has {field} {theirs} and that of {header.algorithm} {ours}, so it "
+                "would act otherwise; start from a policy of the same kind"
+            )
+    return policy
+
+
+def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
+    """A run in a folder: a new one, or the one that is there with `resume`.
+
+    Raises:
+      DmcvbError: the folder holds another configuration, or a run and `resume` was not asked for; settings are
+        unknown or wrong; there is too little room on the disk.
+    """
+    folder = local_path(folder)
+    found = read_config(folder)
+    if found:
+        if not resume:
+            raise DmcvbError(f"{folder} holds a run already; go on with --resume, or choose another --out")
+        check_same(folder, found, config)
+    elif folder.is_file() or (folder.exists() and any(folder.iterdir())):
+        raise DmcvbError(f"{folder} is not empty and holds no run; choose another --out")
+    digest = _digest_of_start(folder, config, found)
+    run = Run(folder, dataclasses.replace(config, init_sha256=found.init_sha256 if found else digest))
+    if problem := useless_setting(run.task, run.settings):
+        raise DmcvbError(problem)
+    run.algorithm.check(run)
+    with storage_errors(folder, "write to"):
+        folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < 1e9:
+            raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")
+        if not found:  # a run that goes on writes it once it is alone in the folder
+            run.write_config()
+    return run
+
+
+def _digest_of_start(folder: Path, config: RunConfig, found: RunConfig | None) -> str | None:
+    """SHA-256 of the policy file that a run starts from, None if it starts from none; refuses one that is not there."""
+    source = config.init_from
+    if not source or (found and (folder / "resume" / STATE).exists()):
+        return None
+    if not Path(source).is_file() and not read_config(source):
+        raise DmcvbError(f"--init-from {source} is neither a run folder nor a policy file")
+    digest = sha256_file(source) if Path(source).is_file() else None
+    if found and digest and found.init_sha256 not in (None, digest):
+        raise DmcvbError(f"{source} is no longer the file that {folder} began with; choose another --out")
+    return digest
