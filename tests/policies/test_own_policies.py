@@ -212,6 +212,24 @@ def test_an_sb3_policy_acts_as_sb3_does(task, name, named, tmp_path):
     np.testing.assert_allclose(load_policy(tmp_path / "p.safetensors").act(seen, None, True), theirs, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", SB3)
+def test_an_sb3_policy_acts_in_the_tasks_own_bounds(name, tmp_path):
+    """Quadruped's are not -1 to 1; SB3 scales SAC's and TD3's actions to them, and cuts PPO's off there."""
+    task = get_task("quadruped-walk")
+    space, (algorithm, arguments) = Space(task), SB3[name]
+    space.action_space = gymnasium.spaces.Box(task.action_low, task.action_high, dtype=np.float32)
+    made = algorithm("MlpPolicy", space, seed=0, device="cpu", **arguments)
+    for parameter in made.policy.parameters():
+        parameter.data *= 4  # so that some actions are at the bounds
+    made.save(tmp_path / "model.zip")
+    save_policy(tmp_path / "p.safetensors", *convert(tmp_path / "model.zip", task.id))
+    seen = np.random.default_rng(0).normal(size=(50, task.behaviour_size)).astype(np.float32)
+    theirs, _ = made.predict(seen, deterministic=True)
+    ours = task.from_unit(load_policy(tmp_path / "p.safetensors").act(seen, None, True))
+    np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    assert (theirs.max(0) > 1.05).any() or (theirs.min(0) > -0.85).any()
+
+
 class Doubled(FlattenExtractor):
     def forward(self, observations):
         return 2 * super().forward(observations)
