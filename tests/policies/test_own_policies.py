@@ -501,6 +501,31 @@ def test_mixed_policies_are_the_numbered_files_alone(tmp_path):
     assert "no numbered mixed policy" in line
 
 
+def test_one_checkpoint_of_a_run_is_named_by_its_step(tmp_path, caplog):
+    run, odd = tmp_path / "run", tmp_path / "x@latest"
+    for folder, steps in ((run, (600, 1200)), (odd, (300,))):
+        (folder / "checkpoints").mkdir(parents=True)
+        for step in steps:
+            (folder / "checkpoints" / f"{step:010d}.safetensors").write_bytes(b"")
+    for name, step in (("latest", 1200), ("600", 600)):
+        [path] = resolve_policies(WALKER, "expert", f"{run}@{name}")
+        assert path == run / "checkpoints" / f"{step:010d}.safetensors"
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{run}@latest is the checkpoint of agent step 1,200."
+    ]
+    for name in ("700", "first", ""):
+        with pytest.raises(DmcvbError, match=rf"no checkpoint '{name}'; give latest, or an agent step .*\[600, 1200\]"):
+            resolve_policies(WALKER, "expert", f"{run}@{name}")
+    with pytest.raises(DmcvbError, match=r"run `dmcvb-gen select-checkpoints .*` first, or give one .*x@latest@latest"):
+        resolve_policies(WALKER, "expert", odd)
+    with pytest.raises(DmcvbError, match="neither a policy file, a run folder nor"):
+        resolve_policies(WALKER, "expert", f"{tmp_path / 'nowhere'}@latest")
+    (run / "checkpoints" / "0000000600.safetensors").unlink()
+    (run / "checkpoints" / "0000001200.safetensors").unlink()
+    with pytest.raises(DmcvbError, match="has no checkpoint yet"):
+        resolve_policies(WALKER, "expert", f"{run}@latest")
+
+
 # -- returns --------------------------------------------------------------------------------------
 
 
