@@ -82,6 +82,12 @@ def levels_of(behaviour: str | Path) -> list[str]:
     raise _nothing_in(path, None)
 
 
+def checkpoints(run: str | Path) -> dict[int, Path]:
+    """Agent step -> checkpoint of a run."""
+    files = Path(run, "checkpoints").glob("[0-9]*.safetensors")
+    return {int(path.stem): path for path in files if path.stem.isdecimal()}
+
+
 def checkpoint_of(behaviour: str | Path) -> Path | None:
     """The checkpoint that RUN@latest or RUN@STEP names; None of a name of another form.
 
@@ -91,7 +97,7 @@ def checkpoint_of(behaviour: str | Path) -> Path | None:
     run, _, asked = str(behaviour).rpartition("@")
     if not Path(run, "checkpoints").is_dir() or not run or Path(behaviour).exists():
         return None
-    files = {int(path.stem): path for path in Path(run, "checkpoints").glob("[0-9]*.safetensors")}
+    files = checkpoints(run)
     if not files:
         raise PolicyFileError(f"{run} has no checkpoint yet; train it longer")
     if asked == "latest":

@@ -37,6 +37,7 @@ from dmcvb_gen.dataset.manifest import environment, write_json_atomically
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, sha256_file, write_bytes
 from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.bundled import checkpoints
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
@@ -344,8 +345,8 @@ class Run:
         save_policy(self._checkpoint(self.step), policy.header.model_copy(update=facts), policy.weights)
 
     def _drop_later_checkpoints(self) -> None:
-        for path in (self.folder / "checkpoints").glob("[0-9]*.safetensors"):
-            if int(path.stem) > self.step:
+        for step, path in checkpoints(self.folder).items():
+            if step > self.step:
                 path.unlink()
         for folder in ("checkpoints", "resume"):
             for path in (self.folder / folder).glob("*.partial"):

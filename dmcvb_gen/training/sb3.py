@@ -19,7 +19,6 @@ import sb3_contrib
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
@@ -49,22 +48,19 @@ def algorithm_class(algorithm: str) -> type[BaseAlgorithm]:
     Raises:
       UnknownNameError: neither package has it.
     """
-    found = {name: value for package in (sb3_contrib, stable_baselines3) for name, value in vars(package).items()}
-    known = {
-        name: value for name, value in found.items() if isinstance(value, type) and issubclass(value, BaseAlgorithm)
-    }
     name = algorithm.removeprefix(SB3)
-    if name not in known:
-        raise UnknownNameError("algorithm of Stable-Baselines3", name, sorted(known))
-    return known[name]
+    kind = getattr(sb3_contrib, name, None) or getattr(stable_baselines3, name, None)
+    if not (isinstance(kind, type) and issubclass(kind, BaseAlgorithm)):
+        known = [*stable_baselines3.__all__, *sb3_contrib.__all__]
+        raise UnknownNameError("algorithm of Stable-Baselines3", name, known)
+    return kind
 
 
 def settings_class(algorithm: str) -> type:
     """A data class of the arguments of an algorithm, with their defaults, documented as SB3 documents them."""
     kind = algorithm_class(algorithm)
-    defaults = {
-        name: value.default for name, value in inspect.signature(kind).parameters.items() if name not in NOT_SET
-    }
+    given = inspect.signature(kind).parameters
+    defaults = {name: value.default for name, value in given.items() if name not in NOT_SET}
     values = OURS | defaults
     fields = [(name, Any, dataclasses.field(default=value)) for name, value in values.items()]
     lines = re.findall(r":param (\w+): (.+(?:\n(?!\s*:).+)*)", kind.__doc__ or "")
@@ -96,8 +92,6 @@ def make_model(run: Run) -> BaseAlgorithm:
       DmcvbError: SB3 does not accept the settings.
     """
     given = {name: value for name, value in vars(run.settings).items() if name not in OURS}
-    if "buffer_size" in given:
-        given["buffer_size"] = max(min(given["buffer_size"], run.config.steps), run.settings.simulations)
     if isinstance(noise := given.get("action_noise"), int | float):
         given["action_noise"] = NormalActionNoise(np.zeros(run.task.action_size), np.full(run.task.action_size, noise))
     env: Any = TaskVecEnv(run.task, run.settings.simulations, run.config.seed)
@@ -127,39 +121,17 @@ def export(run: Run, model: BaseAlgorithm) -> tuple[dict[str, torch.Tensor], dic
     return as_tensors(weights), built | {"clip_observation": 10.0 if normalize and normalize.norm_obs else UNCLIPPED}
 
 
-class Trainer(BaseCallback):
-    """After every step of all simulations: counts it, evaluates and saves if it is time to."""
-
-    def __init__(self, run: Run):
-        super().__init__()
-        self.run_ = run
-
-    def _on_step(self) -> bool:
-        run, model = self.run_, self.model
-        run.advance(self.training_env.num_envs)
-        if run.evaluation_is_due():
-            logged = {name.removeprefix("train/"): value for name, value in model.logger.name_to_value.items()}
-            metrics = {name: float(value) for name, value in logged.items() if np.isscalar(value)}
-            run.record(export(run, model)[0], model._n_updates, metrics)
-        run.checkpoint_if_due(lambda: state_of(model), lambda: export(run, model)[0])
-        return run.step < run.config.steps
-
-
 def state_of(model: BaseAlgorithm) -> dict[str, Any]:
     """What a run goes on from."""
     variables = {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
     state: dict[str, Any] = {"parameters": model.get_parameters(), "variables": variables}
     if normalize := model.get_vec_normalize_env():
-        names = [name for name in ("obs_rms", "ret_rms") if hasattr(normalize, name)]
-        state["norms"] = {name: [torch.as_tensor(v) for v in _moments(getattr(normalize, name))] for name in names}
+        norms = {name: getattr(normalize, name) for name in ("obs_rms", "ret_rms") if hasattr(normalize, name)}
+        state["norms"] = {n: [torch.as_tensor(v) for v in (rms.mean, rms.var, rms.count)] for n, rms in norms.items()}
     if buffer := getattr(model, "replay_buffer", None):
         state["buffer"] = {name: torch.from_numpy(getattr(buffer, name)[: buffer.size()]) for name in BUFFER}
         state |= {"position": buffer.pos, "full": buffer.full}
     return state
-
-
-def _moments(running: Any) -> tuple[Any, ...]:
-    return running.mean, running.var, running.count
 
 
 def restore(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
@@ -171,11 +143,9 @@ def restore(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
         running = getattr(model.get_vec_normalize_env(), name)
         running.mean, running.var, running.count = (value.numpy().copy() for value in moments)
     if "buffer" in saved:
-        buffer, rows = model.replay_buffer, len(saved["buffer"]["rewards"])
         for name, value in saved["buffer"].items():
-            getattr(buffer, name)[:rows] = value.numpy()[: buffer.buffer_size]
-        grown = saved["full"] and buffer.buffer_size > rows
-        buffer.pos, buffer.full = (rows, False) if grown else (saved["position"], saved["full"])
+            getattr(model.replay_buffer, name)[: len(value)] = value.numpy()
+        model.replay_buffer.pos, model.replay_buffer.full = saved["position"], saved["full"]
     model.num_timesteps = saved["step"]
 
 
@@ -185,6 +155,16 @@ def train(run: Run) -> None:
     run.header = run.header.model_copy(update=export(run, model)[1])
     if saved := run.saved():
         restore(model, saved)
+
+    def after_step(*_: Any) -> bool:
+        run.advance(run.settings.simulations)
+        if run.evaluation_is_due():
+            logged = {name.removeprefix("train/"): value for name, value in model.logger.name_to_value.items()}
+            metrics = {name: float(value) for name, value in logged.items() if np.isscalar(value)}
+            run.record(export(run, model)[0], model._n_updates, metrics)
+        run.checkpoint_if_due(lambda: state_of(model), lambda: export(run, model)[0])
+        return run.step < run.config.steps
+
     if run.step < run.config.steps:
-        model.learn(run.config.steps - run.step, Trainer(run), log_interval=None, reset_num_timesteps=False)
+        model.learn(run.config.steps - run.step, after_step, log_interval=None, reset_num_timesteps=False)
     run.save(state_of(model))

@@ -209,13 +209,13 @@ def pick_checkpoints(
     if not curve or not way > 0:
         return Selection(task, base, convergence, {}, dict.fromkeys(levels, _nothing(curve, base, convergence)))
     found: dict[str, tuple[Pick, ...] | str] = {}
-    if costs and convergence.value < 0:  # 95 % of the way from a random policy's return costs half again as much
+    if not convergence.converged:
+        found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
+    elif costs and convergence.value < 0:  # 95 % of the way from a random policy's return costs half again as much
         goal = convergence.value / EXPERT_SHARE
         found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check)
     else:
         found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check)
-    if not convergence.converged:
-        found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
     last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
     before = [point for point in curve if point[0] <= last]
     if medium is None:
@@ -391,28 +391,20 @@ def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> 
     """The learning curve with the picks marked, a PNG."""
     colors = {"expert": "tab:green", "medium": "tab:orange", "mixed": "tab:red"}
     with _curve_figure(curve, selection.task, path) as axes:
-        axes.axhline(selection.convergence.value, color="tab:blue", linestyle=":", linewidth=1)
-        axes.text(
-            curve[0][0], selection.convergence.value, f" convergence {selection.convergence.value:.0f}", va="bottom"
-        )
+        end = selection.convergence.value
+        axes.axhline(end, color="tab:blue", linestyle=":", linewidth=1)
+        axes.text(curve[0][0], end, f" convergence {end:.0f}", va="bottom")
         axes.set_xscale("function", functions=(np.sqrt, np.square))  # medium is within the first tenth
         axes.set_xlim(0, curve[-1][0])
         axes.locator_params(axis="x", nbins=5)
         # Medium is often the last of the mixed: its ring goes around that one.
         for level, size, filled in (("mixed", 5, True), ("medium", 9, False), ("expert", 7, True)):
             if picks := selection.picks.get(level):
-                axes.errorbar(
-                    [pick.step for pick in picks],
-                    [pick.evaluation.mean for pick in picks],
-                    [pick.evaluation.std for pick in picks],
-                    fmt="o",
-                    color=colors[level],
-                    markersize=size,
-                    markerfacecolor=colors[level] if filled else "none",
-                    capsize=2,
-                    zorder=3,
-                    label=f"{level} (fresh episodes)",
-                )
+                steps, means = [pick.step for pick in picks], [pick.evaluation.mean for pick in picks]
+                look = dict(fmt="o", color=colors[level], markersize=size, capsize=2, zorder=3)
+                look["markerfacecolor"] = colors[level] if filled else "none"
+                spread, label = [pick.evaluation.std for pick in picks], f"{level} (fresh episodes)"
+                axes.errorbar(steps, means, spread, label=label, **look)
 
 
 def plot_curve(folder: str | Path, expert: float | None = None) -> Path:
