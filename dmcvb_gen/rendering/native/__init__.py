@@ -5,7 +5,7 @@ a pixel and surface, light computed at the floor's vertices, textures from the s
 
 A map for new developers. One frame goes through these kernels (`frame.paint_frames`):
 
-    pose_geoms, choose_lamp    records of geoms and lamps, in the camera's frame          frame.py, records.py
+    pose_geoms, choose_lamp    records of geoms and lamps, in the camera's frame          frame.py, layout.py
     light_frame                the lamp's light at the floor's vertices, its shadow map   lighting.py
     draw                       the nearest geom of each of four samples a pixel:          visibility.py
                                draw_sphere, draw_capsule, draw_solid (cylinder, box,
@@ -21,9 +21,8 @@ A map for new developers. One frame goes through these kernels (`frame.paint_fra
 Around them:
 
     scene.py       a task's model -> geoms, sites and tendons that can be seen, lamps, materials by look
-    textures.py    pictures -> mip levels in one buffer; skies.py: the same of a video's frames
-    lanes.py       how loops touch memory so that they become vector code
-    compiled.py    entry points, compiled once a machine (about a minute)
+    textures.py    pictures and a video's frames -> mip levels in one buffer
+    layout.py      where every number lies, how loops reach it, what is compiled once a machine (about a minute)
     renderer.py    the `Renderer`: batches, caches, hidden goals
 
 A new kind of convex geom needs `visibility.through_solid` (where a ray enters and leaves it) and `half_length`, a

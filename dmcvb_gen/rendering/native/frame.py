@@ -8,57 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from dmcvb_gen.rendering.native.lanes import (
-    BASE_BLUE,
-    BASE_GREEN,
-    BASE_RED,
-    CHUNK,
-    ROWS,
-    distinct,
-    get,
-    leaf,
-    part,
-    put,
-    stage,
-)
+from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native.layout import distinct, get, leaf, part, put, put3, stage
 from dmcvb_gen.rendering.native.lighting import aim_shadows, light_vertices
-from dmcvb_gen.rendering.native.records import (
-    AXIS,
-    BOXED,
-    CLIP,
-    CONE,
-    CORD,
-    EYE,
-    GOAL,
-    GRIDDED,
-    HEADLIGHT,
-    KIND,
-    LAMP,
-    LENGTH,
-    MATERIAL,
-    MIRROR,
-    MIRRORED,
-    MIRRORED_AXIS,
-    MIRRORED_PLACE,
-    MIRRORED_TURN,
-    MOVING,
-    NEAR,
-    OPACITY,
-    OWN_OPACITY,
-    PLACE,
-    REFLECTANCE,
-    RGB,
-    SIZE,
-    SKY,
-    SPOT,
-    STEP,
-    TURN,
-    VIEW,
-    WIDTH,
-    WINDOW,
-)
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE, SPHERE
-from dmcvb_gen.rendering.native.shading import aim, cover_body, cover_plane, shade_body, shade_plane, shade_sky
+from dmcvb_gen.rendering.native.shading import aim, cover, set_color, shade_body, shade_plane, shade_sky
 from dmcvb_gen.rendering.native.visibility import (
     NOTHING,
     box_of_body,
@@ -79,7 +33,7 @@ ALL, NO_GOAL, NOTHING_MOVING = 0, 1, 2
 """Which geoms are drawn."""
 
 
-class Frames(NamedTuple):
+class FrameTable(NamedTuple):
     """Data that differ from frame to frame, with a leading frame axis; positions in the world, meters."""
 
     center: np.ndarray  # (frame, geom, 3)
@@ -92,7 +46,7 @@ class Frames(NamedTuple):
     sky: np.ndarray  # (frame,) texture of the sky; -1: none
 
 
-class Still(NamedTuple):
+class SceneConstants(NamedTuple):
     """Data that are the same in all frames."""
 
     looks: np.ndarray  # (look, geom, column) the first columns of `rec`
@@ -104,7 +58,7 @@ class Still(NamedTuple):
     rays: np.ndarray  # see visibility.sample_rays
 
 
-class Work(NamedTuple):
+class Scratch(NamedTuple):
     """Memory of one painter, used again for every frame; numba pays for every array that it hands over.
 
     A job is a surface in a pixel. `jobs` has their rows, columns and numbers of samples (each `room` long), then the
@@ -116,29 +70,29 @@ class Work(NamedTuple):
     number: np.ndarray  # uint8, geom of each sample
     behind: np.ndarray  # as `inverse`: of the mirrored bodies, or of a plane that is seen through
     behind_number: np.ndarray
-    rec: np.ndarray  # (geom, records.WIDTH)
-    k: np.ndarray  # (records.LENGTH,)
+    rec: np.ndarray  # (geom, layout.WIDTH)
+    k: np.ndarray  # (layout.LENGTH,)
     plane: (
         np.ndarray
     )  # float32, the lit plane's grid (2, line), the lamp's color at its vertices (x, y, 3), all lights'
-    s: np.ndarray  # see lanes
+    s: np.ndarray  # see layout
     jobs: np.ndarray  # int32, see above
     color: np.ndarray  # float32, (3, room) of each job, then the sky's (3, pixels^2)
     kept: np.ndarray  # (pixels, pixels, 3) uint8, what does not move
 
 
-def make_work(geoms: int, pixels: int, grid: np.ndarray) -> Work:
+def make_scratch(geoms: int, pixels: int, grid: np.ndarray) -> Scratch:
     """Memory for frames of `pixels` a side."""
     samples, room = 4 * pixels * pixels, room_for.py_func(pixels)
-    return Work(
+    return Scratch(
         inverse=np.zeros(samples, np.float32),
         number=np.zeros(samples, np.uint8),
         behind=np.zeros(samples, np.float32),
         behind_number=np.zeros(samples, np.uint8),
-        rec=np.zeros((geoms, WIDTH)),
-        k=np.zeros(LENGTH),
+        rec=np.zeros((geoms, L.WIDTH)),
+        k=np.zeros(L.LENGTH),
         plane=np.concatenate([grid.ravel(), np.zeros(6 * grid.shape[1] ** 2)]).astype(np.float32),
-        s=np.zeros(ROWS * CHUNK, np.float32),
+        s=np.zeros(L.ROWS * L.CHUNK, np.float32),
         jobs=np.empty(lists_at.py_func(room, geoms, 2, 0) + 2 * (geoms + 1), np.int32),  # taken as it is written
         color=np.zeros(3 * room + 3 * pixels * pixels, np.float32),
         kept=np.zeros((pixels, pixels, 3), np.uint8),
@@ -180,30 +134,30 @@ def pose_geoms(rec, looks, center, turn, eye, axes, rgb, look, f):
             rec[g, column] = looks[look, g, column]
         x, y, z = center[f, g, 0] - eye[f, 0], center[f, g, 1] - eye[f, 1], center[f, g, 2] - eye[f, 2]
         for row in range(3):
-            rec[g, PLACE + row] = turned(axes, f, row, x, y, z)
+            rec[g, L.PLACE + row] = turned(axes, f, row, x, y, z)
             for column in range(3):
-                rec[g, TURN + 3 * row + column] = turned(
+                rec[g, L.TURN + 3 * row + column] = turned(
                     axes, f, row, turn[f, g, 0, column], turn[f, g, 1, column], turn[f, g, 2, column]
                 )
-        if rec[g, CORD] > 0.0:
-            x, y, z = rec[g, TURN + 2], rec[g, TURN + 5], rec[g, TURN + 8]
-            rec[g, SIZE + 1] = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        if rec[g, L.CORD] > 0.0:
+            x, y, z = rec[g, L.TURN + 2], rec[g, L.TURN + 5], rec[g, L.TURN + 8]
+            rec[g, L.SIZE + 1] = max(math.sqrt(x * x + y * y + z * z), 1e-9)
             for row in range(3):
-                rec[g, TURN + 3 * row + 2] /= rec[g, SIZE + 1]
+                rec[g, L.TURN + 3 * row + 2] /= rec[g, L.SIZE + 1]
         for row in range(3):
-            rec[g, AXIS + row] = rec[g, TURN + 3 * row + 2]
-        material = int(rec[g, MATERIAL])
+            rec[g, L.AXIS + row] = rec[g, L.TURN + 3 * row + 2]
+        material = int(rec[g, L.MATERIAL])
         if material >= 0:
             for c in range(3):
-                rec[g, RGB + c] = rgb[f, material, c]
+                rec[g, L.RGB + c] = rgb[f, material, c]
 
 
 @part
 def face_planes(rec):
     """Fill the planes' FUNCTIONS, and their OPACITY from the side that is seen."""
     for g in range(rec.shape[0]):
-        if rec[g, KIND] == PLANE:
-            rec[g, OPACITY] = rec[g, OWN_OPACITY] * (1.0 if plane_functions(rec, g) else BACK_OF_PLANE)
+        if rec[g, L.KIND] == PLANE:
+            rec[g, L.OPACITY] = rec[g, L.OWN_OPACITY] * (1.0 if plane_functions(rec, g) else BACK_OF_PLANE)
 
 
 @part
@@ -211,23 +165,23 @@ def pose_camera(k, axes, sky, f):
     """Fill a frame's entries of k."""
     for row in range(3):
         for column in range(3):
-            k[VIEW + 3 * row + column] = axes[f, row, column]
-    k[EYE], k[EYE + 1], k[EYE + 2] = 0.0, 0.0, -1.0
-    k[SKY] = sky[f]
+            k[L.VIEW + 3 * row + column] = axes[f, row, column]
+    k[L.EYE], k[L.EYE + 1], k[L.EYE + 2] = 0.0, 0.0, -1.0
+    k[L.SKY] = sky[f]
 
 
 @part
 def choose_lamp(k, constants, lamps, lamp, eye, axes, f, which):
     """Fill the lamp's entries of k with one of the lamps; the headlight shines beside the first one alone."""
     for i in range(9):
-        k[SPOT + i] = lamps[which, i]
-        k[HEADLIGHT + i] = constants[HEADLIGHT + i] if which == 0 else 0.0
+        k[L.SPOT + i] = lamps[which, i]
+        k[L.HEADLIGHT + i] = constants[L.HEADLIGHT + i] if which == 0 else 0.0
     for i in range(3):
-        k[CONE + i] = lamps[which, 9 + i]
+        k[L.CONE + i] = lamps[which, 9 + i]
     x, y, z = lamp[f, which, 0] - eye[f, 0], lamp[f, which, 1] - eye[f, 1], lamp[f, which, 2] - eye[f, 2]
     for row in range(3):
-        k[LAMP + row] = turned(axes, f, row, x, y, z)
-        k[LAMP + 3 + row] = turned(axes, f, row, lamp[f, which, 3], lamp[f, which, 4], lamp[f, which, 5])
+        k[L.LAMP + row] = turned(axes, f, row, x, y, z)
+        k[L.LAMP + 3 + row] = turned(axes, f, row, lamp[f, which, 3], lamp[f, which, 4], lamp[f, which, 5])
 
 
 @leaf
@@ -240,25 +194,29 @@ def mirrored(x, y, z, nx, ny, nz, away):
 @part
 def reflect(k, rec):
     """Mirror bodies, lamp and headlight."""
-    m = int(k[MIRROR])
-    nx, ny, nz = rec[m, AXIS], rec[m, AXIS + 1], rec[m, AXIS + 2]
-    away = rec[m, PLACE] * nx + rec[m, PLACE + 1] * ny + rec[m, PLACE + 2] * nz
+    m = int(k[L.MIRROR])
+    nx, ny, nz = rec[m, L.AXIS], rec[m, L.AXIS + 1], rec[m, L.AXIS + 2]
+    away = rec[m, L.PLACE] * nx + rec[m, L.PLACE + 1] * ny + rec[m, L.PLACE + 2] * nz
     for g in range(rec.shape[0]):
-        for source, target, far in ((PLACE, MIRRORED_PLACE, away), (AXIS, MIRRORED_AXIS, 0.0)):
+        for source, target, far in ((L.PLACE, L.MIRRORED_PLACE, away), (L.AXIS, L.MIRRORED_AXIS, 0.0)):
             x, y, z = mirrored(rec[g, source], rec[g, source + 1], rec[g, source + 2], nx, ny, nz, far)
             rec[g, target], rec[g, target + 1], rec[g, target + 2] = x, y, z
         for c in range(3):
-            x, y, z = mirrored(rec[g, TURN + c], rec[g, TURN + 3 + c], rec[g, TURN + 6 + c], nx, ny, nz, 0.0)
-            rec[g, MIRRORED_TURN + c], rec[g, MIRRORED_TURN + 3 + c], rec[g, MIRRORED_TURN + 6 + c] = x, y, z
+            x, y, z = mirrored(rec[g, L.TURN + c], rec[g, L.TURN + 3 + c], rec[g, L.TURN + 6 + c], nx, ny, nz, 0.0)
+            rec[g, L.MIRRORED_TURN + c], rec[g, L.MIRRORED_TURN + 3 + c], rec[g, L.MIRRORED_TURN + 6 + c] = x, y, z
     for i, far in ((0, 0.0), (3, away), (6, 0.0)):
-        x, y, z = mirrored(k[EYE + i], k[EYE + i + 1], k[EYE + i + 2], nx, ny, nz, far)
-        k[MIRRORED + i], k[MIRRORED + i + 1], k[MIRRORED + i + 2] = x, y, z
+        x, y, z = mirrored(k[L.EYE + i], k[L.EYE + i + 1], k[L.EYE + i + 2], nx, ny, nz, far)
+        k[L.MIRRORED + i], k[L.MIRRORED + i + 1], k[L.MIRRORED + i + 2] = x, y, z
 
 
 @part
 def swap_with_image(rec, g):
     """Exchange plane g and its mirror image; gives whether what is at its place now faces the camera."""
-    for there, here, count in ((MIRRORED_PLACE, PLACE, 3), (MIRRORED_TURN, TURN, 9), (MIRRORED_AXIS, AXIS, 3)):
+    for there, here, count in (
+        (L.MIRRORED_PLACE, L.PLACE, 3),
+        (L.MIRRORED_TURN, L.TURN, 9),
+        (L.MIRRORED_AXIS, L.AXIS, 3),
+    ):
         for i in range(count):
             rec[g, there + i], rec[g, here + i] = rec[g, here + i], rec[g, there + i]
     return plane_functions(rec, g)
@@ -282,13 +240,13 @@ def in_a_box(boxes, eye, f):
 @leaf
 def drawn(rec, g, which):
     """Return True if geom g is drawn (ALL, NO_GOAL, NOTHING_MOVING)."""
-    return which == ALL or (rec[g, GOAL] == 0.0 and (which == NO_GOAL or rec[g, MOVING] == 0.0))
+    return which == ALL or (rec[g, L.GOAL] == 0.0 and (which == NO_GOAL or rec[g, L.MOVING] == 0.0))
 
 
 @part
 def body_box(k, rec, g, place, axis, pixels):
     """Pixels in CLIP that a body can touch; its center and axis are in these columns of its record."""
-    half = rec[g, SIZE + 1] if rec[g, KIND] == CAPSULE else 0.0
+    half = rec[g, L.SIZE + 1] if rec[g, L.KIND] == CAPSULE else 0.0
     return box_of_body(k, rec, g, place, axis, half, pixels)
 
 
@@ -298,13 +256,13 @@ def draw_body(inverse, number, rays, k, rec, g, place, axis):
     c0, c1, r0, r1 = body_box(k, rec, g, place, axis, rays.size // 9)
     if c0 >= c1 or r0 >= r1:
         return
-    nearest, geom = 1.0 / k[NEAR], np.uint8(g)
-    if rec[g, KIND] == CAPSULE:
+    nearest, geom = 1.0 / k[L.NEAR], np.uint8(g)
+    if rec[g, L.KIND] == CAPSULE:
         draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
-    elif rec[g, KIND] == SPHERE:
+    elif rec[g, L.KIND] == SPHERE:
         draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
     else:
-        turn = i8(TURN if place == PLACE else MIRRORED_TURN)
+        turn = i8(L.TURN if place == L.PLACE else L.MIRRORED_TURN)
         draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)
 
 
@@ -312,7 +270,7 @@ def draw_body(inverse, number, rays, k, rec, g, place, axis):
 def draw_bodies(inverse, number, rays, k, rec, which, place, axis):
     """Draw all bodies (`drawn`)."""
     for g in range(rec.shape[0]):
-        if rec[g, KIND] != PLANE and drawn(rec, g, which):
+        if rec[g, L.KIND] != PLANE and drawn(rec, g, which):
             draw_body(inverse, number, rays, k, rec, g, place, axis)
 
 
@@ -320,8 +278,8 @@ def draw_bodies(inverse, number, rays, k, rec, which, place, axis):
 def draw_planes(inverse, number, rays, k, rec, opaque):
     """Draw the planes that are opaque, or the others."""
     for g in range(rec.shape[0]):
-        if rec[g, KIND] == PLANE and (rec[g, OPACITY] >= OPAQUE) == opaque:
-            c0, c1, r0, r1 = box_of_plane(k, rec, g, k[NEAR], rays.size // 9)
+        if rec[g, L.KIND] == PLANE and (rec[g, L.OPACITY] >= OPAQUE) == opaque:
+            c0, c1, r0, r1 = box_of_plane(k, rec, g, k[L.NEAR], rays.size // 9)
             if c0 < c1 and r0 < r1:
                 draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
 
@@ -330,9 +288,9 @@ def draw_planes(inverse, number, rays, k, rec, opaque):
 def draw_mirrored_planes(inverse, number, rays, k, rec):
     """Draw the mirror images of the other planes, as far as their front is seen in the mirror."""
     for g in range(rec.shape[0]):
-        if rec[g, KIND] == PLANE and g != int(k[MIRROR]):
+        if rec[g, L.KIND] == PLANE and g != int(k[L.MIRROR]):
             if swap_with_image(rec, g):
-                c0, c1, r0, r1 = box_of_plane(k, rec, g, k[NEAR], rays.size // 9)
+                c0, c1, r0, r1 = box_of_plane(k, rec, g, k[L.NEAR], rays.size // 9)
                 if c0 < c1 and r0 < r1:
                     draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
             swap_with_image(rec, g)
@@ -346,9 +304,9 @@ def veils(rec, inside):
       inside: the eye is inside a box.
     """
     for g in range(rec.shape[0]):
-        if rec[g, KIND] == PLANE and rec[g, OPACITY] < OPAQUE:
-            facing = rec[g, OPACITY] == rec[g, OWN_OPACITY]
-            if facing or inside or rec[g, BOXED] == 0.0:
+        if rec[g, L.KIND] == PLANE and rec[g, L.OPACITY] < OPAQUE:
+            facing = rec[g, L.OPACITY] == rec[g, L.OWN_OPACITY]
+            if facing or inside or rec[g, L.BOXED] == 0.0:
                 return True
     return False
 
@@ -357,8 +315,8 @@ def veils(rec, inside):
 def clear(inverse, number, k, pixels):
     """Empty the samples in CLIP."""
     distinct()
-    first, past = 4 * int(k[CLIP]), 4 * int(k[CLIP + 1])
-    for row in range(int(k[CLIP + 2]), int(k[CLIP + 3])):
+    first, past = 4 * int(k[L.CLIP]), 4 * int(k[L.CLIP + 1])
+    for row in range(int(k[L.CLIP + 2]), int(k[L.CLIP + 3])):
         at = 4 * row * pixels
         for i in range(at + first, at + past):
             put(inverse, i, f4(0))
@@ -369,8 +327,8 @@ def clear(inverse, number, k, pixels):
 def copy_depths(inverse, behind, k, pixels):
     """Make `behind` as deep as `inverse` in CLIP."""
     distinct()
-    first, past = 4 * int(k[CLIP]), 4 * int(k[CLIP + 1])
-    for row in range(int(k[CLIP + 2]), int(k[CLIP + 3])):
+    first, past = 4 * int(k[L.CLIP]), 4 * int(k[L.CLIP + 1])
+    for row in range(int(k[L.CLIP + 2]), int(k[L.CLIP + 3])):
         at = 4 * row * pixels
         for i in range(at + first, at + past):
             put(behind, i, get(inverse, i))
@@ -380,27 +338,29 @@ def copy_depths(inverse, behind, k, pixels):
 def drop_hidden_images(inverse, number, behind, behind_number, k, pixels):
     """Keep mirror images where the mirror is in front and the image beyond it."""
     distinct()
-    mirror = np.uint8(k[MIRROR])
-    for i in range(4 * pixels * int(k[CLIP + 2]), 4 * pixels * int(k[CLIP + 3])):
+    mirror = np.uint8(k[L.MIRROR])
+    for i in range(4 * pixels * int(k[L.CLIP + 2]), 4 * pixels * int(k[L.CLIP + 3])):
         seen = (get(number, i) == mirror) & (get(behind, i) < get(inverse, i))
         put(behind_number, i, get(behind_number, i) if seen else np.uint8(NOTHING))
 
 
 @part
-def draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled):
+def draw(scratch, rays, which, veiled):
     """Fill the buffers with the opaque surfaces, and the second ones with the planes to be seen through (`veiled`),
     in front of them, or else with mirror images."""
+    inverse, number, k, rec = scratch.inverse, scratch.number, scratch.k, scratch.rec
+    behind, behind_number = scratch.behind, scratch.behind_number
     pixels = rays.size // 9
     clear(inverse, number, k, pixels)
     clear(behind, behind_number, k, pixels)
-    draw_bodies(inverse, number, rays, k, rec, which, i8(PLACE), i8(AXIS))
+    draw_bodies(inverse, number, rays, k, rec, which, i8(L.PLACE), i8(L.AXIS))
     draw_planes(inverse, number, rays, k, rec, True)
     if veiled:
         copy_depths(inverse, behind, k, pixels)
         draw_planes(behind, behind_number, rays, k, rec, False)
-    elif k[MIRROR] >= 0.0:
+    elif k[L.MIRROR] >= 0.0:
         reflect(k, rec)
-        draw_bodies(behind, behind_number, rays, k, rec, which, i8(MIRRORED_PLACE), i8(MIRRORED_AXIS))
+        draw_bodies(behind, behind_number, rays, k, rec, which, i8(L.MIRRORED_PLACE), i8(L.MIRRORED_AXIS))
         draw_mirrored_planes(behind, behind_number, rays, k, rec)
         drop_hidden_images(inverse, number, behind, behind_number, k, pixels)
 
@@ -448,7 +408,7 @@ def list_jobs(number, behind_number, jobs, color, k, pixels, geoms, first_row, p
         put(jobs, i, i4(0))
     count = 0
     for row in range(first_row, past_row):
-        for column in range(int(k[CLIP]), int(k[CLIP + 1])):
+        for column in range(int(k[L.CLIP]), int(k[L.CLIP + 1])):
             first = 4 * (row * pixels + column)
             geom, behind = np.int64(get(number, first)), np.int64(get(behind_number, first))
             odd = (get(number, first + 1) ^ geom) | (get(number, first + 2) ^ geom) | (get(number, first + 3) ^ geom)
@@ -491,9 +451,7 @@ def take_base(s, n, jobs, color, room, first):
     distinct()
     for i in range(n):
         job = get(jobs, first + i)
-        put(s, BASE_RED + i, get(color, job))
-        put(s, BASE_GREEN + i, get(color, room + job))
-        put(s, BASE_BLUE + i, get(color, 2 * room + job))
+        put3(s, L.BASE + i, get(color, job), get(color, room + job), get(color, 2 * room + job))
 
 
 @part
@@ -501,35 +459,34 @@ def give_base(s, n, jobs, color, room, first):
     """The base colors back to their jobs."""
     for i in range(n):
         job = get(jobs, first + i)
-        put(color, job, get(s, BASE_RED + i))
-        put(color, room + job, get(s, BASE_GREEN + i))
-        put(color, 2 * room + job, get(s, BASE_BLUE + i))
+        for c in range(3):
+            put(color, c * room + job, get(s, L.BASE + c * L.CHUNK + i))
 
 
 @stage
-def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, mirrored, veil, further):
+def shade_geom(scene, scratch, pixels, which, g, mirrored, veil, further):
     """Lay geom g over the colors of its jobs.
 
     Args:
-      which: of its lists (0: in front); `mirrored`: its mirror image; `veil`: see `shading.cover_plane`.
+      which: of its lists (0: in front); `mirrored`: its mirror image; `veil`, `further`: see `shading.cover`.
     """
+    s, k, rec, jobs, color = scratch.s, scratch.k, scratch.rec, scratch.jobs, scratch.color
     geoms, room = rec.shape[0], room_for(pixels)
     first, total = lists_at(room, geoms, which, g), np.int64(get(jobs, length_at(room, geoms, which, g)))
-    for at in range(first, first + total, CHUNK):
-        n = min(CHUNK, first + total - at)
-        aim(s, n, jobs, room, at, pixels, k[STEP])
+    set_color(k, rec, g, k[L.REFLECTANCE] if mirrored else 1.0)
+    for at in range(first, first + total, L.CHUNK):
+        n = min(L.CHUNK, first + total - at)
+        aim(s, n, jobs, room, at, pixels, k[L.STEP])
         take_base(s, n, jobs, color, room, at)
-        if rec[g, KIND] == PLANE:
+        if rec[g, L.KIND] == PLANE:
             if mirrored:
                 swap_with_image(rec, g)
-            tint = k[REFLECTANCE] if mirrored else 1.0
-            shade_plane(s, n, k, rec, texels, width, plane, g, mirrored, tint)
-            cover_plane(s, n, k, rec, g, veil, further, tint)
+            shade_plane(s, n, k, rec, scene.texels, scene.width, scratch.plane, g, mirrored)
             if mirrored:
                 swap_with_image(rec, g)
         else:
-            shade_body(s, n, k, rec, texels, width, g, mirrored)
-            cover_body(s, n, k, rec, g, k[REFLECTANCE] if mirrored else 1.0)
+            shade_body(s, n, k, rec, scene.texels, scene.width, g, mirrored)
+        cover(s, n, k, rec, g, veil, further)
         give_base(s, n, jobs, color, room, at)
 
 
@@ -537,9 +494,9 @@ def shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, m
 def shade_sky_jobs(s, k, texels, width, jobs, color, pixels, first, total):
     """Colors of `total` jobs of the sky, listed from `first` on."""
     room = room_for(pixels)
-    for at in range(first, first + total, CHUNK):
-        n = min(CHUNK, first + total - at)
-        aim(s, n, jobs, room, at, pixels, k[STEP])
+    for at in range(first, first + total, L.CHUNK):
+        n = min(L.CHUNK, first + total - at)
+        aim(s, n, jobs, room, at, pixels, k[L.STEP])
         shade_sky(s, n, k, texels, width)
         give_base(s, n, jobs, color, room, at)
 
@@ -549,8 +506,8 @@ def keep_sky(s, k, texels, width, jobs, color, pixels, geoms):
     """Fill the last part of `color` with the sky in every pixel."""
     room, total = room_for(pixels), pixels * pixels
     at = lists_at(room, geoms, 0, 0)
-    for first in range(0, total, CHUNK):
-        n = min(CHUNK, total - first)
+    for first in range(0, total, L.CHUNK):
+        n = min(L.CHUNK, total - first)
         for i in range(n):
             jobs[i], jobs[room + i], jobs[at + i] = (first + i) // pixels, (first + i) % pixels, i
         shade_sky_jobs(s, k, texels, width, jobs, color, pixels, at, n)
@@ -570,13 +527,14 @@ def take_sky(jobs, color, room, pixels, first, total):
 
 
 @stage
-def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known, further):
+def shade_jobs(scene, scratch, pixels, veiled, known, further):
     """Colors of all listed jobs: mirror images, what is in front, what that is seen through.
 
     Args:
       known: the sky is kept.
       further: add the light of another lamp to the colors that they have.
     """
+    s, k, rec, jobs, color = scratch.s, scratch.k, scratch.rec, scratch.jobs, scratch.color
     geoms, room = rec.shape[0], room_for(pixels)
     for layer in range(3):
         if (layer == 0 and veiled) or (layer == 2 and not veiled):
@@ -584,16 +542,16 @@ def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, kno
         which = 0 if layer == 1 else 1
         for g in range(geoms):
             if get(jobs, length_at(room, geoms, which, g)) > 0:
-                rest = (1.0 - rec[g, OPACITY]) * (1.0 - rec[g, OPACITY])  # MuJoCo draws what is transparent twice
+                rest = (1.0 - rec[g, L.OPACITY]) * (1.0 - rec[g, L.OPACITY])  # what is transparent is drawn twice
                 veil = 1.0 - rest if layer == 2 else 1.0
-                shade_geom(s, k, rec, texels, width, plane, jobs, color, pixels, which, g, layer == 0, veil, further)
+                shade_geom(scene, scratch, pixels, which, g, layer == 0, veil, further)
         first, total = lists_at(room, geoms, 0, geoms), np.int64(get(jobs, length_at(room, geoms, 0, geoms)))
         if further:
             continue
         if layer == 1 and known:
             take_sky(jobs, color, room, pixels, first, total)
         elif layer == 1:
-            shade_sky_jobs(s, k, texels, width, jobs, color, pixels, first, total)
+            shade_sky_jobs(s, k, scene.texels, scene.width, jobs, color, pixels, first, total)
 
 
 # -- pictures --------------------------------------------------------------------------------------
@@ -602,7 +560,7 @@ def shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, kno
 @part
 def clip(k, c0, c1, r0, r1):
     """Paint this part of the picture only."""
-    k[CLIP], k[CLIP + 1], k[CLIP + 2], k[CLIP + 3] = c0, c1, r0, r1
+    k[L.CLIP], k[L.CLIP + 1], k[L.CLIP + 2], k[L.CLIP + 3] = c0, c1, r0, r1
 
 
 @part
@@ -611,34 +569,33 @@ def clip_to_some(k, rec, pixels, goal):
     clip(k, i8(0), pixels, i8(0), pixels)
     left, right, top, bottom = pixels, 0, pixels, 0
     for g in range(rec.shape[0]):
-        if rec[g, KIND] != PLANE and rec[g, GOAL] == goal and (goal or rec[g, MOVING] > 0.0):
-            c0, c1, r0, r1 = body_box(k, rec, g, i8(PLACE), i8(AXIS), pixels)
+        if rec[g, L.KIND] != PLANE and rec[g, L.GOAL] == goal and (goal or rec[g, L.MOVING] > 0.0):
+            c0, c1, r0, r1 = body_box(k, rec, g, i8(L.PLACE), i8(L.AXIS), pixels)
             if c0 < c1 and r0 < r1:
                 left, right, top, bottom = min(left, c0), max(right, c1), min(top, r0), max(bottom, r1)
-    if goal and (k[CONE] > 0.0 or k[MIRROR] >= 0.0):
+    if goal and (k[L.CONE] > 0.0 or k[L.MIRROR] >= 0.0):
         return True  # its shadow and mirror image may be anywhere
     clip(k, left, right, top, bottom)
     return left < right
 
 
 @stage
-def paint(
-    inverse, number, behind, behind_number, rays, s, k, rec, texels, width, plane, jobs, color,
-    constants, lamps, lamp, eye, axes, f, which, inside, known, out,
-):  # fmt: skip
+def paint(scene, frames, scratch, f, which, inside, known, out):
     """Paint the CLIP of frame f into a picture (row, column, 3)."""
-    pixels, bottom = rays.size // 9, int(k[CLIP + 3])
+    k, rec = scratch.k, scratch.rec
+    pixels, bottom = scene.rays.size // 9, int(k[L.CLIP + 3])
     veiled, room = veils(rec, inside), room_for(pixels)
-    draw(inverse, number, behind, behind_number, rays, k, rec, which, veiled)
-    for row in range(int(k[CLIP + 2]), bottom, room // (4 * pixels)):
+    draw(scratch, scene.rays, which, veiled)
+    for row in range(int(k[L.CLIP + 2]), bottom, room // (4 * pixels)):
         past_row = min(row + room // (4 * pixels), bottom)
+        number, behind_number, jobs, color = scratch.number, scratch.behind_number, scratch.jobs, scratch.color
         count = list_jobs(number, behind_number, jobs, color, k, pixels, rec.shape[0], row, past_row)
-        for at in range(len(lamps)):
-            if len(lamps) > 1:
-                light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, at)
-                if k[MIRROR] >= 0.0:
+        for at in range(len(scene.lamps)):
+            if len(scene.lamps) > 1:
+                light_frame(scene, frames, scratch, f, at)
+                if k[L.MIRROR] >= 0.0:
                     reflect(k, rec)
-            shade_jobs(s, k, rec, texels, width, plane, jobs, color, pixels, veiled, known, at > 0)
+            shade_jobs(scene, scratch, pixels, veiled, known, at > 0)
         write_pixels(jobs, color, room, count, out)
 
 
@@ -675,60 +632,60 @@ def same_sky(axes, sky, f):
 
 
 @part
-def light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, which):
+def light_frame(scene, frames, scratch, f, which):
     """Make a lamp's light on the lit plane and its shadow map ready."""
-    choose_lamp(k, constants, lamps, lamp, eye, axes, f, which)
+    k, rec = scratch.k, scratch.rec
+    choose_lamp(k, scene.constants, scene.lamps, frames.lamp, frames.eye, frames.axes, f, which)
     for i in range(4):
-        k[WINDOW + i] = 0.0
-    if k[CONE] <= 0.0:
+        k[L.WINDOW + i] = 0.0
+    if k[L.CONE] <= 0.0:
         return
     aim_shadows(k, rec)
     for g in range(rec.shape[0]):
-        if rec[g, GRIDDED] > 0.0:
-            light_vertices(s, k, rec, plane, g, len(lamps) > 1, which)
+        if rec[g, L.GRIDDED] > 0.0:
+            light_vertices(scratch.s, k, rec, scratch.plane, g, len(scene.lamps) > 1, which)
 
 
 @stage
-def pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels):
+def pose(scene, frames, scratch, f, pixels):
     """Transform everything of frame f into the camera's frame."""
-    pose_geoms(rec, looks, center, turn, eye, axes, rgb, look[f], f)
-    pose_camera(k, axes, sky, f)
+    k, eye, axes = scratch.k, frames.eye, frames.axes
+    pose_geoms(scratch.rec, scene.looks, frames.center, frames.turn, eye, axes, frames.rgb, frames.look[f], f)
+    pose_camera(k, axes, frames.sky, f)
     clip(k, i8(0), pixels, i8(0), pixels)
 
 
+@part
+def looks_as_before(frames, f):
+    """Return True if all that does not move looks in frame f as in the frame before it."""
+    same_look = same_sky(frames.axes, frames.sky, f) and frames.look[f] == frames.look[f - 1]
+    return same_look and same(frames.eye.reshape(-1, 1, 3), f) and same(frames.rgb, f)
+
+
 @stage
-def paint_frames(
-    looks, constants, lamps, boxes, texels, width, rays,
-    center, turn, eye, axes, lamp, rgb, look, sky,
-    inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-    stays, shown, hidden,
-):  # fmt: skip
+def paint_frames(scene, frames, scratch, stays, shown, hidden):
     """Paint frames into `shown`, and without the goal into `hidden`, each (frame, pixels, pixels, 3) uint8, or of no
-    frames if it is not wanted; arguments as `Still`, `Frames` and `Work` name them.
+    frames if it is not wanted.
 
     Args:
       stays: no plane, shadow or mirror image ever moves.
     """
-    set_constants(k, constants)
-    pixels, has_kept, known = rays.size // 9, False, False
+    k, rec, kept, axes, sky = scratch.k, scratch.rec, scratch.kept, frames.axes, frames.sky
+    set_constants(k, scene.constants)
+    pixels, has_kept, known = scene.rays.size // 9, False, False
     all_, both = ALL if len(shown) else NO_GOAL, len(shown) > 0 and len(hidden) > 0
-    for f in range(look.size):
+    for f in range(frames.look.size):
         out = shown[f] if len(shown) else hidden[f]
-        pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels)
+        pose(scene, frames, scratch, f, pixels)
         face_planes(rec)
-        light_frame(s, k, rec, plane, constants, lamps, lamp, eye, axes, f, i8(0))
-        inside = in_a_box(boxes, eye, f)
+        light_frame(scene, frames, scratch, f, i8(0))
+        inside = in_a_box(scene.boxes, frames.eye, f)
         known = known and same_sky(axes, sky, f)
         if not known and same_sky(axes, sky, f + 1):
-            keep_sky(s, k, texels, width, jobs, color, pixels, rec.shape[0])
+            jobs, color = scratch.jobs, scratch.color
+            keep_sky(scratch.s, k, scene.texels, scene.width, jobs, color, pixels, rec.shape[0])
             known = True
-        still = (
-            stays
-            and same_sky(axes, sky, f)
-            and look[f] == look[f - 1]
-            and same(eye.reshape(-1, 1, 3), f)
-            and same(rgb, f)
-        )
+        still = stays and looks_as_before(frames, f)
         has_kept = has_kept and still
         # What does not move, once; what moves; the goal; the goal's place without it.
         for step in range(4):
@@ -751,30 +708,23 @@ def paint_frames(
                     continue
             elif step > 0:
                 continue
-            paint(
-                inverse, number, behind, behind_number, rays, s, k, rec, texels, width, plane, jobs, color,
-                constants, lamps, lamp, eye, axes, f, which, inside, known, picture,
-            )  # fmt: skip
+            paint(scene, frames, scratch, f, which, inside, known, picture)
 
 
 @stage
-def label_frames(
-    looks, constants, lamps, boxes, texels, width, rays,
-    center, turn, eye, axes, lamp, rgb, look, sky,
-    inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-    depth, geom,
-):  # fmt: skip
+def label_frames(scene, frames, scratch, depth, geom):
     """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them."""
-    set_constants(k, constants)
-    pixels = rays.size // 9
-    for f in range(look.size):
-        pose(k, rec, looks, center, turn, eye, axes, rgb, look, sky, f, pixels)
+    k, rec, inverse, number = scratch.k, scratch.rec, scratch.inverse, scratch.number
+    set_constants(k, scene.constants)
+    pixels = scene.rays.size // 9
+    for f in range(frames.look.size):
+        pose(scene, frames, scratch, f, pixels)
         for g in range(rec.shape[0]):
-            rec[g, OWN_OPACITY] = 1.0 / BACK_OF_PLANE
+            rec[g, L.OWN_OPACITY] = 1.0 / BACK_OF_PLANE
         face_planes(rec)
         clear(inverse, number, k, pixels)
-        draw_bodies(inverse, number, rays, k, rec, i8(ALL), i8(PLACE), i8(AXIS))
-        draw_planes(inverse, number, rays, k, rec, True)
+        draw_bodies(inverse, number, scene.rays, k, rec, i8(ALL), i8(L.PLACE), i8(L.AXIS))
+        draw_planes(inverse, number, scene.rays, k, rec, True)
         for row in range(pixels):
             for column in range(pixels):
                 sample = 4 * (row * pixels + column)
@@ -787,19 +737,9 @@ def painter(version: int):
     """`paint_frames` compiled and kept on disk under a version: numba itself looks at one file's date alone."""
 
     @njit(nogil=True, error_model="numpy", cache=True)
-    def paint_them(
-        looks, constants, lamps, boxes, texels, width, rays,
-        center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-        stays, shown, hidden,
-    ):  # fmt: skip
+    def paint_them(scene, frames, scratch, stays, shown, hidden):
         if version != 0:
-            paint_frames(
-                looks, constants, lamps, boxes, texels, width, rays,
-                center, turn, eye, axes, lamp, rgb, look, sky,
-                inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-                stays, shown, hidden,
-            )  # fmt: skip
+            paint_frames(scene, frames, scratch, stays, shown, hidden)
 
     return paint_them
 
@@ -808,18 +748,8 @@ def labeler(version: int):
     """`label_frames` compiled and kept on disk under a version."""
 
     @njit(nogil=True, error_model="numpy", cache=True)
-    def label_them(
-        looks, constants, lamps, boxes, texels, width, rays,
-        center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-        depth, geom,
-    ):  # fmt: skip
+    def label_them(scene, frames, scratch, depth, geom):
         if version != 0:
-            label_frames(
-                looks, constants, lamps, boxes, texels, width, rays,
-                center, turn, eye, axes, lamp, rgb, look, sky,
-                inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-                depth, geom,
-            )  # fmt: skip
+            label_frames(scene, frames, scratch, depth, geom)
 
     return label_them

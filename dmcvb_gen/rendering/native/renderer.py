@@ -13,9 +13,9 @@ import numpy as np
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, moved_lamps
-from dmcvb_gen.rendering.native import records as columns
-from dmcvb_gen.rendering.native.compiled import call
-from dmcvb_gen.rendering.native.frame import Frames, Still, labeler, make_work, painter
+from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native.frame import FrameTable, SceneConstants, labeler, make_scratch, painter
+from dmcvb_gen.rendering.native.layout import call
 from dmcvb_gen.rendering.native.scene import (
     BOX,
     CYLINDER,
@@ -62,7 +62,7 @@ class NativeRenderer(Renderer):
         self._textures = Textures(task.picture_model, backgrounds, finest)
         self._textures.make_ready(self._scene.sky)
         self._looks: dict[int, int] = {}
-        self._records = np.zeros((0, len(self._scene.geoms), columns.RGB + 3))
+        self._records = np.zeros((0, len(self._scene.geoms), L.RGB + 3))
         fields = ["geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "light_xpos", "light_xdir"]
         needed = {
             "geom": True,
@@ -78,7 +78,7 @@ class NativeRenderer(Renderer):
         )
         sun = task.model.light_type[self._scene.lamps] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
         self._far_away = np.where(sun, SUN_DISTANCE * task.model.stat.extent, 0.0)
-        self._work = make_work(len(self._scene.geoms), size, self._scene.grid)
+        self._scratch = make_scratch(len(self._scene.geoms), size, self._scene.grid)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -114,8 +114,8 @@ class NativeRenderer(Renderer):
         for rows, poses in self._parts(physics, exogenous):
             pictures = [np.empty((len(rows) * asked, *shape[1:]), np.uint8) for asked in (shown, hidden)]
             for column, view in enumerate(indices):
-                frames, still = self._frames(poses, exogenous[rows], view), self._still(view)
-                call(painter, *still, *frames, *self._work, self._stays, *pictures)
+                frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view)
+                call(painter, scene, frames, self._scratch, self._stays, *pictures)
                 for whole, part in zip(out, pictures, strict=True):
                     if len(part):
                         whole[rows, column] = part
@@ -139,8 +139,8 @@ class NativeRenderer(Renderer):
             deep = np.empty((len(rows), self.size, self.size), np.float32)
             geom = np.empty((len(rows), self.size, self.size), np.int16)
             for column, view in enumerate(indices):
-                frames, still = self._frames(poses, exogenous[rows], view), self._still(view, centers=True)
-                call(labeler, *still, *frames, *self._work, deep, geom)
+                frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view, centers=True)
+                call(labeler, scene, frames, self._scratch, deep, geom)
                 depth[rows, column], segmentation[rows, column] = deep, numbers[geom]
         return {"depth": depth, "segmentation": segmentation}
 
@@ -158,7 +158,7 @@ class NativeRenderer(Renderer):
             yield rows, self._kinematics(physics[rows])
             first += len(rows)
 
-    def _frames(self, poses: dict[str, np.ndarray], exogenous: DistractorState, view: int) -> Frames:
+    def _frames(self, poses: dict[str, np.ndarray], exogenous: DistractorState, view: int) -> FrameTable:
         scene, count = self._scene, len(exogenous)
         backgrounds = zip(exogenous.background_video.tolist(), exogenous.background_frame.tolist(), strict=True)
         sky = [self._textures.background(*key) if key[0] >= 0 else scene.sky for key in backgrounds]
@@ -170,7 +170,7 @@ class NativeRenderer(Renderer):
             lamp[..., :3], lamp[..., 3:] = place[:, scene.lamps], direction[:, scene.lamps]
             lamp[..., :3] -= self._far_away[:, None] * lamp[..., 3:]
         center, turn = _poses(scene, poses)
-        return Frames(
+        return FrameTable(
             center=center,
             turn=turn,
             eye=np.ascontiguousarray(exogenous.camera_position[:, view], np.float64),
@@ -188,20 +188,20 @@ class NativeRenderer(Renderer):
             for texture in np.unique(look.texture).tolist():
                 self._textures.make_ready(texture)
             rec = np.zeros(self._records.shape[1:])
-            rec[:, columns.KIND], rec[:, columns.SIZE : columns.SIZE + 3] = scene.kind, scene.size
-            rec[:, columns.GOAL], rec[:, columns.BOXED] = scene.goal, _boxed(self.task, scene)
-            rec[:, columns.MOVING], rec[:, columns.BALL] = scene.moving, ball_radius(scene)
-            rec[:, columns.CORD] = np.arange(len(rec)) >= len(rec) - len(scene.cords)
-            rec[:, columns.GRIDDED] = np.arange(len(rec)) == scene.gridded
-            rec[:, columns.MATERIAL], rec[:, columns.OWN_OPACITY] = look.material, look.color[:, 3]
-            rec[:, columns.TEXTURE], rec[:, columns.REPEAT : columns.REPEAT + 2] = look.texture, look.repeat
-            rec[:, columns.SHARE], rec[:, columns.EXPONENT] = look.shine.T
-            rec[:, columns.RGB : columns.RGB + 3] = look.color[:, :3]
+            rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3] = scene.kind, scene.size
+            rec[:, L.GOAL], rec[:, L.BOXED] = scene.goal, _boxed(self.task, scene)
+            rec[:, L.MOVING], rec[:, L.BALL] = scene.moving, ball_radius(scene)
+            rec[:, L.CORD] = np.arange(len(rec)) >= len(rec) - len(scene.cords)
+            rec[:, L.GRIDDED] = np.arange(len(rec)) == scene.gridded
+            rec[:, L.MATERIAL], rec[:, L.OWN_OPACITY] = look.material, look.color[:, 3]
+            rec[:, L.TEXTURE], rec[:, L.REPEAT : L.REPEAT + 2] = look.texture, look.repeat
+            rec[:, L.SHARE], rec[:, L.EXPONENT] = look.shine.T
+            rec[:, L.RGB : L.RGB + 3] = look.color[:, :3]
             self._records = np.concatenate([self._records, rec[None]])
             self._looks[style] = len(self._looks)
         return self._looks[style]
 
-    def _still(self, view: int, centers: bool = False) -> Still:
+    def _constants(self, view: int, centers: bool = False) -> SceneConstants:
         """The constant arguments of a view; with `centers` all samples lie in the middle of their pixels."""
         scene, angle = self._scene, self._angles[view]
         step = 2 * math.tan(angle / 2) / self.size
@@ -214,7 +214,7 @@ class NativeRenderer(Renderer):
                 [scene.grid.shape[1], scene.horizon],
             ]
         )
-        return Still(
+        return SceneConstants(
             looks=self._records,
             constants=constants,
             lamps=scene.shine,

@@ -1,46 +1,23 @@
 """Colors of textures at coordinates, with mip levels and weights as OpenGL on a CPU (Mesa's llvmpipe) has them.
 
-Everything works on rows of `lanes`. Texels and weights are whole numbers below 2^24, which float32 holds exactly.
+Everything works on rows of `layout`. Texels and weights are whole numbers below 2^24, which float32 holds exactly.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from dmcvb_gen.rendering.native.lanes import (
-    BLUE,
-    DX,
-    DY,
-    DZ,
-    FACE,
-    FOOTPRINT,
-    GREEN,
-    LEVEL,
-    MIX,
-    RED,
-    RIGHT_X,
-    RIGHT_Y,
-    RIGHT_Z,
-    UP_X,
-    UP_Y,
-    UP_Z,
-    S,
-    T,
-    distinct,
-    get,
-    leaf,
-    part,
-    put,
-    stage,
-)
-from dmcvb_gen.rendering.native.records import FACES, FIRST, LEVELS
+from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native.layout import distinct, get, get3, leaf, part, put, put3, stage
 
 f4, i4 = np.float32, np.int32
+SHARE_UNIT = 1.0 / (255.0 * 65536.0 * 256.0)
+"""Of a channel in a byte, times the weights of a texel, times 256ths of a level: the color in [0, 1]."""
 
 
 @part
 def fill(s, n, row, value):
-    """Set a row of `lanes`."""
+    """Set a row of `layout`."""
     for i in range(n):
         put(s, row + i, value)
 
@@ -58,7 +35,7 @@ def choose_levels(s, n, last):
     distinct()
     most = i4(0)
     for i in range(n):
-        rho = get(s, FOOTPRINT + i)
+        rho = get(s, L.FOOTPRINT + i)
         bits = f4(rho).view(i4)
         power, rest = f4(i4((bits >> i4(23)) - i4(127))), f4(i4(bits & i4(0x7FFFFF))) * f4(1.0 / 0x800000)
         lod = f4(0.5) * (power + rest) + f4(0.25)
@@ -66,11 +43,9 @@ def choose_levels(s, n, last):
         level = i4(lod)
         share = np.floor(f4(256) * max(f4(2) * (lod - f4(level)) - f4(1), f4(0)))
         share = share if level < last else f4(0)
-        put(s, LEVEL + i, f4(min(level, i4(last))))
-        put(s, MIX + i, share)
-        put(s, RED + i, f4(0))
-        put(s, GREEN + i, f4(0))
-        put(s, BLUE + i, f4(0))
+        put(s, L.LEVEL + i, f4(min(level, i4(last))))
+        put(s, L.MIX + i, share)
+        put3(s, L.TEXEL + i, f4(0), f4(0), f4(0))
         most = max(most, i4(share))
     return most > 0
 
@@ -88,31 +63,39 @@ def blend(one, two, three, four, across, down, shift):
     return (a * left + b * across) * top + (c * left + d * across) * down
 
 
+@leaf
+def add_texels(s, i, texels, base, columns, left, right, top, bottom, across, down, share):
+    """Add `share` of a blend of four texels of a level to TEXEL; the level begins at `base`, in rows of `columns`."""
+    top, bottom = i4(base + i4(top * columns)), i4(base + i4(bottom * columns))
+    one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
+    three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
+    red, green, blue = get3(s, L.TEXEL + i)
+    red += share * blend(one, two, three, four, across, down, i4(0))
+    green += share * blend(one, two, three, four, across, down, i4(8))
+    blue += share * blend(one, two, three, four, across, down, i4(16))
+    put3(s, L.TEXEL + i, red, green, blue)
+
+
 @part
 def add_repeating(s, n, texels, at, last, further, weight, slope):
-    """Add one level's color at (S, T) to RED, GREEN, BLUE, `weight + slope * MIX` times.
+    """Add one level's color at (S, T) to TEXEL, `weight + slope * MIX` times.
 
     Args:
       at: where in `texels` the table of textures has the texture's first level; `further`: 1 for the coarser level.
     """
     distinct()
     for i in range(n):
-        entry = at + 3 * min(i4(get(s, LEVEL + i)) + further, last)
+        entry = at + 3 * min(i4(get(s, L.LEVEL + i)) + further, last)
         base, columns, rows = get(texels, entry), get(texels, entry + 1), get(texels, entry + 2)
-        x, y = get(s, S + i), get(s, T + i)
+        x, y = get(s, L.S + i), get(s, L.T + i)
         x, y = (x - np.floor(x)) * f4(columns) + f4(0.5), (y - np.floor(y)) * f4(rows) + f4(0.5)
         right, bottom = i4(x), i4(y)
         across, down = np.floor(f4(256) * (x - f4(right))), np.floor(f4(256) * (y - f4(bottom)))
         left, top = i4(right - i4(1)), i4(bottom - i4(1))
         left, top = left if left >= 0 else i4(columns - i4(1)), top if top >= 0 else i4(rows - i4(1))
         right, bottom = right if right < columns else i4(0), bottom if bottom < rows else i4(0)
-        top, bottom = i4(base + i4(top * columns)), i4(base + i4(bottom * columns))
-        one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
-        three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
-        share = (weight + slope * get(s, MIX + i)) * f4(1.0 / (255.0 * 65536.0 * 256.0))
-        put(s, RED + i, get(s, RED + i) + share * blend(one, two, three, four, across, down, i4(0)))
-        put(s, GREEN + i, get(s, GREEN + i) + share * blend(one, two, three, four, across, down, i4(8)))
-        put(s, BLUE + i, get(s, BLUE + i) + share * blend(one, two, three, four, across, down, i4(16)))
+        share = (weight + slope * get(s, L.MIX + i)) * f4(SHARE_UNIT)
+        add_texels(s, i, texels, base, columns, left, right, top, bottom, across, down, share)
 
 
 @stage
@@ -123,11 +106,11 @@ def sample_repeating(s, n, texels, width, texture):
       texels: the table of textures, and the textures; `width` of the table's rows.
     """
     at = texture * width
-    last = i4(texels[at + LEVELS] - 1)
+    last = i4(texels[at + L.LEVELS] - 1)
     mixed = choose_levels(s, n, last)
-    add_repeating(s, n, texels, at + FIRST, last, i4(0), f4(256), f4(-1))
+    add_repeating(s, n, texels, at + L.FIRST, last, i4(0), f4(256), f4(-1))
     if mixed:
-        add_repeating(s, n, texels, at + FIRST, last, i4(1), f4(0), f4(1))
+        add_repeating(s, n, texels, at + L.FIRST, last, i4(1), f4(0), f4(1))
 
 
 @leaf
@@ -153,7 +136,7 @@ def face_cube(s, n, half):
     """
     distinct()
     for i in range(n):
-        x, y, z = get(s, DX + i), get(s, DY + i), get(s, DZ + i)
+        x, y, z = get3(s, L.DIRECTION + i)
         ax, ay, az = abs(x), abs(y), abs(z)
         along_z = (az >= ax) & (az >= ay)
         along_x = (not along_z) & (ax > ay)
@@ -162,15 +145,17 @@ def face_cube(s, n, half):
         across, upwards, length = turn_to_face(along_z, along_x, sign, x, y, z)
         over = f4(1) / length
         across, upwards = across * over, upwards * over
-        a, b, c = turn_to_face(along_z, along_x, sign, get(s, RIGHT_X + i), get(s, RIGHT_Y + i), get(s, RIGHT_Z + i))
-        d, e, f = turn_to_face(along_z, along_x, sign, get(s, UP_X + i), get(s, UP_Y + i), get(s, UP_Z + i))
+        x, y, z = get3(s, L.RIGHT + i)
+        a, b, c = turn_to_face(along_z, along_x, sign, x, y, z)
+        x, y, z = get3(s, L.UP + i)
+        d, e, f = turn_to_face(along_z, along_x, sign, x, y, z)
         most = max(max(abs(a - across * c), abs(b - upwards * c)), max(abs(d - across * f), abs(e - upwards * f)))
         rho = half * most * over
         first = f4(4) if along_z else (f4(0) if along_x else f4(2))
-        put(s, FACE + i, first if sign > f4(0) else first + f4(1))
-        put(s, S + i, min(max(f4(0.5) * across + f4(0.5), f4(0)), f4(1)))
-        put(s, T + i, min(max(f4(0.5) * upwards + f4(0.5), f4(0)), f4(1)))
-        put(s, FOOTPRINT + i, rho * rho)
+        put(s, L.FACE + i, first if sign > f4(0) else first + f4(1))
+        put(s, L.S + i, min(max(f4(0.5) * across + f4(0.5), f4(0)), f4(1)))
+        put(s, L.T + i, min(max(f4(0.5) * upwards + f4(0.5), f4(0)), f4(1)))
+        put(s, L.FOOTPRINT + i, rho * rho)
 
 
 @part
@@ -182,30 +167,25 @@ def add_clamped(s, n, texels, at, many, last, further, weight, slope):
     """
     distinct()
     for i in range(n):
-        entry = at + 3 * min(i4(get(s, LEVEL + i)) + further, last)
+        entry = at + 3 * min(i4(get(s, L.LEVEL + i)) + further, last)
         base, side = get(texels, entry), get(texels, entry + 1)
-        x, y = get(s, S + i) * f4(side) + f4(0.5), get(s, T + i) * f4(side) + f4(0.5)
+        x, y = get(s, L.S + i) * f4(side) + f4(0.5), get(s, L.T + i) * f4(side) + f4(0.5)
         right, bottom = i4(x), i4(y)
         across, down = np.floor(f4(256) * (x - f4(right))), np.floor(f4(256) * (y - f4(bottom)))
         left, top = max(i4(right - i4(1)), i4(0)), max(i4(bottom - i4(1)), i4(0))
         right, bottom = min(right, i4(side - i4(1))), min(bottom, i4(side - i4(1)))
-        base = i4(base + i4(many * i4(get(s, FACE + i))) * i4(side * side))
-        top, bottom = i4(base + i4(top * side)), i4(base + i4(bottom * side))
-        one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
-        three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
-        share = (weight + slope * get(s, MIX + i)) * f4(1.0 / (255.0 * 65536.0 * 256.0))
-        put(s, RED + i, get(s, RED + i) + share * blend(one, two, three, four, across, down, i4(0)))
-        put(s, GREEN + i, get(s, GREEN + i) + share * blend(one, two, three, four, across, down, i4(8)))
-        put(s, BLUE + i, get(s, BLUE + i) + share * blend(one, two, three, four, across, down, i4(16)))
+        base = i4(base + i4(many * i4(get(s, L.FACE + i))) * i4(side * side))
+        share = (weight + slope * get(s, L.MIX + i)) * f4(SHARE_UNIT)
+        add_texels(s, i, texels, base, side, left, right, top, bottom, across, down, share)
 
 
 @part
 def sample_cube(s, n, texels, width, texture):
     """Sample a cube map in a direction with its changes to the right and upwards. See `sample_repeating`."""
     at = texture * width
-    last, many = i4(texels[at + LEVELS] - 1), i4(1 if texels[at + FACES] > 1 else 0)
-    face_cube(s, n, f4(0.5) * f4(texels[at + FIRST + 1]))
+    last, many = i4(texels[at + L.LEVELS] - 1), i4(1 if texels[at + L.FACES] > 1 else 0)
+    face_cube(s, n, f4(0.5) * f4(texels[at + L.FIRST + 1]))
     mixed = choose_levels(s, n, last)
-    add_clamped(s, n, texels, at + FIRST, many, last, i4(0), f4(256), f4(-1))
+    add_clamped(s, n, texels, at + L.FIRST, many, last, i4(0), f4(256), f4(-1))
     if mixed:
-        add_clamped(s, n, texels, at + FIRST, many, last, i4(1), f4(0), f4(1))
+        add_clamped(s, n, texels, at + L.FIRST, many, last, i4(1), f4(0), f4(1))

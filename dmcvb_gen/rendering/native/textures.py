@@ -11,13 +11,16 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
+from numba import njit
 from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.native import skies
-from dmcvb_gen.rendering.native.compiled import call
-from dmcvb_gen.rendering.native.records import FACES, FIRST, LEVELS
+from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native.layout import call, distinct, get, leaf, part, put
 
+f4, i4 = np.float32, np.int32
+BITS = 22
+"""Bits of Pillow's weights below the point."""
 SKY_WIDTH = 800
 """Texels a side of a background on the sky (the skybox's own width, Distracting Control Suite)."""
 SKY_BYTES = 64 << 20
@@ -104,8 +107,8 @@ def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.nd
         total = sum(width * height for width, height in level_sizes(SKY_WIDTH, SKY_WIDTH))
         sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}
         room.update({name: np.empty(size, np.int32) for name, size in sizes.items()})
-    across, down = skies.taps(columns, SKY_WIDTH), skies.taps(rows, SKY_WIDTH)
-    call(skies.sky_maker, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], room["all"])
+    across, down = taps(columns, SKY_WIDTH), taps(rows, SKY_WIDTH)
+    call(sky_maker, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], room["all"])
     return room["all"]
 
 
@@ -140,12 +143,12 @@ class Textures:
         self.slots = int(np.clip(SKY_BYTES // each, 8, 256)) if backgrounds is not None else 0
         textures += [sky] * self.slots
         most = max((len(sizes) for sizes, _, _ in textures), default=0)
-        self.table = np.zeros((max(len(textures), 1), FIRST + 3 * most), np.int32)
+        self.table = np.zeros((max(len(textures), 1), L.FIRST + 3 * most), np.int32)
         total = self.table.size
         for row, (sizes, faces, first) in zip(self.table, textures, strict=False):
-            row[LEVELS], row[FACES] = len(sizes), faces
+            row[L.LEVELS], row[L.FACES] = len(sizes), faces
             for level, (width, height) in enumerate(sizes):
-                row[FIRST + 3 * level : FIRST + 3 * level + 3] = total, width, height
+                row[L.FIRST + 3 * level : L.FIRST + 3 * level + 3] = total, width, height
                 total += faces * width * height if level >= first else 0
         self.texels = np.empty(total, np.int32)  # memory is taken when a texture is written
         self.texels[: self.table.size] = self.table.ravel()
@@ -155,7 +158,7 @@ class Textures:
         if index < 0 or index in self._ready:
             return
         self._ready.add(index)
-        faces = int(self.table[index, FACES])
+        faces = int(self.table[index, L.FACES])
         # OpenGL reads cubes as they are.
         srgb = faces == 1 and self._model.tex_colorspace[index] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
         for face, picture in enumerate(self._faces(index, faces)):
@@ -178,7 +181,7 @@ class Textures:
         return self._slot[key]
 
     def _put(self, texture: int, level: int, texels: np.ndarray, face: int = 0) -> None:
-        first = int(self.table[texture, FIRST + 3 * level]) + face * len(texels)
+        first = int(self.table[texture, L.FIRST + 3 * level]) + face * len(texels)
         self.texels[first : first + len(texels)] = texels
 
     def _faces(self, index: int, faces: int) -> list[np.ndarray]:
@@ -189,3 +192,124 @@ class Textures:
         if faces == 1:
             return [data]
         return [data] * 6 if height == width else [data[face * width : (face + 1) * width] for face in range(6)]
+
+
+# -- skies: the same bits as Pillow's bilinear `resize` and `reduce`, several times as fast ----------
+
+
+def taps(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of `old` texels made `new` >= `old`: (new,) int32, the first of the two that each lies between, and its weight.
+
+    Pillow's bilinear filter; the second one has the rest of the weight.
+    """
+    center = (np.arange(new) + 0.5) * (old / new)
+    first = np.maximum((center - 0.5).astype(np.int64), 0)
+    past = np.minimum((center + 1.5).astype(np.int64), old)
+    share = 1.0 - np.abs(first - center + 0.5)
+    second = np.where(past - first > 1, 1.0 - np.abs(first + 1 - center + 0.5), 0.0)
+    weight = (0.5 + share / (share + second) * (1 << BITS)).astype(np.int64)
+    alone = np.minimum(first, old - 2) < first  # the last texel counts as a second one without a first
+    weight = np.where(alone, 0, weight)
+    return np.where(alone, old - 2, first).astype(np.int32), weight.astype(np.int32)
+
+
+@leaf
+def between(one, two, weight, shift):
+    """Channel of two texels by weight of the first, in its place."""
+    a, b = i4((one >> shift) & i4(255)), i4((two >> shift) & i4(255))
+    value = i4(i4(a * weight) + i4(b * i4(i4(1 << BITS) - weight)))
+    return i4(i4(i4(value + i4(1 << (BITS - 1))) >> i4(BITS)) << shift)
+
+
+@part
+def widen(texels, first, weight, rows, columns, wide, out):
+    """(rows * columns) texels made (rows * wide)."""
+    distinct()
+    for row in range(rows):
+        at, to = row * columns, row * wide
+        for x in range(wide):
+            place, share = i4(at + get(first, x)), get(weight, x)
+            one, two = get(texels, place), get(texels, i4(place + i4(1)))
+            red, green = between(one, two, share, i4(0)), between(one, two, share, i4(8))
+            put(out, to + x, i4(red | green | between(one, two, share, i4(16))))
+
+
+@part
+def heighten(texels, first, weight, columns, high, out):
+    """(rows * columns) texels made (high * columns)."""
+    distinct()
+    for row in range(high):
+        at, to, share = first[row] * columns, row * columns, weight[row]
+        for x in range(columns):
+            one, two = get(texels, at + x), get(texels, at + columns + x)
+            red, green = between(one, two, share, i4(0)), between(one, two, share, i4(8))
+            put(out, to + x, i4(red | green | between(one, two, share, i4(16))))
+
+
+@part
+def halve(texels, side, out):
+    """(2 * side * 2 * side) texels made (side * side), boxes of four."""
+    distinct()
+    for row in range(side):
+        at, to = 4 * side * row, side * row
+        for x in range(side):
+            one, two = get(texels, at + 2 * x), get(texels, at + 2 * x + 1)
+            three, four = get(texels, at + 2 * side + 2 * x), get(texels, at + 2 * side + 2 * x + 1)
+            apart = i4(0xFF00FF)
+            sides = i4((one & apart) + (two & apart) + (three & apart) + (four & apart) + 0x20002)
+            middle = i4(((one >> 8) & 255) + ((two >> 8) & 255) + ((three >> 8) & 255) + ((four >> 8) & 255) + 2)
+            put(out, to + x, i4(((sides >> 2) & apart) | ((middle >> 2) << 8)))
+
+
+@part
+def shrink(texels, side, out):
+    """(side * side) texels of an odd side made (side // 2)^2, each the blend of the four around its center."""
+    less = side // 2
+    for row in range(less):
+        y = (row + 0.5) * side / less - 0.5
+        top = int(np.floor(y))
+        down = f4(y - top)
+        for column in range(less):
+            x = (column + 0.5) * side / less - 0.5
+            left = int(np.floor(x))
+            across, color = f4(x - left), i4(0)
+            for shift in range(0, 24, 8):
+                a, b = channel(texels, side * top + left, shift), channel(texels, side * top + left + 1, shift)
+                at = side * (top + 1) + left
+                c, d = channel(texels, at, shift), channel(texels, at + 1, shift)
+                near, far = a * (f4(1) - down) + c * down, b * (f4(1) - down) + d * down
+                value = np.floor(near * (f4(1) - across) + far * across + f4(0.5))
+                color |= i4(i4(value) << shift)
+            out[less * row + column] = color
+
+
+@leaf
+def channel(texels, at, shift):
+    """A channel of a texel, as a float."""
+    return f4(i4((texels[at] >> shift) & 255))
+
+
+def sky_maker(version: int):
+    """Return a function that makes of (rows, columns, 3) uint8 the texels of `side` * `side` and of all smaller levels,
+    one after another; see `frame.painter`.
+    """
+
+    @njit(nogil=True, error_model="numpy", cache=True)
+    def make(picture, across, across_weight, down, down_weight, narrow, tall, out):
+        rows, columns, side = picture.shape[0], picture.shape[1], down.size
+        if version != 0:
+            for row in range(rows):
+                for x in range(columns):
+                    red, green, blue = i4(picture[row, x, 0]), i4(picture[row, x, 1]), i4(picture[row, x, 2])
+                    narrow[row * columns + x] = red | (green << 8) | (blue << 16)
+            widen(narrow, across, across_weight, rows, columns, side, tall)
+            heighten(tall, down, down_weight, side, side, out)
+            at = 0
+            while side > 1:
+                if side % 2 == 0:
+                    halve(out[at : at + side * side], side // 2, out[at + side * side :])
+                else:
+                    shrink(out[at : at + side * side], side, out[at + side * side :])
+                at, side = at + side * side, side // 2
+
+    return make

@@ -11,22 +11,8 @@ import math
 
 import numpy as np
 
-from dmcvb_gen.rendering.native.lanes import distinct, get, leaf, part, put
-from dmcvb_gen.rendering.native.records import (
-    AXIS,
-    BALL,
-    CLIP,
-    FAR,
-    FUNCTIONS,
-    HORIZON,
-    KIND,
-    NEAR,
-    PLACE,
-    SIZE,
-    STEP,
-    TURN,
-    VIEW,
-)
+from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native.layout import distinct, get, leaf, part, put
 from dmcvb_gen.rendering.native.scene import BOX, CYLINDER
 
 SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
@@ -63,13 +49,13 @@ def slopes_of_ball(side, depth, radius):
 @part
 def screen_box(left, right, low, high, k, size):
     """Columns and rows (first, past the last) of the pixels that slopes in these ranges touch, inside CLIP."""
-    half, step = 0.5 * size, k[STEP]
+    half, step = 0.5 * size, k[L.STEP]
     first_column = int(math.floor(min(max(left / step + half - 0.01, 0.0), size)))
     past_column = int(math.ceil(min(max(right / step + half + 0.01, 0.0), size)))
     first_row = int(math.floor(min(max(half - high / step - 0.01, 0.0), size)))
     past_row = int(math.ceil(min(max(half - low / step + 0.01, 0.0), size)))
-    first_column, past_column = max(first_column, int(k[CLIP])), min(past_column, int(k[CLIP + 1]))
-    return first_column, past_column, max(first_row, int(k[CLIP + 2])), min(past_row, int(k[CLIP + 3]))
+    first_column, past_column = max(first_column, int(k[L.CLIP])), min(past_column, int(k[L.CLIP + 1]))
+    return first_column, past_column, max(first_row, int(k[L.CLIP + 2])), min(past_row, int(k[L.CLIP + 3]))
 
 
 @part
@@ -80,7 +66,7 @@ def box_of_body(k, rec, g, place, axis, half, size):
       place, axis: the columns of `rec` where its center and its axis are.
     """
     left, right, low, high = 1e9, -1e9, 1e9, -1e9
-    radius, behind = rec[g, BALL], True
+    radius, behind = rec[g, L.BALL], True
     for end in range(2):
         reach = half if end == 0 else -half
         x, y = rec[g, place] + reach * rec[g, axis], rec[g, place + 1] + reach * rec[g, axis + 1]
@@ -104,7 +90,7 @@ def draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, g
       nearest: the largest inverse depth drawn.
     """
     distinct()
-    px, py, pz, radius = rec[g, place], rec[g, place + 1], rec[g, place + 2], rec[g, SIZE]
+    px, py, pz, radius = rec[g, place], rec[g, place + 1], rec[g, place + 2], rec[g, L.SIZE]
     inside = px * px + py * py + pz * pz - radius * radius
     if inside <= 0.0:
         return  # its back faces are not drawn
@@ -130,7 +116,7 @@ def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nea
     """Put a capsule into the buffers; see `draw_sphere` and `box_of_body`."""
     distinct()
     zero, one = np.float32(0), np.float32(1)
-    radius, half = rec[g, SIZE], rec[g, SIZE + 1]
+    radius, half = rec[g, L.SIZE], rec[g, L.SIZE + 1]
     px, py, pz = rec[g, place], rec[g, place + 1], rec[g, place + 2]
     dx, dy, dz = rec[g, axis], rec[g, axis + 1], rec[g, axis + 2]
     ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
@@ -181,19 +167,31 @@ def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nea
 
 
 @leaf
-def own_origin(rec, g, place, turn, axis, x, y, z):
-    """Coordinate `axis` of the camera-frame point (x, y, z) in a solid's own frame."""
-    at, over = turn + axis, 1.0 / half_length(rec, g, axis)
-    dx, dy, dz = x - rec[g, place], y - rec[g, place + 1], z - rec[g, place + 2]
-    return (rec[g, at] * dx + rec[g, at + 3] * dy + rec[g, at + 6] * dz) * over
+def half_length(rec, g, axis):
+    """Half length of a solid along one of its axes, meters; a cylinder's sizes are its radius and its half length."""
+    if rec[g, L.KIND] == CYLINDER:
+        return rec[g, L.SIZE + 1] if axis == 2 else rec[g, L.SIZE]
+    return rec[g, L.SIZE + axis]
 
 
 @leaf
-def half_length(rec, g, axis):
-    """Half length of a solid along one of its axes, meters; a cylinder's sizes are its radius and its half length."""
-    if rec[g, KIND] == CYLINDER:
-        return rec[g, SIZE + 1] if axis == 2 else rec[g, SIZE]
-    return rec[g, SIZE + axis]
+def own_point(rec, g, place, turn, x, y, z):
+    """The camera-frame point (x, y, z) in a solid's own frame, float32."""
+    x, y, z = x - rec[g, place], y - rec[g, place + 1], z - rec[g, place + 2]
+    a = (rec[g, turn] * x + rec[g, turn + 3] * y + rec[g, turn + 6] * z) * (1.0 / half_length(rec, g, 0))
+    b = (rec[g, turn + 1] * x + rec[g, turn + 4] * y + rec[g, turn + 7] * z) * (1.0 / half_length(rec, g, 1))
+    c = (rec[g, turn + 2] * x + rec[g, turn + 5] * y + rec[g, turn + 8] * z) * (1.0 / half_length(rec, g, 2))
+    return np.float32(a), np.float32(b), np.float32(c)
+
+
+@leaf
+def own_axes(rec, g, turn):
+    """The three axes of a solid over their half lengths, nine float32."""
+    f4, a, b, c = np.float32, 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
+    ax, ay, az = f4(a * rec[g, turn]), f4(a * rec[g, turn + 3]), f4(a * rec[g, turn + 6])
+    bx, by, bz = f4(b * rec[g, turn + 1]), f4(b * rec[g, turn + 4]), f4(b * rec[g, turn + 7])
+    cx, cy, cz = f4(c * rec[g, turn + 2]), f4(c * rec[g, turn + 5]), f4(c * rec[g, turn + 8])
+    return ax, ay, az, bx, by, bz, cx, cy, cz
 
 
 @leaf
@@ -241,16 +239,9 @@ def draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, neare
       turn: the column of `rec` where its axes are.
     """
     distinct()
-    f4, kind = np.float32, int(rec[g, KIND])
-    ox, oy = (
-        f4(own_origin(rec, g, place, turn, 0, 0.0, 0.0, 0.0)),
-        f4(own_origin(rec, g, place, turn, 1, 0.0, 0.0, 0.0)),
-    )
-    oz = f4(own_origin(rec, g, place, turn, 2, 0.0, 0.0, 0.0))
-    a, b, c = 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
-    ax, ay, az = f4(a * rec[g, turn]), f4(a * rec[g, turn + 3]), f4(a * rec[g, turn + 6])
-    bx, by, bz = f4(b * rec[g, turn + 1]), f4(b * rec[g, turn + 4]), f4(b * rec[g, turn + 7])
-    cx, cy, cz = f4(c * rec[g, turn + 2]), f4(c * rec[g, turn + 5]), f4(c * rec[g, turn + 8])
+    f4, kind = np.float32, int(rec[g, L.KIND])
+    ox, oy, oz = own_point(rec, g, place, turn, 0.0, 0.0, 0.0)
+    ax, ay, az, bx, by, bz, cx, cy, cz = own_axes(rec, g, turn)
     limit, tiny, size = f4(nearest), f4(1e-6), rays.size // 9
     for row in range(r0, r1):
         top, at = rays[8 * size + row], 4 * size * row
@@ -268,12 +259,12 @@ def draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, neare
 def draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, geom):
     """Put a rectangle into the buffers, from its FUNCTIONS, as far as the sky does not hide it."""
     distinct()
-    at = FUNCTIONS
+    at = L.FUNCTIONS
     a, b, c = np.float32(rec[g, at]), np.float32(rec[g, at + 1]), np.float32(rec[g, at + 2])
     ua, ub, uc = np.float32(rec[g, at + 3]), np.float32(rec[g, at + 4]), np.float32(rec[g, at + 5])
     va, vb, vc = np.float32(rec[g, at + 6]), np.float32(rec[g, at + 7]), np.float32(rec[g, at + 8])
-    least, most = np.float32(1.0 / k[FAR]), np.float32(1.0 / k[NEAR])
-    at, over = VIEW, 1.0 / k[HORIZON]  # a ray's run in the world's horizontal plane, over the horizon
+    least, most = np.float32(1.0 / k[L.FAR]), np.float32(1.0 / k[L.NEAR])
+    at, over = L.VIEW, 1.0 / k[L.HORIZON]  # a ray's run in the world's horizontal plane, over the horizon
     ea, eb, ec = np.float32(k[at] * over), np.float32(k[at + 1] * over), np.float32(k[at + 2] * over)
     na, nb, nc = np.float32(k[at + 3] * over), np.float32(k[at + 4] * over), np.float32(k[at + 5] * over)
     size = rays.size // 9
@@ -294,18 +285,18 @@ def draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, geom):
 def plane_functions(rec, g):
     """Fill a plane's FUNCTIONS: inverse depth, and its two coordinates over their half lengths times the inverse
     depth, each as an affine function of the ray's (x, y). Gives whether the plane faces the camera."""
-    px, py, pz = rec[g, PLACE], rec[g, PLACE + 1], rec[g, PLACE + 2]
-    nx, ny, nz = rec[g, AXIS], rec[g, AXIS + 1], rec[g, AXIS + 2]
+    px, py, pz = rec[g, L.PLACE], rec[g, L.PLACE + 1], rec[g, L.PLACE + 2]
+    nx, ny, nz = rec[g, L.AXIS], rec[g, L.AXIS + 1], rec[g, L.AXIS + 2]
     toward = px * nx + py * ny + pz * nz
     if toward == 0.0:
-        rec[g, FUNCTIONS : FUNCTIONS + 9] = 0.0
+        rec[g, L.FUNCTIONS : L.FUNCTIONS + 9] = 0.0
         return False
     a, b, c = nx / toward, ny / toward, -nz / toward
-    rec[g, FUNCTIONS], rec[g, FUNCTIONS + 1], rec[g, FUNCTIONS + 2] = a, b, c
+    rec[g, L.FUNCTIONS], rec[g, L.FUNCTIONS + 1], rec[g, L.FUNCTIONS + 2] = a, b, c
     for axis in range(2):
-        ex, ey, ez = rec[g, TURN + axis], rec[g, TURN + 3 + axis], rec[g, TURN + 6 + axis]
-        along, over = px * ex + py * ey + pz * ez, 1.0 / rec[g, SIZE + axis]
-        at = FUNCTIONS + 3 + 3 * axis
+        ex, ey, ez = rec[g, L.TURN + axis], rec[g, L.TURN + 3 + axis], rec[g, L.TURN + 6 + axis]
+        along, over = px * ex + py * ey + pz * ez, 1.0 / rec[g, L.SIZE + axis]
+        at = L.FUNCTIONS + 3 + 3 * axis
         rec[g, at], rec[g, at + 1], rec[g, at + 2] = (
             (ex - along * a) * over,
             (ey - along * b) * over,
@@ -317,12 +308,12 @@ def plane_functions(rec, g):
 @part
 def corner_of_plane(rec, g, corner):
     """Side, height and depth of one of a rectangle's four corners, in turn."""
-    a = rec[g, SIZE] if corner == 1 or corner == 2 else -rec[g, SIZE]
-    b = rec[g, SIZE + 1] if corner == 2 or corner == 3 else -rec[g, SIZE + 1]
+    a = rec[g, L.SIZE] if corner == 1 or corner == 2 else -rec[g, L.SIZE]
+    b = rec[g, L.SIZE + 1] if corner == 2 or corner == 3 else -rec[g, L.SIZE + 1]
     return (
-        rec[g, PLACE] + a * rec[g, TURN] + b * rec[g, TURN + 1],
-        rec[g, PLACE + 1] + a * rec[g, TURN + 3] + b * rec[g, TURN + 4],
-        -(rec[g, PLACE + 2] + a * rec[g, TURN + 6] + b * rec[g, TURN + 7]),
+        rec[g, L.PLACE] + a * rec[g, L.TURN] + b * rec[g, L.TURN + 1],
+        rec[g, L.PLACE + 1] + a * rec[g, L.TURN + 3] + b * rec[g, L.TURN + 4],
+        -(rec[g, L.PLACE + 2] + a * rec[g, L.TURN + 6] + b * rec[g, L.TURN + 7]),
     )
 
 
