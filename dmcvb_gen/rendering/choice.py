@@ -73,8 +73,8 @@ def _moments(task: Task) -> np.ndarray:
     batch.reset([np.random.default_rng(0)])
     states = [batch.physics()[0]]
     for _ in range(min(task.max_steps, STEPS)):
-        ended = batch.step(rng.uniform(-1, 1, (1, task.action_size))).terminated[0]
+        step = batch.step(task.from_unit(rng.uniform(-1, 1, (1, task.action_size))))
         states.append(batch.physics()[0])
-        if ended:
+        if step.terminated[0] or step.truncated[0]:
             break
     return np.stack([states[0], states[len(states) // 2], states[-1]])

@@ -13,9 +13,8 @@ import pytest
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering import choice, default_renderer, make_renderer, opengl
-from dmcvb_gen.tasks.base import PHYSICS_SPEC
+from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
-from dmcvb_gen.tasks.suite import SuiteTask
 from tests.rendering.test_rendering import needs_opengl
 
 SKY = '<texture type="skybox" builtin="gradient" rgb1=".4 .6 .8" rgb2="0 0 0" width="128" height="128"/>'
@@ -114,7 +113,9 @@ NATIVE = {f"{geom}, plain" for geom in GEOMS if geom not in ("mesh", "hfield")} 
 def task_of(tmp_path, xml, steps=8, **options):
     """A task of a user's own, and states of two episodes of it: (frame, physics)."""
     (tmp_path / "model.xml").write_text(xml)
-    task = SuiteTask("own:model", lambda: mjcf_environment(tmp_path / "model.xml", lambda physics: 0.0, **options))
+    task = EnvironmentTask(
+        "own:model", lambda: mjcf_environment(tmp_path / "model.xml", lambda physics: 0.0, **options)
+    )
     batch = task.batch(2)
     batch.reset([np.random.default_rng(seed) for seed in range(2)])
     for _ in range(steps):
@@ -140,7 +141,7 @@ def reference(task, physics, change=lambda model, data: None):
     for row in physics:
         model = copy.copy(task.model)
         data = mujoco.MjData(model)
-        mujoco.mj_setState(model, data, row[: mujoco.mj_stateSize(model, PHYSICS_SPEC)], PHYSICS_SPEC)
+        mujoco.mj_setState(model, data, row[: mujoco.mj_stateSize(model, task.physics_spec)], task.physics_spec)
         change(model, data)
         mujoco.mj_forward(model, data)
         with mujoco.Renderer(model, 64, 64) as renderer:
