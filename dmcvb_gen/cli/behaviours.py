@@ -145,7 +145,6 @@ def _show_picks(picked, run):
 @click.argument("task")
 @click.option("--out", type=OutPath(path_type=Path), required=True, help="Policy file to write (.safetensors).")
 @click.option("--level", type=click.Choice(["expert", "medium", "mixed"]), help="Level to note in the file.")
-@click.option("--hidden", metavar="N,N,...", help="Widths that the hidden layers must have.  [default: as they are]")
 @click.option(
     "--activation",
     type=click.Choice(["relu", "tanh", "elu", "gelu"]),
@@ -161,7 +160,7 @@ def _show_picks(picked, run):
     "--statistics", type=click.Path(path_type=Path), help='.npz with "mean" and "std" of normalized observations.'
 )
 @json_option
-def convert_policy(source, task, out, level, hidden, activation, distribution, statistics, as_json):
+def convert_policy(source, task, out, level, activation, distribution, statistics, as_json):
     """Convert another program's policy to a policy file: a Stable-Baselines3 zip or a torch state dict (CleanRL).
 
     Weights are read without unpickling anything. Data of a converted policy regenerate bit for bit. CleanRL's SAC keeps
@@ -169,7 +168,7 @@ def convert_policy(source, task, out, level, hidden, activation, distribution, s
 
     \b
     dmcvb-gen convert-policy model.zip walker-run --out walker-run.safetensors
-    dmcvb-gen convert-policy ppo.pt hopper-hop --hidden 64,64 --statistics observations.npz --out hopper-hop.safetensors
+    dmcvb-gen convert-policy ppo.pt hopper-hop --statistics observations.npz --out hopper-hop.safetensors
     dmcvb-gen rollout walker-run --level expert --behaviour walker-run.safetensors --episodes 20
     """
     from dmcvb_gen.own_code import allow
@@ -179,16 +178,11 @@ def convert_policy(source, task, out, level, hidden, activation, distribution, s
     allow([task])  # a person typed its name, so its code may run
     if out.suffix in CONVERTED:
         raise PolicyFileError(f"--behaviour would take {out} for another program's file; end its name in .safetensors")
-    try:
-        widths = [int(width) for width in hidden.split(",")] if hidden else None
-    except ValueError:
-        raise click.UsageError(f"--hidden {hidden!r} is no list of widths such as 256,256.") from None
     header = convert_file(
         source,
         task,
         out,
         level=level,
-        hidden=widths,
         activation=activation,
         distribution=distribution and {"tanh": "deterministic", "clip": "gaussian"}[distribution],
         statistics=statistics,

@@ -52,6 +52,10 @@ AGREEMENT = 1e-3
 """Largest difference between our actions and SB3's, of a range from -1 to 1."""
 
 
+SCALES = ("action_scale", "action_bias")
+"""Names of the half width and the middle of the actions' bounds, as CleanRL keeps them."""
+
+
 class Layout(NamedTuple):
     """Parameter names under which a program keeps the parts of an actor.
 
@@ -74,16 +78,8 @@ class Layout(NamedTuple):
     others: tuple[str, ...] = ()
 
 
-CRITICS = (
-    "critic",
-    "value_net.",
-    "mlp_extractor.value_net.",
-    "actor_target.",
-    "qf",
-    "fc_logstd.",
-    "action_scale",
-    "action_bias",
-)
+CRITICS = ("critic", "value_net.", "mlp_extractor.value_net.", "actor_target.", "qf", "fc_logstd.", *SCALES)
+"""Beginnings of the names of what is no part of a known program's actor."""
 LAYOUTS = (
     Layout("sb3", "actor.latent_pi.", "actor.mu", "actor.log_std", "relu", "squashed_gaussian", CRITICS),
     Layout("sb3", "actor.mu.", None, None, "relu", "deterministic", CRITICS),
@@ -122,7 +118,6 @@ def convert(
     task_id: str,
     level: str | None = None,
     *,
-    hidden: Sequence[int] | None = None,
     activation: str | None = None,
     distribution: str | None = None,
     statistics: str | Path | None = None,
@@ -130,7 +125,6 @@ def convert(
     """Header and weights of another program's policy.
 
     Args:
-      hidden: widths that its hidden layers must have.
       activation: activation of the hidden layers, if it is not the program's own: "relu", "tanh", "elu" or "gelu".
       distribution: of a plain network, "deterministic" (tanh of the output) or "gaussian" (clipped output).
       statistics: .npz file with "mean" and "std" of the observations that it was trained on, if it normalized them.
@@ -157,7 +151,12 @@ def convert(
         _scaled(weights, task)
     sizes = weights["body.0.weight" if body else "mean.weight"].shape[1], weights["mean.weight"].shape[0]
     widths = tuple(int(weights[f"body.{2 * index}.weight"].shape[0]) for index in range(len(body)))
-    _check_sizes(path, task, sizes, widths, hidden)
+    if sizes != (task.behaviour_size, task.action_size):
+        layers, asked = (sizes[0], *widths, sizes[1]), (task.behaviour_size, *widths, task.action_size)
+        raise PolicyFileError(
+            f"{path} has layers of {' x '.join(map(str, layers))}, {task_id} asks for {' x '.join(map(str, asked))} "
+            "(observation, hidden, action); train it on this task"
+        )
     if facts:
         _check_actions(path, task, facts.low, facts.high)
     if facts and facts.normalized and statistics is None:
@@ -257,29 +256,14 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
     )
 
 
-def _check_sizes(
-    path: Path, task: Task, sizes: tuple[int, int], widths: tuple[int, ...], hidden: Sequence[int] | None
-) -> None:
-    if sizes == (task.behaviour_size, task.action_size) and (hidden is None or tuple(hidden) == widths):
-        return
-    asked = task.behaviour_size, *(hidden if hidden is not None else widths), task.action_size
-    found = sizes[0], *widths, sizes[1]
-    raise PolicyFileError(
-        f"{path} has layers of {' x '.join(map(str, found))}, {task.id} and the sizes given ask for "
-        f"{' x '.join(map(str, asked))} (observation, hidden, action); train it on this task"
-    )
-
-
 def _check_actions(path: Path, task: Task, low: np.ndarray, high: np.ndarray) -> None:
     """Refuse an actor whose actions have other bounds than the task's, as nobody says how its environment took them."""
-    if not (np.allclose(low, task.action_low) and np.allclose(high, task.action_high)):
-        given, own = (
-            [np.round(bound, 6).tolist() for bound in bounds]
-            for bounds in ((low, high), (task.action_low.astype(float), task.action_high.astype(float)))
-        )
+    theirs = [np.round(bound.astype(float), 6).tolist() for bound in (low, high)]
+    ours = [np.round(bound.astype(float), 6).tolist() for bound in (task.action_low, task.action_high)]
+    if theirs != ours:
         raise PolicyFileError(
-            f"{path} acts from {given[0]} to {given[1]}, {task.id} takes actions from {own[0]} to {own[1]}; train it "
-            "with the task's own bounds"
+            f"{path} acts from {theirs[0]} to {theirs[1]}, {task.id} takes actions from {ours[0]} to {ours[1]}; train "
+            "it with the task's own bounds"
         )
 
 
@@ -353,9 +337,9 @@ def _weights(
             weights["log_std_vector"] = state[log_std].reshape(size) if log_std else np.full(size, NO_NOISE, np.float32)
     except (KeyError, ValueError, TypeError) as error:
         raise PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict") from None
-    scale, bias = (state[name].ravel() if name in state else None for name in ("action_scale", "action_bias"))
-    if scale is not None and bias is not None and len(scale) == len(bias) == task.action_size:
-        _check_actions(path, task, bias - scale, bias + scale)
+    if set(SCALES) <= state.keys():
+        half, middle = (state[name].ravel() for name in SCALES)
+        _check_actions(path, task, middle - half, middle + half)
     return weights
 
 

@@ -349,7 +349,7 @@ def test_a_cleanrl_state_dict_acts_as_cleanrl_does_and_regenerates(task, kind, t
     torch.save(actor.state_dict(), tmp_path / "actor.pt")
     statistics = {"mean": np.full(task.behaviour_size, 0.5), "std": np.full(task.behaviour_size, 2.0)}
     np.savez(tmp_path / "seen.npz", **statistics)
-    options = ["--hidden", "8,8", "--statistics", tmp_path / "seen.npz", "--out", tmp_path / "p.safetensors"]
+    options = ["--statistics", tmp_path / "seen.npz", "--out", tmp_path / "p.safetensors"]
     done("convert-policy", tmp_path / "actor.pt", task.id, *options)
     seen = np.random.default_rng(0).normal(size=(5, task.behaviour_size)).astype(np.float32)
     with torch.no_grad():
@@ -382,8 +382,6 @@ def test_policies_that_do_not_fit_are_refused_in_one_line(tmp_path):
     torch.save(mlp(sizes[0], 8, sizes[1]).state_dict(), plain)
     assert "give --activation and --actions" in refused("convert-policy", plain, WALKER, "--out", out)
     done("convert-policy", plain, WALKER, "--activation", "tanh", "--actions", "tanh", "--out", out)
-    wide = ["--activation", "tanh", "--actions", "tanh", "--hidden", "9", "--out", out]
-    assert "24 x 9 x 6" in refused("convert-policy", plain, WALKER, *wide)
     torch.save({"conv.weight": torch.zeros(3, 3, 3, 3)}, plain)
     assert "none of the actors that are known" in refused("convert-policy", plain, WALKER, "--out", out)
     model(SAC, task, use_sde=True, buffer_size=10).save(tmp_path / "sde.zip")
