@@ -157,3 +157,17 @@ def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """
     count = math.prod(shape)
     return gaussian(rng.random(count + count % 2))[:count].reshape(shape)
+
+
+def from_unit(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Numbers in [-1, 1], (..., n), scaled to [low, high], each (n,); as they are if these are -1 and 1."""
+    if (low == -1).all() and (high == 1).all():
+        return values
+    return np.clip(low + (values + 1) / 2 * (high - low), low, high).astype(values.dtype)
+
+
+def to_unit(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Numbers in [low, high], (..., n), scaled to [-1, 1]: the inverse of `from_unit`."""
+    if (low == -1).all() and (high == 1).all():
+        return values
+    return np.clip((values - low) / (high - low) * 2 - 1, -1, 1).astype(values.dtype)

@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from dmcvb_gen.agents.learners import Batch
+from dmcvb_gen.arithmetic import to_unit
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
@@ -464,6 +465,9 @@ def load_data(
     if memory is None:  # an accelerator's pictures are read into main memory first
         memory = min(default_memory(place) for place in ("cpu", device))
     table = StepTable.read(parts, PAD, None if needed <= memory else scratch or tempfile.gettempdir(), tick)
+    bounds = subsets[0].array("action").attributes  # agents act in [-1, 1], whatever the task's bounds
+    if "low" in bounds:
+        table.action[:] = to_unit(table.action, *(np.array(bounds[name], np.float32) for name in ("low", "high")))
     returns = np.concatenate([part.subset.read("return", part.episodes) for part in parts])
     return TrainingData(table, np.concatenate(held_out), stack, returns, device)
 

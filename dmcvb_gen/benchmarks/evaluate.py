@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("dmcvb_gen")
 Act = Callable[[dict[str, np.ndarray]], Any]
-"""A policy of one's own: observations of all episodes in, (episode, action) in [-1, 1] out.
+"""A policy of one's own: observations of all episodes in, (episode, action) out, in the task's bounds.
 
 The observations are "pixels" (episode, stack x view x 3, size, size) uint8, oldest frame first, as a release's `source`
 gives them, and "state" (episode, state) float32. A policy that asks for no pictures gets the states alone.
@@ -52,7 +52,7 @@ gives them, and "state" (episode, state) float32. A policy that asks for no pict
 STREAM_NAME = "validate"
 """Name of the evaluation's random streams, from which no release is made."""
 ROUNDING = 1e-5
-"""How far an action may leave [-1, 1] before it is refused: what rounding does."""
+"""How far an action may leave its bounds before it is refused: what rounding does."""
 SPLIT = "val"
 """Split of the videos and maze styles that no data show."""
 
@@ -241,7 +241,7 @@ class Evaluator:
         """Roll a policy out. It is asked for one action a step, for all episodes at once.
 
         Raises:
-          DmcvbError: its actions have another shape than (episode, action), are no numbers, or leave [-1, 1].
+          DmcvbError: its actions have another shape than (episode, action), are no numbers, or leave the task's bounds.
         """
         started = time.perf_counter()
         task, count = self.task, self.episodes
@@ -259,13 +259,16 @@ class Evaluator:
                 if step % max(1, self.steps // self.shots) == 0:
                     pictures.append(stack[0, -1, :3].transpose(1, 2, 0).copy())
                 observation["pixels"] = stack.reshape(count, -1, *stack.shape[3:]).copy()
-            action = check_actions(act(observation), (count, task.action_size), step)
+            given = act(observation)
+            given = task.from_unit(given) if isinstance(act, TrainedAgent) else given
+            action = check_actions(given, (count, task.action_size), step, task.action_low, task.action_high)
             result = batch.step(action, active)
             state = result.state
             returns += result.reward  # episodes that are over earn nothing
-            length[result.terminated & active] = step + 1
+            over = (result.terminated | result.truncated) & active
+            length[over] = step + 1
             ended |= result.terminated
-            active &= ~result.terminated
+            active &= ~over
             if not active.any():
                 break
         return Score.of(
@@ -305,11 +308,16 @@ def _distance(task, state: np.ndarray) -> np.ndarray | None:
     return None if part is None else np.linalg.norm(state[:, part], axis=1)
 
 
-def check_actions(actions: Any, shape: tuple[int, int], step: int) -> np.ndarray:
+def check_actions(
+    actions: Any, shape: tuple[int, int], step: int, low: np.ndarray | float = -1.0, high: np.ndarray | float = 1.0
+) -> np.ndarray:
     """(episode, action) float32: the actions of a policy at a step.
 
+    Args:
+      low, high: (action,) the task's bounds.
+
     Raises:
-      DmcvbError: they have another shape, are no numbers, or leave [-1, 1].
+      DmcvbError: they have another shape, are no numbers, or leave the bounds.
     """
     if hasattr(actions, "detach"):  # a torch tensor, which numpy does not read if it has a gradient or is elsewhere
         actions = actions.detach().cpu().float()
@@ -319,13 +327,14 @@ def check_actions(actions: Any, shape: tuple[int, int], step: int) -> np.ndarray
         raise DmcvbError(f"step {step}: the policy gave no array of actions ({error}); expected {shape}") from None
     if values.shape != shape:
         raise DmcvbError(f"step {step}: the policy gave actions of shape {values.shape}; expected {shape}")
-    if not np.isfinite(values).all():
-        place = tuple(map(int, np.argwhere(~np.isfinite(values))[0]))
-        raise DmcvbError(f"step {step}: the policy's action {place} is {values[place]}; expected numbers in [-1, 1]")
-    if np.abs(values).max() > 1 + ROUNDING:
-        place = tuple(map(int, np.unravel_index(np.abs(values).argmax(), shape)))
-        raise DmcvbError(f"step {step}: the policy's action {place} is {values[place]:g}; expected [-1, 1], clip it")
-    return values.clip(-1, 1)
+    low, high = np.broadcast_to(low, shape), np.broadcast_to(high, shape)
+    inside = (values >= low - ROUNDING) & (values <= high + ROUNDING)
+    if not inside.all():
+        place = tuple(map(int, np.argwhere(~inside)[0]))
+        expected = f"[{low[place]:g}, {high[place]:g}]"
+        cure = f"expected {expected}, clip it" if np.isfinite(values[place]) else f"expected numbers in {expected}"
+        raise DmcvbError(f"step {step}: the policy's action {place} is {values[place]:g}; {cure}")
+    return values.clip(low, high)
 
 
 def evaluate(

@@ -260,6 +260,7 @@ def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallb
     subset, manifest, backgrounds = work
     tick(subset.name)
     try:
+        from dmcvb_gen.distractors.registry import distractors_of
         from dmcvb_gen.generate.jobs import streams_of
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
@@ -269,6 +270,7 @@ def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallb
         return []
     try:
         get_task(subset.task)
+        distractors_of(subset.record.distractor)
     except DmcvbError as error:  # code of somebody else, which is not here or does not run here
         return [Issue(UNCHECKED, subset.name, f"values, physics and images cannot be checked here: {error}")]
     try:

@@ -166,17 +166,7 @@ class Task(abc.ABC):
 
     def from_unit(self, actions: np.ndarray) -> np.ndarray:
         """Actions in [-1, 1], (..., action), as a policy gives them, scaled to the task's own bounds."""
-        low, high = self.action_low, self.action_high
-        if (low == -1).all() and (high == 1).all():
-            return actions
-        return np.clip(low + (actions + 1) / 2 * (high - low), low, high).astype(actions.dtype)
-
-    def to_unit(self, actions: np.ndarray) -> np.ndarray:
-        """Actions in the task's own bounds, (..., action), scaled to [-1, 1]: the inverse of `from_unit`."""
-        low, high = self.action_low, self.action_high
-        if (low == -1).all() and (high == 1).all():
-            return actions
-        return np.clip((actions - low) / (high - low) * 2 - 1, -1, 1).astype(actions.dtype)
+        return arithmetic.from_unit(actions, self.action_low, self.action_high)
 
     @property
     def array_attributes(self) -> dict[str, dict[str, Any]]:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from dm_control import suite
 
 from dmcvb_gen.agents import data as agents_data
 from dmcvb_gen.agents import trainer
@@ -19,6 +20,8 @@ from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset import steps as steps_module
 from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.recipe import make_recipe
+from tests.conftest import roll_out
 
 LENGTHS = np.array([4, 7, 2])
 SIZE = 16
@@ -349,3 +352,17 @@ def test_without_held_out_episodes_there_is_no_test_loss():
     assert hold_out_losses(state_learner(data), data, 4, 1) == {}
     with pytest.raises(DmcvbError, match="held-out"):
         data.batch(4, np.random.default_rng(0), hold_out=True)
+
+
+def test_agents_learn_actions_in_unit_bounds_from_data_with_the_tasks_own(tmp_path):
+    pattern = {"tasks": "quadruped-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 4}
+    roll_out(make_recipe({"name": "r", "size": 16, "subsets": [pattern]}), tmp_path / "r")
+    release = open_release(tmp_path / "r")
+    [subset] = release.subsets.values()
+    spec = suite.load("quadruped", "walk").action_spec()
+    attributes, action = subset.array("action").attributes, subset.read("action")[:, :-1]
+    np.testing.assert_allclose([attributes["low"], attributes["high"]], [spec.minimum, spec.maximum], rtol=1e-6)
+    assert (action >= spec.minimum).all() and (action <= spec.maximum).all()
+    data = load_data(release, [Slice(subset.name)], pixels=False)
+    learned = data.action.reshape(2, 5, -1)[:, :-1].numpy()
+    np.testing.assert_allclose(learned, (action - spec.minimum) / (spec.maximum - spec.minimum) * 2 - 1, atol=1e-5)

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ks_2samp, kstest
 
+from dmcvb_gen import spec
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, registry, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
@@ -279,9 +280,16 @@ def test_a_class_of_a_file_in_this_folder_is_a_distractor(tmp_path, monkeypatch)
     task = get_task("walker-walk")
     found = labels(task, "dusk_hard", physics_of(task, 1, 2)).material_rgb
     np.testing.assert_allclose(found, np.broadcast_to(0.7 * task.material_colors, found.shape), 1e-6)
+    assert run("verify", tmp_path / "r").exit_code == 0
     for name, told in (
         ("dusk_file:Nothing", "cannot find distractor"),
         ("dusk_file:Other", "is no distractor 'other'"),
     ):
         result = run(*made, name, "--out", tmp_path / "none")
         assert result.exit_code == 2 and told in result.output and result.output.count("\n") == 1, result.output
+    monkeypatch.setattr(registry, "_registered", {})  # as in a new process
+    spec.own_distractors.discard("dusk")
+    for gone, told in (("", "unknown distractor 'dusk'"), ("gone_file:Dusk", "cannot find distractor gone_file:Dusk")):
+        monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", gone)
+        result = run("verify", tmp_path / "r")
+        assert result.exit_code == 3 and "NOT CHECKED" in result.output and told in result.output, result.output
