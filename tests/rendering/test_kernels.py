@@ -125,7 +125,8 @@ def test_light_on_the_plane_is_blended_between_the_corners_of_triangles():
 
 def test_every_pixel_shows_the_geom_that_mujocos_ray_meets(tmp_path):
     others = """<geom type="box" size=".2 .1 .3" pos=".5 .4 0" euler="20 30 0"/>
-    <geom type="sphere" size=".2" pos="-.6 -.4 0"/><geom type="ellipsoid" size=".2 .1 .3" pos="-.6 .4 0"/><geom type="capsule" size=".1 .2" pos=".6 -.4 0"/>"""
+    <geom type="sphere" size=".2" pos="-.6 -.4 0"/><geom type="ellipsoid" size=".2 .1 .3" pos="-.6 .4 0"/>
+    <geom type="capsule" size=".1 .2" pos=".6 -.4 0"/>"""
     task, physics = task_of(tmp_path, model("cylinder", world=FLOOR + others))
     found = make_renderer("native", task, 64).render_labels(physics[:1], labels_of(task, physics[:1]))
     world, data = task.model, mujoco.MjData(task.model)
