@@ -1,0 +1,46 @@
+"""Name the versions and the processor that can change a bit of the data."""
+
+from __future__ import annotations
+
+import functools
+import platform
+from importlib import metadata
+from pathlib import Path
+
+from dmcvb_gen.version import __version__
+
+PACKAGES = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
+
+
+def environment() -> dict[str, str]:
+    """Versions and processor of this process."""
+    return dict(_environment())
+
+
+@functools.cache
+def _environment() -> dict[str, str]:
+    versions = {name: version for name in PACKAGES if (version := _version(name))}
+    return {
+        "dmcvb-gen": __version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "cpu": _cpu_name(),
+        **versions,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown"

@@ -1,0 +1,399 @@
+"""Open a release: the one gate through which everything that is read of it comes.
+
+`Release.open` reads the manifest once, bounded, and compares its digest with one from outside if there is one. From
+there on, lists are compared with the manifest and files with the lists as they are read, and nothing is read twice. A
+release in the making has no manifest yet, or an older one; it opens by its recipes and records.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dmcvb_gen.dataset3.manifest import (
+    COPY,
+    COPY_BYTES,
+    MANIFEST,
+    MANIFEST_BYTES,
+    MAX_SHARDS,
+    RECIPE_BYTES,
+    RECIPES,
+    RECORDS,
+    ArraySpec,
+    Copy,
+    FileRecord,
+    Layer,
+    LayerList,
+    ListedLayer,
+    Manifest,
+    Resolved,
+    ShardRecord,
+    SubsetRecord,
+    check_record,
+    list_bytes_limit,
+    list_path,
+    merged_layers,
+    merged_subset,
+    parse,
+    record_bytes_limit,
+    record_path,
+)
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.files import sha256_bytes
+from dmcvb_gen.spec import select
+from dmcvb_gen.storage.store import NotThere, Store, open_store
+from dmcvb_gen.text import pluralize
+
+READERS = 16
+"""Small files of a bucket that are read at a time."""
+_PINNED = re.compile(r"(?P<place>.+)@sha256:(?P<digest>[0-9a-f]{64})")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A shard of a layer that is listed: its record and its files.
+
+    Attributes:
+      here: False in a copy that lacks it.
+    """
+
+    layer: Layer
+    number: int
+    record: ShardRecord
+    here: bool
+
+    @property
+    def episodes(self) -> range:
+        return self.layer.episodes_of(self.number)
+
+    @property
+    def record_path(self) -> str:
+        return record_path(self.layer.name, self.number)
+
+    @property
+    def files(self) -> tuple[FileRecord, ...]:
+        """Its data files, with their paths in the release."""
+        specs = {spec.name: spec for spec in self.layer.arrays}
+        return tuple(
+            FileRecord(path=self.layer.file_path(specs[name], self.number), bytes=file.bytes, sha256=file.sha256)
+            for name, file in sorted(self.record.files.items())
+        )
+
+
+class Release:
+    """A release, read-only.
+
+    Attributes:
+      store: where it lies.
+      manifest: what it holds; of a release in the making, what its recipes ask for.
+      digest: SHA-256 of the manifest's bytes; None while it is made.
+      compared: whether the digest was compared with one from outside.
+      copy: what it was copied from, None if it is no copy.
+    """
+
+    def __init__(
+        self, store: Store, manifest: Manifest | Resolved, digest: str | None, compared: bool, copy: Copy | None
+    ):
+        self.store, self.manifest, self.digest, self.compared, self.copy = store, manifest, digest, compared, copy
+        self._records: dict[str, dict[int, ShardRecord]] = {}
+        self._here: dict[str, Collection[int]] = {}
+
+    @classmethod
+    def open(
+        cls, place: str | Path | Store, options: Mapping[str, Any] | None = None, digest: str | None = None
+    ) -> Release:
+        """Open a release.
+
+        Args:
+          place: its folder or URL, or "<folder or URL>@sha256:<digest>".
+          options: options of the storage client, for URLs.
+          digest: SHA-256 of the manifest, from a source that you trust.
+
+        Raises:
+          StoreError: there is no release, its manifest is damaged or has another digest.
+        """
+        if not isinstance(place, Store):
+            if pinned := _PINNED.fullmatch(str(place)):
+                place, digest = pinned["place"], pinned["digest"]
+            place = open_store(place, options)
+        store = place
+        try:
+            text = store.read(MANIFEST, MANIFEST_BYTES)
+        except NotThere:
+            if digest is not None:
+                raise StoreError(f"{store.place} has no manifest, so it is not release {digest[:12]}") from None
+            return cls.in_making(store)
+        found = sha256_bytes(text)
+        if digest is not None and digest != found:
+            raise StoreError(
+                f"{store.place} is release {found}, not {digest}: do not use it for the one that you meant"
+            )
+        manifest = parse(Manifest, text, f"{store.place}/{MANIFEST}")
+        copy = cls._read_copy(store)
+        if copy is not None and copy.manifest != found:
+            raise StoreError(
+                f"{store.place} is a copy of release {copy.manifest[:12]}, but its manifest is {found[:12]}; fetch it again"
+            )
+        return cls(store, manifest, found, digest is not None or copy is not None, copy)
+
+    @classmethod
+    def in_making(cls, store: Store) -> Release:
+        """Open what recipes ask for, as far as it is made; for whoever goes on with it.
+
+        Raises:
+          StoreError: there is no recipe, or recipes contradict one another.
+        """
+        recipes = read_recipes(store)
+        if not recipes:
+            raise StoreError(
+                f"{store.place} holds no release (no {MANIFEST}); give the folder that `rollout --out` made"
+            )
+        layers = merged_layers(recipes)
+        subsets: dict[str, SubsetRecord] = {}
+        for recipe in recipes:
+            for subset in recipe.subsets:
+                there = subsets.get(subset.name)
+                subsets[subset.name] = subset if there is None else merged_subset(there, subset)
+        newest = recipes[-1]
+        wanted = newest.model_copy(update={"layers": tuple(layers.values()), "subsets": tuple(subsets.values())})
+        return cls(store, wanted, None, False, None)
+
+    @staticmethod
+    def _read_copy(store: Store) -> Copy | None:
+        try:
+            return parse(Copy, store.read(COPY, COPY_BYTES), f"{store.place}/{COPY}")
+        except NotThere:
+            return None
+
+    def __repr__(self) -> str:
+        return f"<Release {self.manifest.name} {self.manifest.version}: {pluralize(len(self.subsets), 'subsets')}>"
+
+    @property
+    def place(self) -> str:
+        """Where it lies, for messages."""
+        return self.store.place
+
+    @property
+    def in_the_making(self) -> bool:
+        """True if it has no manifest yet."""
+        return self.digest is None
+
+    @functools.cached_property
+    def layers(self) -> dict[str, Layer]:
+        """All layers, by name."""
+        return {layer.name: layer for layer in self.manifest.layers}
+
+    @functools.cached_property
+    def recipes(self) -> tuple[Resolved, ...]:
+        """The resolved recipes that it comes from.
+
+        Raises:
+          StoreError: one is missing or was altered.
+        """
+        if isinstance(self.manifest, Resolved):
+            return tuple(read_recipes(self.store))
+        return tuple(read_recipe(self.store, digest) for digest in self.manifest.recipes)
+
+    # -- records --------------------------------------------------------------------------------------
+
+    def records(self, layer: str) -> dict[int, ShardRecord]:
+        """Shard -> record of all shards of a layer that exist, here or not; read once.
+
+        Raises:
+          StoreError: the list is missing or altered, or a record is another job's.
+        """
+        if layer not in self._records:
+            known = self.layers[layer]
+            if isinstance(known, ListedLayer):
+                self._records[layer] = self._read_list(known)
+            else:
+                self._records[layer] = read_records(self.store, known)
+        return self._records[layer]
+
+    def _read_list(self, layer: ListedLayer) -> dict[int, ShardRecord]:
+        path, where = list_path(layer.list), f"{self.place}/{list_path(layer.list)}"
+        text = self.store.read(path, list_bytes_limit(layer))
+        if sha256_bytes(text) != layer.list:
+            raise StoreError(f"{where} was altered: it does not have its own SHA-256; fetch it again")
+        shards = parse(LayerList, text, where).shards
+        if len(shards) != layer.shards:
+            raise StoreError(f"{where} lists {len(shards)} shards, and the manifest says {layer.shards}")
+        return {number: check_record(record, layer, number, where) for number, record in enumerate(shards)}
+
+    def here(self, layer: str) -> Collection[int]:
+        """Numbers of the shards of a layer that are here: all, but in a copy those whose record is."""
+        if layer not in self._here:
+            if self.copy is None:
+                self._here[layer] = self.records(layer).keys()
+            else:
+                self._here[layer] = recorded_shards(self.store, layer)
+        return self._here[layer]
+
+    def shards(
+        self, names: Collection[str] = (), episodes: tuple[int, int] | None = None, images: bool = True
+    ) -> Iterator[Shard]:
+        """Shards of subsets, each once, in the order in which they are written.
+
+        Args:
+          names: subsets, all by default.
+          episodes: (first, last + 1), all by default.
+          images: False leaves image layers out that can be rendered again.
+        """
+        done: set[tuple[str, int]] = set()
+        for subset in self.manifest.subsets:
+            if names and subset.name not in names:
+                continue
+            for name in subset.layers:
+                layer = self.layers[name]
+                if layer.kind == "images" and not (images or layer.source):
+                    continue
+                records, here = self.records(name), self.here(name)
+                for number in sorted(records):
+                    span = layer.episodes_of(number)
+                    wanted = span.start < subset.episodes and (
+                        episodes is None or (span.start < episodes[1] and episodes[0] < span.stop)
+                    )
+                    if wanted and (name, number) not in done:
+                        done.add((name, number))
+                        yield Shard(layer, number, records[number], number in here)
+
+    def lists(self, layers: Collection[str] | None = None) -> tuple[str, ...]:
+        """Paths of the lists of layers, all by default; none of a release in the making."""
+        chosen = self.manifest.layers if layers is None else [self.layers[name] for name in layers]
+        return tuple(dict.fromkeys(list_path(layer.list) for layer in chosen if isinstance(layer, ListedLayer)))
+
+    def inputs_of(self, names: Collection[str]) -> tuple[FileRecord, ...]:
+        """Policies and videos of some subsets, of which the release keeps copies."""
+        wanted = [record for record in self.manifest.subsets if record.name in names]
+        policies = {policy.path for record in wanted for policy in record.policies if policy.path}
+        videos = {str((record.backgrounds or {}).get("source", "")) for record in wanted} - {""}
+        return tuple(
+            file
+            for file in self.manifest.inputs
+            if file.path in policies or any(file.path.startswith(f"{folder}/") for folder in videos)
+        )
+
+    # -- subsets --------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def subsets(self) -> dict[str, Any]:
+        """The subsets that have episodes here, by name."""
+        from dmcvb_gen.dataset3.reader import Subset
+
+        made = {record.name: Subset(self, record) for record in self.manifest.subsets}
+        return {name: subset for name, subset in made.items() if len(subset.episodes)}
+
+    def select(self, patterns: Sequence[str] = ()) -> list[str]:
+        """Names of the manifest's subsets that fit any pattern such as "walker-walk/*/static", all by default."""
+        return list(select([record.name for record in self.manifest.subsets], list(patterns)))
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the subsets that have episodes here."""
+        return iter(self.subsets)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.subsets
+
+    def __len__(self) -> int:
+        return len(self.subsets)
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self.subsets and any(record.name == name for record in self.manifest.subsets):
+            raise StoreError(
+                f"{name} belongs to {self.manifest.name}, but {self.place} has no episode of it; make or fetch it first"
+            )
+        if name not in self.subsets:
+            raise UnknownNameError("subset", name, self.subsets)
+        return self.subsets[name]
+
+    @property
+    def shortfalls(self) -> dict[str, tuple[int, int]]:
+        """Subsets that are not whole here -> (episodes here, episodes that belong to them)."""
+        here = {record.name: 0 for record in self.manifest.subsets}
+        here |= {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        planned = {record.name: record.episodes for record in self.manifest.subsets}
+        return {name: (count, planned[name]) for name, count in here.items() if count < planned[name]}
+
+    @property
+    def path(self) -> Path:
+        """The folder of a local release.
+
+        Raises:
+          StoreError: it lies elsewhere.
+        """
+        if self.store.folder is None:
+            raise StoreError(f"{self.place} is not a local folder; fetch it first")
+        return self.store.folder
+
+
+# -- small files ----------------------------------------------------------------------------------
+
+
+def read_recipe(store: Store, digest: str) -> Resolved:
+    """The recipe of a digest.
+
+    Raises:
+      StoreError: it is missing or was altered.
+    """
+    path = f"{RECIPES}{digest}.json"
+    text = store.read(path, RECIPE_BYTES)
+    if sha256_bytes(text) != digest:
+        raise StoreError(f"{store.place}/{path} was altered: it does not have its own SHA-256; fetch it again")
+    return parse(Resolved, text, f"{store.place}/{path}")
+
+
+def read_recipes(store: Store) -> list[Resolved]:
+    """All recipes at a place, in the order of their digests."""
+    found = [re.fullmatch(rf"{RECIPES}([0-9a-f]{{64}})\.json", path) for path in store.list(RECIPES)]
+    return [read_recipe(store, digest) for digest in sorted(match[1] for match in found if match)]
+
+
+def recorded_shards(store: Store, layer: str) -> frozenset[int]:
+    """Numbers of the shards of a layer whose record is there; one listing."""
+    found = [
+        re.fullmatch(rf"{re.escape(RECORDS + layer)}/(\d{{5,6}})\.json", p) for p in store.list(f"{RECORDS}{layer}/")
+    ]
+    numbers = frozenset(int(match[1]) for match in found if match)
+    if len(numbers) > MAX_SHARDS:
+        raise StoreError(f"{store.place} has {len(numbers):,} records of {layer}, more than any release")
+    return numbers
+
+
+def read_records(store: Store, layer: Layer, known: Mapping[int, ShardRecord] | None = None) -> dict[int, ShardRecord]:
+    """Shard -> record of a layer that is being made, checked.
+
+    Args:
+      known: records that were read already, which never change.
+
+    Raises:
+      StoreError: a record is damaged, or of another job.
+    """
+    found = dict(known or {})
+    new = sorted(recorded_shards(store, layer.name) - found.keys())
+
+    def read(number: int) -> ShardRecord:
+        path = record_path(layer.name, number)
+        where = f"{store.place}/{path}"
+        record = parse(ShardRecord, store.read(path, record_bytes_limit(layer)), where)
+        return check_record(record, layer, number, where)
+
+    with ThreadPoolExecutor(READERS) as pool:
+        found |= dict(zip(new, pool.map(read, new), strict=True))
+    return dict(sorted(found.items()))
+
+
+def array_files(
+    shards: Mapping[int, ShardRecord], layer: Layer, spec: ArraySpec, here: Collection[int]
+) -> dict[str, Any]:
+    """Key below an array's folder ("c/3/0/0") -> its file, of the shards that are here."""
+    prefix = f"{layer.group}/{spec.stored_name}/"
+    found = {}
+    for number, record in shards.items():
+        if number in here and (file := record.files.get(spec.name)):
+            found[layer.file_path(spec, number).removeprefix(prefix)] = file
+    return found

@@ -1,0 +1,617 @@
+"""Describe a release as data: layers, subsets, resolved recipes, shard records and the manifest, as checked JSON.
+
+::
+
+    recipes/<sha>.json           Resolved     what was asked for, resolved: layers, subsets, inputs
+    records/<layer>/00003.json   ShardRecord  one shard of one layer: its job key, its files
+    layers/<sha>.json            LayerList    all records of a layer, in order
+    manifest.json                Manifest     subsets, and layers with the SHA-256 of their lists
+
+A digest of a release is the SHA-256 of its manifest's bytes; from there, every file has its SHA-256. The manifest is a
+function of recipes and records (`build_manifest`), so whoever finishes a release writes the same bytes.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import re
+from collections.abc import Collection, Iterable, Mapping
+from typing import Annotated, Any, Literal, TypeVar
+
+import pydantic
+
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import parse_json, sha256_bytes
+from dmcvb_gen.spec import LOCOMOTION, Distractor, GoalMode, SubsetSpec
+
+MANIFEST, COPY = "manifest.json", "copy.json"
+RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE = "recipes/", "records/", "layers/", "manifests/", "provenance/"
+POLICIES, VIDEOS = "policies/", "backgrounds/"
+ZARR_JSON = "zarr.json"
+ATTACHMENT_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
+CARD_FOLDER = "card/"
+"""Attachments: files of the card, copied as data and no part of the tree. Nothing else may lie in a release."""
+
+SCHEMA_VERSION = 3
+MANIFEST_BYTES, RECIPE_BYTES, COPY_BYTES = 2**26, 2**26, 2**24
+"""Largest files of their kind that a reader takes."""
+MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
+MAX_CHUNK_BYTES, MAX_SHARD_BYTES = 2**31, 2**37
+"""More than any release has; a manifest that asks for more is damaged or hostile."""
+PLAIN_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$"
+"""A part of a path that leads nowhere else; exports make folders and files of versions and views."""
+_PART = re.compile(PLAIN_NAME.strip("^$"))
+IMPORTED = "imported"
+"""Name of the renderer of subsets that came from DMC-VB's published data."""
+Kind = Literal["trajectories", "labels", "images"]
+Codec = Literal["zstd", "channel-delta-zstd"]
+
+
+def check_relative_path(path: str) -> str:
+    """Return `path` if it is a plain relative path that stays inside its folder.
+
+    Raises:
+      ValueError: it is absolute, climbs out, or holds an odd character.
+    """
+    if len(path) > 1000 or not all(_PART.fullmatch(part) for part in path.split("/")):
+        raise ValueError(f"{path[:80]!r} is not a plain relative path")
+    return path
+
+
+def _check_line(text: str) -> str:
+    if any(ord(char) < 32 or 127 <= ord(char) < 160 for char in text):
+        raise ValueError("it holds control characters")
+    return text
+
+
+RelativePath = Annotated[str, pydantic.AfterValidator(check_relative_path)]
+Digest = Annotated[str, pydantic.StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Line = Annotated[str, pydantic.StringConstraints(max_length=1000), pydantic.AfterValidator(_check_line)]
+PlainName = Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME, max_length=200)]
+
+
+class _Model(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class FileRecord(_Model):
+    """One file: its path in the release, its size in bytes, and its SHA-256."""
+
+    path: RelativePath
+    bytes: int = pydantic.Field(ge=0)
+    sha256: Digest
+
+
+# -- layers and their records ---------------------------------------------------------------------
+
+
+class ArraySpec(_Model):
+    """One array of a layer.
+
+    Attributes:
+      name: the reader's name, e.g. "pixels", "pixels/top", "at84/pixels" or "exogenous/camera_position".
+      dtype: numpy name.
+      shape: shape of one step, or of one episode's entry if `steps` is false.
+      dims: names of the axes of `shape`.
+      steps: True if the array has a step axis.
+      chunk_steps: steps of one chunk, the unit of reading; None: all steps of an episode.
+      codec: how a chunk becomes bytes, see `schema.codecs`.
+      attributes: stored with the array, e.g. the fields of a state or the bounds of an action.
+    """
+
+    name: RelativePath
+    dtype: Literal[
+        "bool", "uint8", "uint16", "uint64", "int8", "int16", "int32", "int64", "float32", "float64", "float16"
+    ]
+    shape: tuple[Annotated[int, pydantic.Field(gt=0, le=10**7)], ...] = ()
+    dims: tuple[PlainName, ...] = ()
+    steps: bool = True
+    chunk_steps: int | None = pydantic.Field(default=None, gt=0)
+    codec: Codec = "zstd"
+    attributes: dict[str, Any] = {}
+
+    @property
+    def stored_name(self) -> str:
+        """Path below the layer's group: "pixels/top" lies at "pixels_top"; groups "exogenous" and "at84" stay."""
+        head, slash, rest = self.name.partition("/")
+        grouped = slash and (head == "exogenous" or re.fullmatch(r"at\d+", head))
+        return f"{head}/{rest.replace('/', '_')}" if grouped else self.name.replace("/", "_")
+
+
+class Layer(_Model):
+    """Arrays that are made together, shard by shard: a set of trajectories, a setting's labels, or one image array.
+
+    Attributes:
+      name: e.g. "walker-walk/expert/trajectories", "walker-walk/expert/dynamic/labels", ".../dynamic/pixels".
+      group: folder of its Zarr group, e.g. "walker-walk/expert.zarr/dynamic".
+      kind: "trajectories", "labels" or "images".
+      rows: rows of the step axis, max_steps + 1.
+      episodes_per_shard: every shard has as many; arrays cut off what was not asked for.
+      makes: what decides its bytes besides: policies, streams, seed, renderer, ... and "of", the key of the layer below.
+      source: where an imported layer comes from; it cannot be made again, and no copy leaves it out.
+    """
+
+    name: RelativePath
+    group: RelativePath
+    kind: Kind
+    rows: int = pydantic.Field(gt=0, le=MAX_STEPS + 1)
+    episodes_per_shard: int = pydantic.Field(gt=0, le=MAX_EPISODES)
+    arrays: tuple[ArraySpec, ...] = pydantic.Field(min_length=1, max_length=1000)
+    makes: dict[str, Any] = {}
+    source: Line | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _bounded(self) -> Layer:
+        for spec in self.arrays:
+            step = math.prod(spec.shape) * _ITEM_BYTES[spec.dtype]
+            rows = self.rows if spec.steps else 1
+            chunk = step * (min(spec.chunk_steps or rows, rows) if spec.steps else self.episodes_per_shard)
+            if chunk > MAX_CHUNK_BYTES or step * rows * self.episodes_per_shard > MAX_SHARD_BYTES:
+                raise ValueError(f"array {spec.name} of {self.name} has larger shards than any release has")
+        _check_unique([spec.stored_name for spec in self.arrays], f"arrays of {self.name}")
+        return self
+
+    @functools.cached_property
+    def key(self) -> str:
+        """SHA-256 of all that decides its bytes, and of nothing else (not its name)."""
+        facts = self.model_dump(mode="json", include={"kind", "rows", "episodes_per_shard", "makes", "source"})
+        facts["arrays"] = [spec.model_dump(mode="json") for spec in self.arrays]
+        return sha256_bytes(canonical_json(facts))
+
+    def job_key(self, shard: int) -> str:
+        """SHA-256 of all that decides the bytes of one shard."""
+        return sha256_bytes(f"{self.key} {shard}\n".encode())
+
+    def shards_for(self, episodes: int) -> int:
+        """How many shards hold that many episodes."""
+        return -(-episodes // self.episodes_per_shard)
+
+    def episodes_of(self, shard: int) -> range:
+        """The episodes of a shard, which is always full."""
+        return range(shard * self.episodes_per_shard, (shard + 1) * self.episodes_per_shard)
+
+    def array(self, name: str) -> ArraySpec:
+        """The spec of one of its arrays, by the reader's name."""
+        return next(spec for spec in self.arrays if spec.name == name)
+
+    def file_path(self, spec: ArraySpec, shard: int) -> str:
+        """Path in the release of an array's file of a shard."""
+        zeros = len(spec.shape) + spec.steps
+        return f"{self.group}/{spec.stored_name}/c/{'/'.join([str(shard), *['0'] * zeros])}"
+
+
+class ShardFile(_Model):
+    """The file of one array in a shard: its size in bytes and its SHA-256."""
+
+    bytes: int = pydantic.Field(gt=0, le=MAX_SHARD_BYTES)
+    sha256: Digest
+
+
+class ShardRecord(_Model):
+    """A shard exists if and only if its record does.
+
+    Attributes:
+      key: job key, see `Layer.job_key`.
+      files: array name -> file; an array that is left out has nothing but fill values in this shard.
+    """
+
+    key: Digest
+    files: dict[RelativePath, ShardFile]
+
+
+class LayerList(_Model):
+    """All records of a layer, in the order of its shards."""
+
+    shards: tuple[ShardRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+
+class ListedLayer(Layer):
+    """A layer of a finished release.
+
+    Attributes:
+      shards: how many there are.
+      list: SHA-256 of the list of its records, `layers/<sha>.json`.
+    """
+
+    shards: int = pydantic.Field(gt=0, le=MAX_SHARDS)
+    list: Digest
+
+
+_ITEM_BYTES = {"bool": 1, "uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "int32": 4, "float32": 4}
+_ITEM_BYTES |= {"uint64": 8, "int64": 8, "float64": 8}
+
+
+# -- subsets, recipes, manifest -------------------------------------------------------------------
+
+
+class PolicyRecord(_Model):
+    """A behaviour policy of a subset: where the release keeps a copy, and what it is."""
+
+    name: Line
+    digest: Line
+    path: RelativePath | None = None
+    header: dict[str, Any] = {}
+
+
+class SubsetRecord(_Model):
+    """One subset: the episodes of a task and level under one setting.
+
+    Attributes:
+      layers: names of its layers: trajectories, labels (none of imported subsets), then images.
+      size: pixels a side of its own images.
+      family: family of its task, "locomotion" or "ant-maze".
+      views: names of the images of a frame, in the order in which policies see them.
+      hidden_goal: True if the images that the subset is about have no goal in them (both kinds may be stored).
+      max_steps: transitions at which the time limit ends an episode.
+      action_repeat: control steps that an action is held.
+      seconds_per_step: simulated time of one transition.
+      fixed_goals, episodes_per_goal: pairs of start and goal, and the episodes of each; None if drawn an episode.
+      split: the videos and styles that it was rendered with, "train" or "val".
+      only_shown: whether only the images that the subset is about are stored.
+      joints, actuators: names in the model, in the order of the physics state's positions and of the actions.
+      return_range: (random, expert): returns that normalize scores to 0 and 100; None if unknown.
+    """
+
+    name: RelativePath
+    task: Line
+    level: PlainName
+    setting: PlainName
+    episodes: int = pydantic.Field(gt=0, le=MAX_EPISODES)
+    layers: tuple[RelativePath, ...] = pydantic.Field(min_length=1, max_length=1000)
+    size: int = pydantic.Field(gt=0, le=MAX_SIZE)
+    deterministic: bool = False
+    policies: tuple[PolicyRecord, ...] = ()
+    renderer: dict[str, Any] = {}
+    backgrounds: dict[str, Any] | None = None
+    family: PlainName = LOCOMOTION
+    views: tuple[PlainName, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
+    hidden_goal: bool = False
+    max_steps: int = pydantic.Field(default=500, gt=0, le=MAX_STEPS)
+    action_repeat: int = pydantic.Field(default=2, gt=0, le=1000)
+    seconds_per_step: float = pydantic.Field(default=0.05, gt=0)
+    fixed_goals: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
+    episodes_per_goal: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
+    split: Literal["train", "val"] = "train"
+    only_shown: bool = False
+    joints: tuple[Line, ...] = ()
+    actuators: tuple[Line, ...] = ()
+    return_range: tuple[float, float] | None = None
+
+    @property
+    def spec(self) -> SubsetSpec:
+        """Its typed identity.
+
+        Raises:
+          UnknownNameError: the manifest names a level or setting that does not exist.
+        """
+        return SubsetSpec.parse(self.task, self.level, self.setting)
+
+    @property
+    def distractor(self) -> Distractor:
+        """The distractor of its images; "none" for mazes."""
+        return self.spec.distractor
+
+    @property
+    def goal_mode(self) -> GoalMode | None:
+        """Treatment of a maze's goal; None for tasks without one."""
+        return self.spec.goal
+
+    @property
+    def imported(self) -> bool:
+        """Whether it came from DMC-VB's published data: nothing of it can be simulated or rendered again."""
+        return self.renderer.get("name") == IMPORTED
+
+
+def _check_unique(names: Collection[str], what: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name.casefold() in seen:
+            raise ValueError(f"{what}: {name!r} is there twice (case is ignored)")
+        seen.add(name.casefold())
+
+
+def _check_tree(subsets: tuple[SubsetRecord, ...], layers: Iterable[Layer]) -> None:
+    named = {layer.name: layer for layer in layers}
+    _check_unique([subset.name for subset in subsets], "subsets")
+    _check_unique(list(named), "layers")
+    places = [f"{layer.group}/{spec.stored_name}" for layer in named.values() for spec in layer.arrays]
+    _check_unique(places, "arrays")
+    for subset in subsets:
+        if lacking := [name for name in subset.layers if name not in named]:
+            raise ValueError(f"{subset.name} names layer {lacking[0]}, which is not described")
+        if named[subset.layers[0]].kind != "trajectories":
+            raise ValueError(f"the first layer of {subset.name} holds no trajectories")
+
+
+class _Described(_Model):
+    """What recipes and manifests share."""
+
+    schema_version: Literal[3] = SCHEMA_VERSION
+    name: PlainName
+    version: PlainName
+    license: Line
+    authors: tuple[Line, ...] = pydantic.Field(default=(), max_length=1000)
+    description: str = pydantic.Field(default="", max_length=10_000)
+    inputs: tuple[FileRecord, ...] = pydantic.Field(default=(), max_length=10**6)
+    subsets: tuple[SubsetRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+
+class Resolved(_Described):
+    """A resolved recipe, `recipes/<sha>.json`: what a release was asked to be, on any machine.
+
+    Attributes:
+      recipe: the recipe as it was given, without paths of the machine.
+      inputs: policies and videos that the release keeps copies of.
+      derived: for a release made from another one (repaint, import): its name, version and digest.
+    """
+
+    format: Literal["dmcvb-gen recipe"] = "dmcvb-gen recipe"
+    recipe: dict[str, Any] = {}
+    layers: tuple[Layer, ...] = pydantic.Field(max_length=MAX_SHARDS)
+    derived: dict[str, Any] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _whole(self) -> Resolved:
+        _check_tree(self.subsets, self.layers)
+        return self
+
+    @functools.cached_property
+    def sha256(self) -> str:
+        """SHA-256 of its canonical JSON, its name in `recipes/`."""
+        return sha256_bytes(canonical_json(self))
+
+
+class Manifest(_Described):
+    """The release's manifest.json.
+
+    Attributes:
+      recipes: SHA-256 of the recipes that its subsets come from, in order.
+      inputs: policies and videos that the release keeps copies of.
+    """
+
+    format: Literal["dmcvb-gen release"] = "dmcvb-gen release"
+    recipes: tuple[Digest, ...] = pydantic.Field(max_length=10_000)
+    layers: tuple[ListedLayer, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+    @pydantic.model_validator(mode="after")
+    def _whole(self) -> Manifest:
+        _check_tree(self.subsets, self.layers)
+        if sum(layer.shards for layer in self.layers) > 10 * MAX_SHARDS:
+            raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
+        return self
+
+    @property
+    def imported(self) -> bool:
+        """True if any of its subsets was imported, see `SubsetRecord.imported`."""
+        return any(record.imported for record in self.subsets)
+
+    def layer(self, name: str) -> ListedLayer:
+        """One of its layers."""
+        return self._by_name[name]
+
+    @functools.cached_property
+    def _by_name(self) -> dict[str, ListedLayer]:
+        return {layer.name: layer for layer in self.layers}
+
+
+class Copy(_Model):
+    """copy.json of a release that holds a part of another one.
+
+    Attributes:
+      manifest: SHA-256 of the manifest that it was copied from, which is the manifest here.
+      source: where it was copied from, without passwords.
+      promised: layer -> runs (first, last + 1) of shards that were to be copied; a shard is here if its record is.
+    """
+
+    format: Literal["dmcvb-gen copy"] = "dmcvb-gen copy"
+    manifest: Digest
+    source: Line = ""
+    promised: dict[RelativePath, tuple[tuple[int, int], ...]] = {}
+
+
+# -- JSON -----------------------------------------------------------------------------------------
+
+
+def canonical_json(value: Any) -> bytes:
+    """The bytes of a value (plain, or a model) that its SHA-256 is taken of: sorted keys, no spaces, one last newline."""
+    if isinstance(value, pydantic.BaseModel):
+        value = value.model_dump(mode="json")
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return (text + "\n").encode()
+
+
+Parsed = TypeVar("Parsed", bound=pydantic.BaseModel)
+
+
+def parse(model: type[Parsed], text: bytes, where: str) -> Parsed:
+    """A model from canonical JSON.
+
+    Raises:
+      StoreError: not JSON, not canonical, not such a model, or of another schema version.
+    """
+    try:
+        data = parse_json(text)
+    except ValueError as error:
+        raise StoreError(f"{where} is not JSON ({error}); fetch it again, or make a new release") from None
+    version = data.get("schema_version", SCHEMA_VERSION) if isinstance(data, dict) else None
+    if isinstance(version, int) and version != SCHEMA_VERSION:
+        cure = (
+            "install a newer dmcvb-gen" if version > SCHEMA_VERSION else "make the release again, or use dmcvb-gen 0.1"
+        )
+        raise StoreError(f"{where} has schema version {version}, and this dmcvb-gen reads {SCHEMA_VERSION}; {cure}")
+    try:
+        made = model.model_validate(data)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the top"
+        raise StoreError(f"{where} is not valid at {place}: {first['msg']}") from None
+    return made
+
+
+def record_path(layer: str, shard: int) -> str:
+    """Path of a shard's record inside the release."""
+    return f"{RECORDS}{layer}/{shard:05d}.json"
+
+
+def list_path(digest: str) -> str:
+    """Path of a layer's list inside the release."""
+    return f"{LAYERS}{digest}.json"
+
+
+def is_attachment(path: str) -> bool:
+    """Return True if a path is one of the card's files, which are copied as data and lie outside of the tree."""
+    return path in ATTACHMENT_FILES or bool(re.fullmatch(rf"{CARD_FOLDER}[A-Za-z0-9_][A-Za-z0-9_.+-]{{0,200}}", path))
+
+
+def list_bytes_limit(layer: ListedLayer) -> int:
+    """The largest list that a layer can have."""
+    names = sum(len(spec.name) + 130 for spec in layer.arrays)
+    return 1000 + layer.shards * (200 + names)
+
+
+def record_bytes_limit(layer: Layer) -> int:
+    """The largest record that a shard of a layer can have."""
+    return 1000 + sum(len(spec.name) + 130 for spec in layer.arrays)
+
+
+def check_record(record: ShardRecord, layer: Layer, shard: int, where: str) -> ShardRecord:
+    """Return a record that is the shard's.
+
+    Raises:
+      StoreError: it was made by another job, or names arrays that the layer does not have.
+    """
+    key = layer.job_key(shard)
+    if record.key != key:
+        raise StoreError(
+            f"{where} is of another job ({record.key[:12]}) than this release's ({key[:12]}): something that decides "
+            "its bytes differs; choose another place for the new one"
+        )
+    if strange := set(record.files) - {spec.name for spec in layer.arrays}:
+        raise StoreError(f"{where} names array {min(strange)}, which {layer.name} does not have")
+    return record
+
+
+# -- the manifest of recipes and records ----------------------------------------------------------
+
+Counts = Mapping[str, int]
+"""Layer -> how many shards are there without a gap from the first."""
+
+
+def merged_layers(recipes: Iterable[Resolved]) -> dict[str, Layer]:
+    """All layers of recipes.
+
+    Raises:
+      StoreError: two of them describe one layer differently.
+    """
+    layers: dict[str, Layer] = {}
+    for recipe in recipes:
+        for layer in recipe.layers:
+            there = layers.setdefault(layer.name, layer)
+            if there != layer:
+                raise StoreError(_difference(there, layer))
+    return layers
+
+
+def _difference(one: Layer, other: Layer) -> str:
+    for field in ("episodes_per_shard", "rows", "group", "kind", "source", "arrays"):
+        first, second = getattr(one, field), getattr(other, field)
+        if first != second:
+            return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+    keys = sorted(set(one.makes) | set(other.makes))
+    field = next(key for key in keys if one.makes.get(key) != other.makes.get(key))
+    first, second = one.makes.get(field), other.makes.get(field)
+    return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) < 80 else text[:77] + "..."
+
+
+def build_manifest(
+    recipes: Iterable[Resolved], lists: Mapping[str, tuple[ShardRecord, ...]]
+) -> tuple[Manifest, dict[str, LayerList]] | None:
+    """The manifest of recipes and records: of each subset the largest count asked for whose shards all exist.
+
+    Args:
+      recipes: in any order; the result is the same.
+      lists: layer -> its records from the first shard on, up to the first gap.
+
+    Returns:
+      The manifest and the lists that it names by their SHA-256; None if no subset is whole.
+
+    Raises:
+      StoreError: recipes contradict one another.
+    """
+    recipes = sorted(recipes, key=lambda recipe: recipe.sha256)
+    layers = merged_layers(recipes)
+    whole = [(recipe, subset) for recipe in recipes for subset in recipe.subsets if _is_whole(subset, layers, lists)]
+    if not whole:
+        return None
+    subsets: dict[str, SubsetRecord] = {}
+    needed: dict[str, int] = {}
+    for _, subset in whole:
+        there = subsets.get(subset.name)
+        subsets[subset.name] = subset if there is None else merged_subset(there, subset)
+        for name in subset.layers:
+            needed[name] = max(needed.get(name, 0), layers[name].shards_for(subset.episodes))
+    made = {name: LayerList(shards=lists[name][:count]) for name, count in sorted(needed.items())}
+    used = list({recipe.sha256: recipe for recipe, _ in whole}.values())
+    newest = max(used, key=lambda recipe: (_version_key(recipe.version), recipe.name, recipe.sha256))
+    inputs = {file.path: file for recipe in used for file in recipe.inputs}
+    manifest = Manifest(
+        name=newest.name,
+        version=newest.version,
+        license=newest.license,
+        authors=newest.authors,
+        description=newest.description,
+        recipes=tuple(recipe.sha256 for recipe in used),
+        inputs=tuple(inputs[path] for path in sorted(inputs)),
+        layers=tuple(
+            ListedLayer(**_facts(layers[name]), shards=len(each.shards), list=sha256_bytes(canonical_json(each)))
+            for name, each in made.items()
+        ),
+        subsets=tuple(subsets[name] for name in sorted(subsets)),
+    )
+    return manifest, made
+
+
+def _facts(layer: Layer) -> dict[str, Any]:
+    return {name: getattr(layer, name) for name in Layer.model_fields}
+
+
+def _is_whole(subset: SubsetRecord, layers: Mapping[str, Layer], lists: Mapping[str, tuple[ShardRecord, ...]]) -> bool:
+    return all(len(lists.get(name, ())) >= layers[name].shards_for(subset.episodes) for name in subset.layers)
+
+
+def merged_subset(one: SubsetRecord, other: SubsetRecord) -> SubsetRecord:
+    """One subset that two recipes ask for: the larger number of episodes, the layers of both.
+
+    Raises:
+      StoreError: they differ in anything else.
+    """
+    for field in SubsetRecord.model_fields:
+        first, second = getattr(one, field), getattr(other, field)
+        if field not in ("episodes", "layers") and first != second:
+            raise StoreError(
+                f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+            )
+    layers = tuple(sorted({*one.layers, *other.layers}, key=layer_order))
+    return one.model_copy(update={"episodes": max(one.episodes, other.episodes), "layers": layers})
+
+
+def layer_order(name: str) -> tuple[int, str]:
+    """The key by which the layers of a subset are in order: trajectories, labels, then images by name."""
+    last = name.rsplit("/", 1)[-1]
+    return {"trajectories": 0, "labels": 1}.get(last, 2), name
+
+
+def _version_key(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version))
+
+
+def shard_size(episodes: int, most: int) -> int:
+    """Episodes a shard, so that shards are nearly equal and every one is full: ceil(n / ceil(n / most))."""
+    return -(-episodes // -(-episodes // most))

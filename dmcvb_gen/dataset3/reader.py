@@ -1,0 +1,387 @@
+"""Read the episodes of a subset: arrays by name, whole episodes, rows; of a folder or a URL, finished or not."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, cast
+
+import numpy as np
+import zarr
+
+from dmcvb_gen.dataset3.gate import Release, array_files
+from dmcvb_gen.dataset3.manifest import ArraySpec, Layer, SubsetRecord
+from dmcvb_gen.dataset3.pictures import picture_of
+from dmcvb_gen.dataset3.schema import open_array
+from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
+from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.text import quoted
+
+TRANSITIONS = "action", "reward", "discount"
+"""Arrays whose last stored row, of an episode's last observation, means nothing."""
+
+
+def without_ellipsis(selection: Any, dimensions: int) -> tuple:
+    """An index of an array of that many dimensions, with its `...` written out."""
+    parts = list(selection) if isinstance(selection, tuple) else [selection]
+    for place, part in enumerate(parts):
+        if part is Ellipsis:
+            parts[place : place + 1] = [slice(None)] * (dimensions - len(parts) + 1)
+            break
+    return tuple(parts) or (slice(None),)
+
+
+class StoredArray:
+    """One array of a subset, read as it is indexed; damaged bytes and lost connections are one line with a cure.
+
+    Attributes:
+      name: e.g. "pixels/top".
+      shape, dtype, ndim: as in numpy; an entry for each episode that the subset will have.
+      dimensions: names of the axes.
+      attributes: stored with the array.
+      chunking: its "chunks" and "shards", entries of each axis.
+    """
+
+    def __init__(self, array: zarr.Array, name: str, place: str, missing: np.ndarray, cure: str):
+        self._array, self._place, self.name = array, place, name
+        self._missing, self._cure = missing, cure
+        self.shape, self.dtype, self.ndim = array.shape, array.dtype, array.ndim
+        self.dimensions = tuple(map(str, getattr(array.metadata, "dimension_names", None) or ()))
+        self.attributes, self.chunking = dict(array.attrs), {"chunks": array.chunks, "shards": array.shards}
+
+    def __repr__(self) -> str:
+        return f"<StoredArray {self.name}: {self.dtype} {self.shape}>"
+
+    def __getitem__(self, selection: Any) -> np.ndarray:
+        """Values at an index of each axis: numbers, slices, and along one axis a list or a mask.
+
+        Raises:
+          IndexError: the index does not fit the array.
+        """
+        parts = self._index(selection)
+        self._check_here(parts[0])
+        with storage_errors(self._place, decoding=True):
+            lists = any(isinstance(part, np.ndarray) for part in parts)
+            return cast(np.ndarray, self._array.oindex[parts] if lists else self._array[parts])
+
+    def _index(self, selection: Any) -> tuple:
+        """The index as Zarr takes it, looked at before anything is read: what fails then is damaged."""
+        parts = without_ellipsis(selection, self.ndim)
+        if len(parts) > self.ndim:
+            raise IndexError(f"{len(parts)} indices are too many for {self!r}")
+        found = []
+        for axis, part in enumerate(parts):
+            try:
+                chosen = np.arange(self.shape[axis])[part]
+            except IndexError as error:
+                raise IndexError(f"axis {axis} of {self!r}: {error}") from None
+            if chosen.ndim > 1:
+                raise IndexError(f"axis {axis} of {self!r}: give a number, a slice, or a list of numbers")
+            steps_back = isinstance(part, slice) and (part.step or 1) < 0  # Zarr knows no such slices, nor masks
+            found.append(part if isinstance(part, slice) and not steps_back else chosen)
+        if sum(isinstance(part, np.ndarray) for part in found) > 1:
+            raise IndexError(f"{self!r}: give a list along one axis alone, or see outer()")
+        return tuple(found)
+
+    def outer(self, selection: tuple) -> np.ndarray:
+        """Values at a selection along each axis for itself: slices, indices or arrays of them."""
+        self._check_here(selection[0])
+        with storage_errors(self._place, decoding=True):
+            return cast(np.ndarray, self._array.oindex[selection])
+
+    def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
+        """(episode, ...) values of episodes in any order; of arrays with steps, those in a row are read at once.
+
+        Zarr's own selection of scattered rows takes thirty times as long for pictures.
+
+        Args:
+          rows: read the first rows of the step axis alone.
+        """
+        self._check_here(episodes)
+        with storage_errors(self._place, decoding=True):
+            if self.ndim == 1:
+                return cast(np.ndarray, self._array.oindex[episodes])
+            runs = np.split(episodes, np.flatnonzero(np.diff(episodes) != 1) + 1)
+            read = [cast(np.ndarray, self._array[int(run[0]) : int(run[-1]) + 1, :rows]) for run in runs]
+            return read[0] if len(read) == 1 else np.concatenate(read)
+
+    def _check_here(self, selection: Any) -> None:
+        """Raises StoreError for an episode that is not here, which would read as zero or black."""
+        if self._missing.any() and self._missing[selection].any():
+            raise StoreError(self._cure)
+
+
+class Subset:
+    """One subset of a release, read-only.
+
+    Attributes:
+      release: the release that it belongs to.
+      record: its entry in the manifest.
+    """
+
+    def __init__(self, release: Release, record: SubsetRecord):
+        self.release, self.record = release, record
+
+    def read_as(self, kind: Callable[..., Any], *options: Any) -> Any:
+        """The same subset as another class of subset."""
+        return kind(self.release, self.record, *options)
+
+    @property
+    def name(self) -> str:
+        return self.record.name
+
+    @property
+    def task(self) -> str:
+        return self.record.task
+
+    @property
+    def level(self) -> str:
+        return self.record.level
+
+    @property
+    def setting(self) -> str:
+        return self.record.setting
+
+    def __repr__(self) -> str:
+        return f"<Subset {self.name}: {len(self.episodes)} of {self.record.episodes} episodes>"
+
+    def __len__(self) -> int:
+        """Episodes that are here."""
+        return len(self._episodes)
+
+    def __getstate__(self) -> dict[str, Any]:  # Zarr handles are opened again where the subset lands
+        return {"release": self.release, "record": self.record}
+
+    # -- layers and arrays ----------------------------------------------------------------------------
+
+    @functools.cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """Its layers: trajectories, labels, then images."""
+        return tuple(self.release.layers[name] for name in self.record.layers)
+
+    @functools.cached_property
+    def trajectories(self) -> Layer:
+        """The layer of its states, actions and rewards."""
+        return self.layers[0]
+
+    @functools.cached_property
+    def _specs(self) -> dict[str, tuple[Layer, ArraySpec]]:
+        return {spec.name: (layer, spec) for layer in self.layers for spec in layer.arrays}
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        """Names of all arrays, e.g. "pixels", "pixels/top", "exogenous/camera_position"."""
+        return tuple(sorted(self._specs))
+
+    @property
+    def pixel_arrays(self) -> tuple[str, ...]:
+        """Names of the arrays of RGB images of its own size."""
+        return tuple(name for name in self.arrays if picture_of(name) is not None)
+
+    def spec(self, name: str) -> ArraySpec:
+        """The spec of one array.
+
+        Raises:
+          UnknownNameError: the subset has no such array.
+        """
+        return self._layer_of(name)[1]
+
+    def _layer_of(self, name: str) -> tuple[Layer, ArraySpec]:
+        if name not in self._specs:
+            if picture_of(name) is not None and not self.pixel_arrays:
+                raise StoreError(self._without_images)
+            raise UnknownNameError(f"array of {self.name}", name, self.arrays)
+        return self._specs[name]
+
+    def missing(self, layer: Layer) -> np.ndarray:
+        """(episode of the whole subset,) bool: episodes whose shard of a layer is not here."""
+        lacking = np.ones(self.record.episodes, bool)
+        for number in self.release.here(layer.name):
+            span = layer.episodes_of(number)
+            lacking[span.start : span.stop] = False
+        return lacking
+
+    @functools.cached_property
+    def _opened(self) -> dict[str, StoredArray]:
+        return {}
+
+    def array(self, name: str) -> StoredArray:
+        """One array, read when indexed, with an entry for each episode that the subset will have.
+
+        Raises:
+          UnknownNameError: the subset has no such array.
+        """
+        if name not in self._opened:
+            layer, spec = self._layer_of(name)
+            prefix = f"{layer.group}/{spec.stored_name}"
+            files = array_files(self.release.records(layer.name), layer, spec, self.release.here(layer.name))
+            chunks = self.release.store.zarr_store(prefix, files)
+            place, cure = (
+                f"{self.release.place}/{prefix}",
+                self._without_images if layer.kind == "images" else self._not_here,
+            )
+            array = open_array(layer, spec, self.record.episodes, chunks)
+            self._opened[name] = StoredArray(array, name, place, self.missing(layer), cure)
+        return self._opened[name]
+
+    @property
+    def _without_images(self) -> str:
+        return (
+            f"{self.name} has episodes without images; add them: `dmcvb-gen paint {quoted(self.release.place)}` "
+            "(in Python, dmcvb_gen.open(..., paint=True) renders them as they are read)"
+        )
+
+    @property
+    def _not_here(self) -> str:
+        return f"{self.name} of {self.release.place} has {_ranges(self.episodes)} here; choose among these episodes"
+
+    @property
+    def unpainted(self) -> np.ndarray:
+        """(episode of the whole subset,) bool: here, but without the images that the subset is about."""
+        here = np.zeros(self.record.episodes, bool)
+        here[self._episodes] = True
+        images = [layer for layer in self.layers if any(picture_of(spec.name) for spec in layer.arrays)]
+        lacking = [self.missing(layer) for layer in images] or [np.ones(self.record.episodes, bool)]
+        return here & np.any(lacking, axis=0)
+
+    # -- episodes -------------------------------------------------------------------------------------
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """(episode,) int: indices of the episodes that are here."""
+        return self._episodes.copy()
+
+    @functools.cached_property
+    def _episodes(self) -> np.ndarray:
+        needed = [layer for layer in self.layers if layer.kind != "images" or layer.source]
+        return np.flatnonzero(~np.any([self.missing(layer) for layer in needed], axis=0))
+
+    @functools.cached_property
+    def lengths(self) -> np.ndarray:
+        """(episode,) int32: transitions of each episode that is here, in the order of `episodes`."""
+        return self.read("length").clip(0, self.record.max_steps)
+
+    @functools.cached_property
+    def returns(self) -> np.ndarray:
+        """(episode,) float64: return of each episode that is here, in the order of `episodes`."""
+        return self.read("return")
+
+    @property
+    def steps(self) -> int:
+        """Transitions in all episodes that are here."""
+        return int(self.lengths.sum())
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all its files that are here; settings that share trajectories count them each."""
+        shards = self.release.shards([self.name])
+        return sum(file.bytes for shard in shards if shard.here for file in shard.files)
+
+    def read(self, array: str, episodes: slice | Iterable[int] | None = None) -> np.ndarray:
+        """Values of one array.
+
+        Args:
+          array: a name out of `arrays`.
+          episodes: indices of episodes that are here (all of them by default).
+
+        Returns:
+          (episode, step, ...) for arrays with steps, rows past an episode's length are zero; else (episode, ...).
+        """
+        if isinstance(episodes, slice):
+            wanted = np.arange(self.record.episodes)[episodes]
+            episodes = wanted[np.isin(wanted, self.episodes)]
+        return self._read(array, self.choose(episodes))
+
+    def _read(self, array: str, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
+        source = self.array(array)
+        return source.rows(episodes, rows) if len(episodes) else np.zeros((0, *source.shape[1:]), source.dtype)
+
+    def choose(self, episodes: Iterable[int] | None = None) -> np.ndarray:
+        """(episode,) int: indices of episodes that are here, all by default.
+
+        Args:
+          episodes: indices, or a mask of all of them (`subset.returns > 900`).
+
+        Raises:
+          StoreError: one of them is not there, or these are neither integers nor such a mask.
+        """
+        if episodes is None:
+            return self.episodes
+        chosen = np.asarray(list(episodes))
+        if chosen.dtype == bool and chosen.shape == self.episodes.shape:
+            return self.episodes[chosen]
+        if chosen.size and chosen.dtype.kind not in "iu":
+            raise StoreError(
+                f"episodes are {chosen.dtype} of shape {chosen.shape}; give indices, or a mask of all "
+                f"{len(self.episodes)} episodes of {self.name}"
+            )
+        chosen = chosen.astype(int)
+        missing = np.setdiff1d(chosen, self.episodes)
+        if len(missing):
+            raise StoreError(f"{self.name} has no episode {missing[0]}; it has {_ranges(self.episodes)}")
+        return chosen
+
+    def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
+        """Prepare to read rows of these episodes part by part; does nothing for stored pictures."""
+
+    def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
+        """Rows of episodes, one episode after the other.
+
+        Args:
+          arrays: names of arrays with steps.
+          episodes: indices of episodes that are here.
+
+        Returns:
+          (row, ...) by name, L + 1 rows of each episode.
+        """
+        chosen = self.choose(episodes)
+        length = self.read("length", chosen).clip(0, self.record.max_steps)  # a damaged one asks for no more memory
+        used = np.arange(int(length.max(initial=-1)) + 1) <= length[:, None]
+        read = ((name, self._read(name, chosen, used.shape[1])) for name in arrays)
+        return {name: value.reshape(-1, *value.shape[2:]) if used.all() else value[used] for name, value in read}
+
+    def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
+        """The stored labels of the distractors, leading shape (episode, step); see `read`."""
+        names = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in self.arrays]
+        return DistractorState(**{name: self.read(f"exogenous/{name}", episodes) for name in names})
+
+    def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """One episode, cut to its length L.
+
+        Returns:
+          Arrays by name: L + 1 rows of pixels, state, physics and labels; L rows of action, reward and discount.
+        """
+        names = self.arrays if arrays is None else tuple(arrays)
+        values = self.rows([name for name in names if self.array(name).ndim > 1], [index])
+        values |= {name: values[name][:-1] for name in TRANSITIONS if name in values}
+        return {name: values[name] if name in values else self.read(name, [index])[0] for name in names}
+
+    def each_episode(self, arrays: Iterable[str] | None = None) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Index and arrays of every episode that is here, as `episode` gives them, in the order of `episodes`.
+
+        Each array is read once a shard, which takes a fraction of reading each episode; a shard's arrays are in memory.
+
+        Args:
+          arrays: names of arrays, all by default.
+        """
+        names = self.arrays if arrays is None else tuple(arrays)
+        with_steps = [name for name in names if self.array(name).ndim > 1]
+        lengths = iter(self.lengths.clip(0, self.record.max_steps))
+        per_shard = self.trajectories.episodes_per_shard
+        for episodes in np.split(self._episodes, np.flatnonzero(np.diff(self._episodes // per_shard)) + 1):
+            values: dict[str, Any] = {name: self.read(name, episodes) for name in names if name not in with_steps}
+            ends = np.cumsum([int(next(lengths)) + 1 for _ in episodes])[:-1]
+            for name, rows in self.rows(with_steps, episodes).items():
+                parts = np.split(rows, ends)
+                values[name] = [part[:-1] for part in parts] if name in TRANSITIONS else parts
+            for index, episode in enumerate(episodes):
+                yield int(episode), {name: values[name][index] for name in names}
+
+
+def _ranges(indices: np.ndarray) -> str:
+    if not len(indices):
+        return "none yet"
+    breaks = np.flatnonzero(np.diff(indices) != 1)
+    starts, ends = np.r_[0, breaks + 1], np.r_[breaks, len(indices) - 1]
+    return ", ".join(f"{indices[a]}..{indices[b]}" for a, b in zip(starts, ends, strict=True))

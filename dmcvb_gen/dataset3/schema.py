@@ -1,0 +1,268 @@
+r"""Describe the layers and arrays of a subset, and how an array's shard becomes bytes.
+
+One Zarr v3 group a set of trajectories, arrays episode-major, one file an array and shard::
+
+    <release>/<task>/<level>.zarr/                 the settings of a task and level share their trajectories
+        trajectories/  state action reward ...     (episode, step, ...)
+                       length return ...           (episode,)
+        dynamic/       exogenous/...               (episode, step, ...) labels of the distractors
+                       pixels                      (episode, step, height, width, channel) uint8
+                       pixels_top ...              the same, of tasks with several views
+                       at84/pixels                 the same images at another size
+    <release>/<task>/<level>/<setting>.zarr/       a setting with trajectories of its own (mazes, --independent)
+
+In Python the image of a view is called "pixels/top"; `ArraySpec.stored_name` says where it lies. No dimension has the
+name of an array: action_dim, state_dim, physics_dim.
+
+An episode of `length` L transitions fills rows 0..L; row t holds observation t, the action taken there
+and the reward that it earned; row L holds the last observation and no action (zeros)::
+
+    step        0     1          L-1    L     L+1 ...
+    pixels      o_0   o_1   ...  o_L-1  o_L   (nothing stored)
+    state       s_0   s_1   ...  s_L-1  s_L
+    action      a_0   a_1   ...  a_L-1  0
+    reward      r_0   r_1   ...  r_L-1  0      r_t: earned by a_t
+    discount    1     1     ...  d      0      d = 0 if the task ended the episode, 1 at the time limit
+
+Rows past L are never written: a missing chunk costs no storage.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec, TransposeCodec, ZstdCodec
+from zarr.core.array import AsyncArray
+from zarr.core.metadata.v3 import ArrayV3Metadata
+from zarr.dtype import parse_dtype
+from zarr.storage import MemoryStore, StorePath
+
+from dmcvb_gen.dataset3.manifest import ArraySpec, Codec, Layer
+from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_LABELS
+from dmcvb_gen.errors import StoreError
+
+PIXEL_CHUNK_STEPS = 32
+"""Steps of a chunk of images: the unit of reading (chosen with scripts/bench_store.py)."""
+
+
+@dataclass(frozen=True)
+class EpisodeShape:
+    """Shape of a task's episodes: all that the layout needs to know of the task.
+
+    Attributes:
+      views: names of the images of a frame, in their order; ("pixels",) for one.
+      goal: True if there are images with the goal hidden beside them.
+      state_fields: name -> (first, last + 1) in the state.
+      action_low, action_high: (action,) bounds of the environment's actions.
+      state_size, physics_size: entries of one step.
+      materials: materials whose colors are labels.
+      max_steps: transitions at which the time limit ends an episode.
+    """
+
+    views: tuple[str, ...]
+    goal: bool
+    state_fields: Mapping[str, tuple[int, int]]
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    state_size: int
+    physics_size: int
+    materials: int
+    max_steps: int
+
+    @classmethod
+    def of(cls, task: Any) -> EpisodeShape:
+        """The shape of a `dmcvb_gen.tasks` task (which this package does not import)."""
+        low = getattr(task, "action_low", None)
+        high = getattr(task, "action_high", None)
+        return cls(
+            views=tuple(task.views),
+            goal=bool(task.goal_geoms),
+            state_fields={name: (part.start, part.stop) for name, part in task.state_slices.items()},
+            action_low=tuple(map(float, low if low is not None else [-1.0] * task.action_size)),
+            action_high=tuple(map(float, high if high is not None else [1.0] * task.action_size)),
+            state_size=task.state_size,
+            physics_size=task.physics_size,
+            materials=len(task.material_colors),
+            max_steps=task.max_steps,
+        )
+
+    @property
+    def rows(self) -> int:
+        """Rows of the step axis: one for each observation."""
+        return self.max_steps + 1
+
+
+def trajectory_arrays(shape: EpisodeShape) -> tuple[ArraySpec, ...]:
+    """The arrays of a set of trajectories."""
+    fields = {name: list(part) for name, part in shape.state_fields.items()}
+    bounds = {"low": list(shape.action_low), "high": list(shape.action_high)}
+    action = len(shape.action_low)
+    return (
+        ArraySpec(
+            name="state", dtype="float32", shape=(shape.state_size,), dims=("state_dim",), attributes={"fields": fields}
+        ),
+        ArraySpec(name="action", dtype="float32", shape=(action,), dims=("action_dim",), attributes=bounds),
+        ArraySpec(name="reward", dtype="float32"),
+        ArraySpec(name="discount", dtype="float32"),
+        ArraySpec(name="physics", dtype="float64", shape=(shape.physics_size,), dims=("physics_dim",)),
+        ArraySpec(name="length", dtype="int32", steps=False),
+        ArraySpec(name="terminated", dtype="bool", steps=False),
+        ArraySpec(name="return", dtype="float64", steps=False),
+        ArraySpec(name="seed", dtype="uint64", steps=False),
+        ArraySpec(name="behaviour", dtype="int16", steps=False),
+        ArraySpec(name="goal_pair", dtype="int16", steps=False),
+    )
+
+
+def label_arrays(shape: EpisodeShape, varying: Collection[str] = ()) -> tuple[ArraySpec, ...]:
+    """The arrays of a setting's labels, in the order of `DistractorState`.
+
+    Args:
+      varying: parts of the distractor that vary and have labels of their own, see `OPTIONAL_LABELS`.
+    """
+    sizes = {"view": len(shape.views), "material": shape.materials, "xyz": 3, "wxyz": 4, "rgb": 3}
+    return tuple(
+        ArraySpec(
+            name=f"exogenous/{name}",
+            dtype=dtype,
+            shape=tuple(sizes[axis] for axis in LABEL_DIMENSIONS[name]),
+            dims=LABEL_DIMENSIONS[name],
+        )
+        for name, dtype in LABEL_DTYPES.items()
+        if OPTIONAL_LABELS.get(name, "") in ("", *varying) and all(sizes[axis] for axis in LABEL_DIMENSIONS[name])
+    )
+
+
+def image_array(
+    name: str,
+    size: int,
+    camera_moves: bool,
+    rows: int,
+    *,
+    own_size: int | None = None,
+    dtype: str = "uint8",
+    shape: Sequence[int] = (3,),
+    dims: Sequence[str] = ("channel",),
+) -> ArraySpec:
+    """The array of one view's images, or of a modality of it.
+
+    Images of a moving camera are smaller as differences of neighboring pixels, one color channel at a time. If the
+    camera stands still, zstd finds the repeated rows by itself, and is faster to read (scripts/bench_store.py).
+
+    Args:
+      name: "pixels", "pixels/top", "depth/top", ...
+      size: pixels a side.
+      rows: rows of the step axis.
+      own_size: size of the subset's own images; those of another size are called "at84/pixels", and their axes so.
+      dtype, shape, dims: of one pixel; a modality has others than RGB.
+    """
+    other = own_size is not None and size != own_size
+    axes = (f"height_{size}", f"width_{size}") if other else ("height", "width")
+    return ArraySpec(
+        name=f"at{size}/{name}" if other else name,
+        dtype=dtype,
+        shape=(size, size, *shape),
+        dims=(*axes, *dims),
+        chunk_steps=min(PIXEL_CHUNK_STEPS, rows),
+        codec="channel-delta-zstd" if camera_moves and dtype == "uint8" and tuple(shape) == (3,) else "zstd",
+    )
+
+
+# -- arrays as Zarr has them ----------------------------------------------------------------------
+
+
+class BoundedZstd(ZstdCodec):
+    """zstd that decodes nothing larger than its chunk, whatever a frame's header claims."""
+
+    def _decode_sync(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
+        limit = math.prod(chunk_spec.shape) * chunk_spec.dtype.item_size
+        if frame_content_size(chunk_bytes.to_bytes()[:18]) not in (limit,):
+            raise ValueError(f"a chunk does not decode to its {limit} bytes")
+        return super()._decode_sync(chunk_bytes, chunk_spec)
+
+
+def frame_content_size(head: bytes) -> int | None:
+    """Decoded size that a zstd frame states (RFC 8878, section 3.1.1.1); None if it states none or is no frame."""
+    if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    flags = head[4]
+    single, dictionary, kind = bool(flags & 0x20), (0, 1, 2, 4)[flags & 3], flags >> 6
+    start = 5 + (not single) + dictionary
+    width = (1 if single else 0, 2, 4, 8)[kind]
+    if not width or len(head) < start + width:
+        return None
+    return int.from_bytes(head[start : start + width], "little") + (256 if width == 2 else 0)
+
+
+def _filters(codec: Codec) -> tuple[Any, ...]:
+    """Array codecs before bytes: all are Zarr's own or numcodecs', so plain zarr-python reads them."""
+    if codec == "zstd":
+        return ()
+    from zarr.codecs import numcodecs
+
+    return (TransposeCodec(order=(0, 4, 1, 2, 3)), numcodecs.Delta(dtype="|u1"))
+
+
+def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metadata:
+    """Zarr's metadata of an array, from its spec alone; readers build arrays from it, plain readers get it as zarr.json.
+
+    Args:
+      episodes: length of the first axis.
+    """
+    per_shard, rows = layer.episodes_per_shard, layer.rows
+    pixel_level = 1 if spec.codec == "channel-delta-zstd" else 3
+    packed = (BoundedZstd(level=pixel_level), Crc32cCodec())
+    array_to_bytes: list[Any] = [*_filters(spec.codec), BytesCodec(), *packed]
+    if not spec.steps:
+        shape, chunks, codecs = (episodes, *spec.shape), (per_shard, *spec.shape), array_to_bytes
+        dims: tuple[str, ...] = ("episode", *spec.dims)
+    else:
+        steps = min(spec.chunk_steps or rows, rows)
+        shape, dims = (episodes, rows, *spec.shape), ("episode", "step", *spec.dims)
+        chunks = (per_shard, -(-rows // steps) * steps, *spec.shape)
+        codecs = [ShardingCodec(chunk_shape=(1, steps, *spec.shape), codecs=array_to_bytes)]
+    return ArrayV3Metadata(
+        shape=shape,
+        data_type=parse_dtype(np.dtype(spec.dtype), zarr_format=3),
+        chunk_grid={"name": "regular", "configuration": {"chunk_shape": list(chunks)}},
+        chunk_key_encoding={"name": "default", "configuration": {"separator": "/"}},
+        fill_value=0,
+        codecs=codecs,
+        attributes={"array": spec.name, **spec.attributes},
+        dimension_names=dims,
+    )
+
+
+def open_array(layer: Layer, spec: ArraySpec, episodes: int, store: Any, read_only: bool = True) -> zarr.Array:
+    """An array over a Zarr store of its chunks, built from its spec; nothing is read."""
+    metadata = array_metadata(layer, spec, episodes)
+    return zarr.Array(AsyncArray(metadata=metadata, store_path=StorePath(store)))
+
+
+def encode(layer: Layer, spec: ArraySpec, values: np.ndarray) -> bytes | None:
+    """The bytes of an array's file of one shard.
+
+    Args:
+      values: (episode of the shard, row, ...) or (episode of the shard, ...); a full shard.
+
+    Returns:
+      None if all values are fill values: there is no file then.
+
+    Raises:
+      StoreError: the values have another shape or dtype than the spec.
+    """
+    rows = (layer.rows,) if spec.steps else ()
+    shape = (layer.episodes_per_shard, *rows, *spec.shape)
+    if values.shape != shape or values.dtype != np.dtype(spec.dtype):
+        raise StoreError(
+            f"{spec.name} of {layer.name} is {values.dtype} {values.shape}, and its layer stores {spec.dtype} {shape}"
+        )
+    chunks: dict[str, Any] = {}
+    array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks), read_only=False)
+    array[...] = values
+    return next(iter(chunks.values())).to_bytes() if chunks else None

@@ -1,0 +1,397 @@
+"""Write a release: recipe, shards with their records, layer lists, manifest, metadata for plain readers; in this order.
+
+Files and records are created and never replaced. If a file is there, equal bytes are adopted and others stop with an
+error. Only the manifest and what follows from it (zarr.json, copy.json) are replaced, each in one atomic step::
+
+    begin      inputs, then recipes/<sha>.json
+    put_shard  files, then records/<layer>/00003.json
+    finish     layers/<sha>.json, then manifest.json, then zarr.json
+"""
+
+from __future__ import annotations
+
+import datetime
+import secrets
+from collections.abc import Collection, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.dataset3.environment import environment
+from dmcvb_gen.dataset3.gate import READERS, Release, read_recipes, read_records
+from dmcvb_gen.dataset3.manifest import (
+    COPY,
+    MANIFEST,
+    MANIFEST_BYTES,
+    MANIFESTS,
+    MAX_SHARD_BYTES,
+    PROVENANCE,
+    RECIPES,
+    ZARR_JSON,
+    Copy,
+    FileRecord,
+    Layer,
+    Manifest,
+    Resolved,
+    ShardFile,
+    ShardRecord,
+    SubsetRecord,
+    build_manifest,
+    canonical_json,
+    check_record,
+    list_path,
+    merged_layers,
+    merged_subset,
+    parse,
+    record_bytes_limit,
+    record_path,
+)
+from dmcvb_gen.dataset3.schema import array_metadata, encode
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import parse_json, sha256_bytes
+from dmcvb_gen.storage.store import NotThere, Store
+
+PROVENANCE_BYTES = 2**20
+ROW_LAYOUT = "row t: observation t, action t, reward of action t; row `length`: the last observation alone"
+
+
+def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False, move: bool = False) -> ShardFile:
+    """Create a file, or adopt the equal one that is there.
+
+    Args:
+      data: its bytes, or the path of a local file.
+      first_wins: adopt whatever is there, for images of a renderer that does not promise bits.
+      move: the local file may become the stored one.
+
+    Returns:
+      Size and SHA-256 of the file that is there now.
+
+    Raises:
+      StoreError: a file with other bytes is there, or it cannot be written.
+    """
+    mine = file_facts(data)
+    if store.create(path, data, move=move):
+        return mine
+    there = ShardFile(bytes=store.size(path) or 1, sha256=store.sha256(path, MAX_SHARD_BYTES))
+    if there == mine or first_wins:
+        return there
+    raise StoreError(
+        f"{store.place}/{path} is there with other bytes (SHA-256 {there.sha256[:12]}, made by {makers(store)}) than "
+        f"{_versions(environment())} makes ({mine.sha256[:12]}); use those versions, or choose another place"
+    )
+
+
+def file_facts(data: bytes | Path) -> ShardFile:
+    """Size and SHA-256 of bytes or of a local file."""
+    from dmcvb_gen.files import sha256_file
+
+    if isinstance(data, bytes):
+        return ShardFile(bytes=len(data), sha256=sha256_bytes(data))
+    return ShardFile(bytes=data.stat().st_size, sha256=sha256_file(data))
+
+
+# -- recipe ---------------------------------------------------------------------------------------
+
+
+def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) -> None:
+    """Put a resolved recipe, and the policies and videos that it names; quiet if they are there.
+
+    Args:
+      inputs: path in the release -> local file, for every file of `recipe.inputs`.
+
+    Raises:
+      StoreError: the place holds something else, or a recipe that contradicts this one; or it is a copy.
+    """
+    there = read_recipes(store)
+    if any(each.sha256 == recipe.sha256 for each in there):
+        return
+    if not there and (strange := next(iter(sorted(store.list())), None)) and not _only_inputs(store):
+        raise StoreError(f"{store.place} holds no release but other files ({strange}); choose an empty place for --out")
+    if store.size(COPY) is not None:
+        raise StoreError(f"{store.place} is a copy of a release and does not grow; choose another --out")
+    check_agree([*there, recipe])
+    for file in recipe.inputs:
+        put(store, file.path, inputs[file.path])
+    put(store, f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
+
+
+def _only_inputs(store: Store) -> bool:
+    """Return True if a place has nothing but the inputs of a release whose begin was interrupted."""
+    return all(path.startswith(("policies/", "backgrounds/")) for path in store.list())
+
+
+def check_agree(recipes: Iterable[Resolved]) -> None:
+    """Raises StoreError if recipes describe a layer or a subset differently."""
+    recipes = list(recipes)
+    merged_layers(recipes)
+    subsets: dict[str, SubsetRecord] = {}
+    for recipe in recipes:
+        for subset in recipe.subsets:
+            there = subsets.get(subset.name)
+            subsets[subset.name] = subset if there is None else merged_subset(there, subset)
+
+
+# -- shards ---------------------------------------------------------------------------------------
+
+
+def put_shard(
+    store: Store, layer: Layer, shard: int, arrays: Iterable[tuple[str, np.ndarray]], *, first_wins: bool = False
+) -> ShardRecord:
+    """Write the arrays of a layer's shard, then its record.
+
+    Args:
+      arrays: (name, (episode of the shard, ...)) pairs of all arrays of the layer, taken one after the other.
+      first_wins: see `put`.
+
+    Raises:
+      StoreError: see `put`; arrays are missing; another job's record is there.
+    """
+    specs, files, given = {spec.name: spec for spec in layer.arrays}, {}, set()
+    for name, values in arrays:
+        given.add(name)
+        data = encode(layer, specs[name], values)
+        if data is not None:
+            files[name] = put(store, layer.file_path(specs[name], shard), data, first_wins=first_wins)
+    if lacking := set(specs) - given:
+        raise StoreError(f"shard {shard} of {layer.name} was made without {min(lacking)}")
+    return put_record(store, layer, shard, ShardRecord(key=layer.job_key(shard), files=files), first_wins=first_wins)
+
+
+def put_record(store: Store, layer: Layer, shard: int, record: ShardRecord, *, first_wins: bool = False) -> ShardRecord:
+    """Put the record of a shard whose files are there: from now on the shard exists.
+
+    Raises:
+      StoreError: another record is there.
+    """
+    path = record_path(layer.name, shard)
+    if store.create(path, canonical_json(record)):
+        return record
+    where = f"{store.place}/{path}"
+    there = check_record(parse(ShardRecord, store.read(path, record_bytes_limit(layer)), where), layer, shard, where)
+    if there != record and not first_wins:
+        name = next(n for n in sorted({*there.files, *record.files}) if there.files.get(n) != record.files.get(n))
+        raise StoreError(
+            f"{where} has other bytes of {name} (made by {makers(store)}) than {_versions(environment())} makes; use "
+            "those versions, or choose another place"
+        )
+    return there
+
+
+def wrong_bytes(store: Store, file: FileRecord) -> str | None:
+    """Say what is wrong with a file of a release, in words that follow its name; None if every byte is as recorded."""
+    try:
+        size = store.size(file.path)
+        if size is None:
+            return "is missing"
+        if size != file.bytes:
+            return f"has {size} bytes instead of {file.bytes}"
+        return None if store.sha256(file.path, file.bytes) == file.sha256 else "does not have its digest"
+    except NotThere:
+        return "is missing"
+    except StoreError as error:
+        return f"cannot be read: {error}"
+
+
+def put_back(store: Store, file: FileRecord, data: bytes | Path) -> None:
+    """Put a file in the place of a missing or damaged one, if it has the recorded SHA-256; else change nothing.
+
+    Raises:
+      StoreError: it has other bytes.
+    """
+    mine = file_facts(data)
+    if (mine.bytes, mine.sha256) != (file.bytes, file.sha256):
+        raise StoreError(
+            f"{file.path} was made by {makers(store)} and cannot be made with {_versions(environment())}: SHA-256 "
+            f"{mine.sha256[:12]} instead of {file.sha256[:12]}; nothing was changed"
+        )
+    store.delete(file.path)
+    put(store, file.path, data)
+
+
+# -- manifest -------------------------------------------------------------------------------------
+
+
+def finish(store: Store) -> Release:
+    """Write the manifest of what is there: of each subset the largest count asked for whose shards all exist.
+
+    Whoever finishes writes the same bytes. Until the manifest is replaced, the older one is the release, whole. The
+    manifest of a copy stays.
+
+    Returns:
+      The release as it is now; in the making if no subset is whole.
+    """
+    if store.size(COPY) is not None:
+        release = Release.open(store)
+        write_plain_metadata(release)
+        return release
+    while True:
+        tag = store.version(MANIFEST)
+        old = store.read(MANIFEST, MANIFEST_BYTES) if tag is not None else None
+        recipes = read_recipes(store)
+        known = _listed_records(store) if old is not None else {}
+        lists = {
+            name: _leading(read_records(store, layer, known.get(name)))
+            for name, layer in merged_layers(recipes).items()
+        }
+        built = build_manifest(recipes, lists)
+        if built is None:
+            return Release.in_making(store)
+        manifest, made = built
+        text = canonical_json(manifest)
+        if text == old:
+            break
+        for each in made.values():
+            listed = canonical_json(each)
+            put(store, list_path(sha256_bytes(listed)), listed)
+        if old is not None:
+            put(store, f"{MANIFESTS}{sha256_bytes(old)}.json", old)
+        if store.replace(MANIFEST, text, expected=tag):
+            break
+    release = Release.open(store)
+    write_plain_metadata(release)
+    return release
+
+
+def _listed_records(store: Store) -> dict[str, dict[int, ShardRecord]]:
+    release = Release.open(store)
+    return {name: release.records(name) for name in release.layers}
+
+
+def _leading(records: Mapping[int, ShardRecord]) -> tuple[ShardRecord, ...]:
+    """The records from the first shard up to the first gap."""
+    leading = []
+    while (record := records.get(len(leading))) is not None:
+        leading.append(record)
+    return tuple(leading)
+
+
+# -- for plain readers ----------------------------------------------------------------------------
+
+
+def write_plain_metadata(release: Release) -> None:
+    """Write the zarr.json files of the layers that are here, for zarr and xarray; our readers never read them."""
+    texts = plain_metadata(release)
+    with ThreadPoolExecutor(READERS) as pool:
+        list(pool.map(release.store.replace, texts.keys(), texts.values()))
+
+
+def plain_metadata(release: Release) -> dict[str, bytes]:
+    """Path -> text of every zarr.json: a function of manifest and copy."""
+    nodes: dict[str, dict[str, Any]] = {}
+    for subset in release.manifest.subsets:
+        for name in subset.layers:
+            if release.here(name):
+                _add_layer(nodes, release, subset, release.layers[name])
+    texts = {}
+    roots = {path for path in nodes if path.endswith(".zarr")}
+    for path, node in nodes.items():
+        if path in roots:
+            members = {each.removeprefix(f"{path}/"): value for each, value in nodes.items() if each.startswith(f"{path}/")}
+            node = node | {
+                "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": dict(sorted(members.items()))}
+            }
+        texts[f"{path}/{ZARR_JSON}"] = canonical_json(node)
+    return texts
+
+
+def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: SubsetRecord, layer: Layer) -> None:
+    root, _, setting = layer.group.partition(".zarr/")
+    shared = {"task": subset.task, "level": subset.level, "release": f"{release.manifest.name} {release.manifest.version}"}
+    shared |= {"seconds_per_step": subset.seconds_per_step, "layout": ROW_LAYOUT}
+    nodes.setdefault(f"{root}.zarr", _group(shared))
+    facts = {} if layer.kind == "trajectories" else {"setting": subset.setting, "views": list(subset.views)}
+    nodes.setdefault(f"{root}.zarr/{setting}", _group(facts))
+    for spec in layer.arrays:
+        path = f"{layer.group}/{spec.stored_name}"
+        folder = path.rpartition("/")[0]
+        if folder != layer.group:
+            nodes.setdefault(folder, _group({}))
+        episodes = min(subset.episodes, len(release.records(layer.name)) * layer.episodes_per_shard)
+        episodes = max(episodes, nodes.get(path, {}).get("shape", (0,))[0])
+        nodes[path] = parse_json(canonical_json(array_metadata(layer, spec, episodes).to_dict()))
+
+
+def _group(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+
+
+# -- copies ---------------------------------------------------------------------------------------
+
+
+def finish_copy(store: Store, manifest_text: bytes, source: str, promised: Mapping[str, Collection[int]]) -> Release:
+    """Make a folder with copied shards and lists a copy: copy.json, then the manifest, then zarr.json.
+
+    Args:
+      manifest_text: the manifest that was copied from, to the byte.
+      source: where it was copied from, without passwords.
+      promised: layer -> shards that were to be copied; those promised before stay so.
+    """
+    digest = sha256_bytes(manifest_text)
+    before: dict[str, Collection[int]] = {}
+    if store.size(COPY) is not None:
+        old = parse(Copy, store.read(COPY, MANIFEST_BYTES), f"{store.place}/{COPY}")
+        before = {name: [n for first, last in runs for n in range(first, last)] for name, runs in old.promised.items()}
+    names = sorted({*before, *promised})
+    runs = {name: _runs({*before.get(name, ()), *promised.get(name, ())}) for name in names}
+    store.replace(COPY, canonical_json(Copy(manifest=digest, source=source, promised=runs)))
+    store.replace(MANIFEST, manifest_text)
+    release = Release.open(store)
+    write_plain_metadata(release)
+    return release
+
+
+def _runs(numbers: Collection[int]) -> tuple[tuple[int, int], ...]:
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and runs[-1][1] == number:
+            runs[-1][1] += 1
+        else:
+            runs.append([number, number + 1])
+    return tuple((first, last) for first, last in runs)
+
+
+# -- provenance -----------------------------------------------------------------------------------
+
+
+def write_provenance(store: Store, command: str, **facts: Any) -> None:
+    """Note who made what, when and with which versions; one file a process, outside of the digest."""
+    now = datetime.datetime.now(datetime.UTC)
+    content = {"time": now.isoformat(timespec="seconds"), "command": command, "environment": environment(), **facts}
+    store.create(f"{PROVENANCE}{now:%Y%m%dT%H%M%SZ}-{secrets.token_hex(4)}.json", canonical_json(content))
+
+
+def read_provenance(store: Store) -> list[dict[str, Any]]:
+    """Notes of all processes that wrote to a release, oldest first; what is no note is left out."""
+    notes = []
+    for path in sorted(store.list(PROVENANCE)):
+        note = parse_json(store.read(path, PROVENANCE_BYTES))
+        if isinstance(note, dict) and isinstance(note.get("environment"), dict):
+            notes.append(note)
+    return notes
+
+
+def makers(store: Store) -> str:
+    """The versions that made a release, for messages."""
+    found = dict.fromkeys(_versions(note["environment"]) for note in read_provenance(store))
+    return " and ".join(found) or "unknown versions"
+
+
+def check_versions(store: Store) -> None:
+    """Raises StoreError if a package has another version here than where a release was begun."""
+    here = environment()
+    for note in read_provenance(store)[:1]:
+        for name, version in here.items():
+            begun = note["environment"].get(name, version)
+            if name not in ("system", "cpu") and begun != version:
+                raise StoreError(
+                    f"the release was begun with {name} {begun} and this is {name} {version}, which may change bits; "
+                    f"install {name} {begun}, or give --other-versions"
+                )
+
+
+def _versions(made_by: Mapping[str, str]) -> str:
+    return f"dmcvb-gen {made_by.get('dmcvb-gen', '?')} with mujoco {made_by.get('mujoco', '?')}"
+
+
