@@ -173,6 +173,9 @@ class Release:
     def __repr__(self) -> str:
         return f"<Release {self.manifest.name} {self.manifest.version}: {pluralize(len(self.subsets), 'subsets')}>"
 
+    def __getstate__(self) -> dict[str, Any]:  # subsets are made again where the release lands
+        return {key: value for key, value in self.__dict__.items() if key != "subsets"}
+
     @property
     def place(self) -> str:
         """Where it lies, for messages."""
@@ -229,7 +232,7 @@ class Release:
         """Numbers of the shards of a layer that are here: all, but in a copy those whose record is."""
         if layer not in self._here:
             if self.copy is None:
-                self._here[layer] = self.records(layer).keys()
+                self._here[layer] = frozenset(self.records(layer))
             else:
                 self._here[layer] = recorded_shards(self.store, layer)
         return self._here[layer]
@@ -390,10 +393,10 @@ def read_records(store: Store, layer: Layer, known: Mapping[int, ShardRecord] | 
 def array_files(
     shards: Mapping[int, ShardRecord], layer: Layer, spec: ArraySpec, here: Collection[int]
 ) -> dict[str, Any]:
-    """Key below an array's folder ("c/3/0/0") -> its file, of the shards that are here."""
+    """Key below an array's folder ("c/3/0/0") -> bytes of its file, of the shards that are here."""
     prefix = f"{layer.group}/{spec.stored_name}/"
     found = {}
     for number, record in shards.items():
         if number in here and (file := record.files.get(spec.name)):
-            found[layer.file_path(spec, number).removeprefix(prefix)] = file
+            found[layer.file_path(spec, number).removeprefix(prefix)] = file.bytes
     return found
