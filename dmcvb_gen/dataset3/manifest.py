@@ -328,7 +328,7 @@ def _check_tree(subsets: tuple[SubsetRecord, ...], layers: Iterable[Layer]) -> N
 class _Described(_Model):
     """What recipes and manifests share."""
 
-    schema_version: Literal[3] = SCHEMA_VERSION
+    schema_version: Literal[3] = 3
     name: PlainName
     version: PlainName
     license: Line

@@ -129,7 +129,7 @@ def label_arrays(shape: EpisodeShape, varying: Collection[str] = ()) -> tuple[Ar
     return tuple(
         ArraySpec(
             name=f"exogenous/{name}",
-            dtype=dtype,
+            dtype=dtype,  # type: ignore[arg-type]  # checked by the model
             shape=tuple(sizes[axis] for axis in LABEL_DIMENSIONS[name]),
             dims=LABEL_DIMENSIONS[name],
         )
@@ -165,7 +165,7 @@ def image_array(
     axes = (f"height_{size}", f"width_{size}") if other else ("height", "width")
     return ArraySpec(
         name=f"at{size}/{name}" if other else name,
-        dtype=dtype,
+        dtype=dtype,  # type: ignore[arg-type]
         shape=(size, size, *shape),
         dims=(*axes, *dims),
         chunk_steps=min(PIXEL_CHUNK_STEPS, rows),

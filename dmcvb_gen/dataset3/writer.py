@@ -261,7 +261,7 @@ def _listed_records(store: Store) -> dict[str, dict[int, ShardRecord]]:
 
 def _leading(records: Mapping[int, ShardRecord]) -> tuple[ShardRecord, ...]:
     """The records from the first shard up to the first gap."""
-    leading = []
+    leading: list[ShardRecord] = []
     while (record := records.get(len(leading))) is not None:
         leading.append(record)
     return tuple(leading)
@@ -298,7 +298,7 @@ def plain_metadata(release: Release) -> dict[str, bytes]:
 
 def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: SubsetRecord, layer: Layer) -> None:
     root, _, setting = layer.group.partition(".zarr/")
-    shared = {"task": subset.task, "level": subset.level, "release": f"{release.manifest.name} {release.manifest.version}"}
+    shared: dict[str, Any] = {"task": subset.task, "level": subset.level, "release": f"{release.manifest.name} {release.manifest.version}"}
     shared |= {"seconds_per_step": subset.seconds_per_step, "layout": ROW_LAYOUT}
     nodes.setdefault(f"{root}.zarr", _group(shared))
     facts = {} if layer.kind == "trajectories" else {"setting": subset.setting, "views": list(subset.views)}

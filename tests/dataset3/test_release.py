@@ -1,0 +1,267 @@
+"""A release from its first file to its copy: what readers see, and what never changes."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import pickle
+
+import numpy as np
+import pytest
+import xarray
+import zarr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import ShardRecord, build_manifest, canonical_json, record_path, shard_size
+from dmcvb_gen.dataset3.schema import frame_content_size
+from dmcvb_gen.dataset3.writer import (
+    begin,
+    check_versions,
+    finish,
+    finish_copy,
+    put_back,
+    put_shard,
+    write_provenance,
+    wrong_bytes,
+)
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.storage.store import open_store
+from tests.dataset3 import made_up, oracle
+
+NAME = "hop/random/dynamic"
+
+
+@pytest.fixture
+def store(tmp_path):
+    return open_store(tmp_path / "release")
+
+
+def test_a_release_is_what_its_manifest_names(store):
+    release = made_up.make(store, made_up.recipe(3))
+    text = (store.folder / "manifest.json").read_bytes()
+    assert release.digest == hashlib.sha256(text).hexdigest()
+    assert oracle.check(store.folder) == json.loads(text)
+
+
+def test_readers_get_the_values_that_were_written(store):
+    subset = made_up.make(store, made_up.recipe(3))[NAME]
+    layers = {spec.name: layer for layer in subset.layers for spec in layer.arrays}
+    for name, layer in layers.items():
+        parts = [dict(made_up.values(layer, shard))[name] for shard in (0, 1)]
+        np.testing.assert_array_equal(subset.read(name), np.concatenate(parts)[:3], err_msg=name)
+    assert len(subset) == 3 and subset.steps == subset.read("length").sum()
+    landed = pickle.loads(pickle.dumps(subset))
+    np.testing.assert_array_equal(landed.read("pixels"), subset.read("pixels"))
+    episodes = dict(subset.each_episode(["pixels", "action", "return"]))
+    assert set(episodes) == {0, 1, 2}
+    for index, episode in episodes.items():
+        assert all((value == subset.episode(index)[name]).all() for name, value in episode.items())
+
+
+def test_plain_readers_see_all_arrays(store):
+    subset = made_up.make(store, made_up.recipe(3))[NAME]
+    place = str(store.folder / "hop/random.zarr")
+    tree = xarray.open_datatree(place, engine="zarr")
+    np.testing.assert_array_equal(tree["dynamic/pixels"].values, subset.read("pixels"))
+    np.testing.assert_array_equal(tree["trajectories/state"].values, subset.read("state"))
+    group = zarr.open_group(place, mode="r")
+    np.testing.assert_array_equal(
+        group["none/exogenous/style"][:], subset.release["hop/random/none"].read("exogenous/style")
+    )
+    joined = xarray.merge([tree["trajectories"].to_dataset(), tree["dynamic"].to_dataset()])
+    assert {"state", "pixels"} <= set(joined)
+
+
+def test_readers_take_no_notice_of_zarr_metadata(store):
+    before = made_up.make(store, made_up.recipe(2))[NAME].read("pixels")
+    for path in store.folder.rglob("zarr.json"):
+        path.write_text('{"zarr_format": 2}')
+    np.testing.assert_array_equal(Release.open(store)[NAME].read("pixels"), before)
+
+
+def test_a_release_in_the_making_opens_by_its_records(store):
+    wanted = made_up.recipe(4)
+    begin(store, wanted, {})
+    assert len(Release.open(store)) == 0
+    for layer in wanted.layers[:3]:  # trajectories, labels and images of the first setting
+        put_shard(store, layer, 1, made_up.values(layer, 1))
+    release = Release.open(store)
+    assert release.in_the_making and list(release) == ["hop/random/none"]
+    assert list(release["hop/random/none"].episodes) == [2, 3]
+    assert finish(store).in_the_making
+
+
+def test_growing_keeps_every_file_and_the_older_manifest(store):
+    first = made_up.make(store, made_up.recipe(2))
+    before = {path: oracle.sha256(store.folder / path) for path in store.list()}
+    second = made_up.make(store, made_up.recipe(5))
+    after = {path: oracle.sha256(store.folder / path) for path in store.list()}
+    changed = {path for path in before if before[path] != after.get(path)}
+    assert {path for path in changed if not path.endswith("zarr.json")} == {"manifest.json"}
+    assert after[f"manifests/{first.digest}.json"] == first.digest
+    assert len(second[NAME]) == 5 and oracle.check(store.folder)
+
+
+def test_images_are_added_as_further_layers(store):
+    light = made_up.make(store, made_up.recipe(3, images=False))
+    with pytest.raises(StoreError, match="paint"):
+        light[NAME].read("pixels")
+    assert light[NAME].unpainted.all()
+    painted = made_up.make(store, made_up.recipe(3))
+    assert painted.digest != light.digest and not painted[NAME].unpainted.any()
+    here = {layer.name: layer.list for layer in light.manifest.layers}
+    assert here.items() <= {layer.name: layer.list for layer in painted.manifest.layers}.items()
+
+
+def test_a_subset_has_fewer_images_than_episodes_until_they_are_rendered(store):
+    made_up.make(store, made_up.recipe(5, images=False))
+    subset = made_up.make(store, made_up.recipe(2))[NAME]
+    assert len(subset) == 5 and list(np.flatnonzero(~subset.unpainted)) == [0, 1]
+    assert subset.read("pixels", [0, 1]).shape[0] == 2
+    with pytest.raises(StoreError, match="without images"):
+        subset.array("pixels")[:]
+
+
+GROWTHS = [made_up.recipe(2), made_up.recipe(5), made_up.recipe(4, ["none"]), made_up.recipe(3, images=False)]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(len(GROWTHS))))[::5])
+def test_growths_in_any_order_give_one_manifest(tmp_path, order):
+    stores = [open_store(tmp_path / name) for name in ("given", "order")]
+    for wanted in GROWTHS:
+        made_up.make(stores[0], wanted)
+    for index in order:
+        made_up.make(stores[1], GROWTHS[index])
+    assert Release.open(stores[0]).digest == Release.open(stores[1]).digest
+
+
+def test_part_of_the_shards_makes_no_subset_whole(store):
+    wanted = made_up.recipe(4, ["none"])
+    lists = {layer.name: (ShardRecord(key=layer.job_key(0), files={}),) for layer in wanted.layers}
+    assert build_manifest([wanted], lists) is None
+
+
+REFUSED = {
+    "another seed": (made_up.TRAJECTORIES.model_copy(update={"makes": {"seed": 2}}), "seed 1, asked for 2"),
+    "another shard size": (
+        made_up.TRAJECTORIES.model_copy(update={"episodes_per_shard": 3}),
+        "episodes_per_shard 2, asked",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_recipe_that_contradicts_the_release_changes_nothing(store, name):
+    layer, message = REFUSED[name]
+    made_up.make(store, made_up.recipe(2))
+    before = store.list()
+    wanted = made_up.recipe(4)
+    with pytest.raises(StoreError, match=message):
+        begin(store, wanted.model_copy(update={"layers": (layer, *wanted.layers[1:])}), {})
+    assert store.list() == before
+
+
+def test_other_bytes_are_never_put_over_a_file(store):
+    wanted = made_up.recipe(2)
+    begin(store, wanted, {})
+    write_provenance(store, "test")
+    layer = wanted.layers[2]
+    record = put_shard(store, layer, 0, made_up.values(layer, 0))
+    before = oracle.sha256(store.folder / layer.file_path(layer.arrays[0], 0))
+    with pytest.raises(StoreError, match="other bytes .*made by dmcvb-gen"):
+        put_shard(store, layer, 0, made_up.values(layer, 1))
+    assert put_shard(store, layer, 0, made_up.values(layer, 1), first_wins=True) == record
+    assert oracle.sha256(store.folder / layer.file_path(layer.arrays[0], 0)) == before
+
+
+def test_the_record_of_another_job_is_refused(store):
+    wanted = made_up.recipe(2)
+    begin(store, wanted, {})
+    layer = wanted.layers[1]
+    store.create(record_path(layer.name, 0), canonical_json(ShardRecord(key="0" * 64, files={})))
+    for act in (
+        lambda: put_shard(store, layer, 0, made_up.values(layer, 0)),
+        lambda: Release.open(store).records(layer.name),
+    ):
+        with pytest.raises(StoreError, match=f"another job .0{{12}}.*{layer.job_key(0)[:12]}"):
+            act()
+
+
+def test_a_folder_of_something_else_is_no_place_for_a_release(store):
+    (store.folder).mkdir()
+    (store.folder / "thesis.tex").write_text("x")
+    with pytest.raises(StoreError, match="thesis.tex"):
+        begin(store, made_up.recipe(2), {})
+
+
+def test_repair_puts_back_recorded_bytes_alone(store):
+    release = made_up.make(store, made_up.recipe(2))
+    file = next(file for shard in release.shards([NAME]) for file in shard.files if "pixels" in file.path)
+    data = (store.folder / file.path).read_bytes()
+    (store.folder / file.path).write_bytes(data[:-1] + b"x")
+    assert wrong_bytes(store, file) == "does not have its digest"
+    with pytest.raises(StoreError, match="nothing was changed"):
+        put_back(store, file, b"other")
+    put_back(store, file, data)
+    assert wrong_bytes(store, file) is None and oracle.check(store.folder)
+
+
+def test_a_copy_has_the_digest_of_what_it_was_copied_from(store, tmp_path):
+    release = made_up.make(store, made_up.recipe(5))
+    copy = open_store(tmp_path / "copy")
+    shards = list(release.shards(["hop/random/none"], (2, 4)))
+    for path in [*release.lists(), *[f"recipes/{digest}.json" for digest in release.manifest.recipes]]:
+        copy.create(path, store.folder / path)
+    promised = {}
+    for shard in shards:
+        promised.setdefault(shard.layer.name, set()).add(shard.number)
+        for path in [*[file.path for file in shard.files], shard.record_path]:
+            copy.create(path, store.folder / path)
+    made = finish_copy(copy, store.read("manifest.json", 10**6), store.place, promised)
+    assert made.digest == release.digest and made.compared and made.copy.promised["hop/random/none/pixels"] == ((1, 2),)
+    assert list(made) == ["hop/random/none"] and list(made["hop/random/none"].episodes) == [2, 3]
+    np.testing.assert_array_equal(
+        made["hop/random/none"].read("pixels"), release["hop/random/none"].read("pixels", [2, 3])
+    )
+    with pytest.raises(StoreError, match="2..3"):
+        made["hop/random/none"].array("state")[:]
+    with pytest.raises(StoreError, match="is a copy"):
+        begin(copy, made_up.recipe(9), {})
+    assert finish(copy).digest == release.digest
+
+
+def test_a_digest_from_outside_is_compared(store):
+    digest = made_up.make(store, made_up.recipe(2)).digest
+    assert not Release.open(store).compared
+    assert Release.open(store, digest=digest).compared
+    assert Release.open(f"{store.folder}@sha256:{digest}").compared
+    with pytest.raises(StoreError, match=digest):
+        Release.open(store, digest="0" * 64)
+
+
+def test_a_release_is_not_resumed_with_other_versions(store, monkeypatch):
+    begin(store, made_up.recipe(2), {})
+    write_provenance(store, "test")
+    check_versions(store)
+    monkeypatch.setattr("dmcvb_gen.dataset3.writer.environment", lambda: {"mujoco": "2.0"})
+    with pytest.raises(StoreError, match="this is mujoco 2.0"):
+        check_versions(store)
+
+
+@given(st.integers(1, 10**6), st.integers(1, 1000))
+def test_shards_are_full_and_nearly_equal(episodes, most):
+    size = shard_size(episodes, most)
+    shards = -(-episodes // size)
+    assert size <= most and shards == -(-episodes // most) or size < most
+    assert 0 <= shards * size - episodes < shards
+
+
+@given(st.integers(0, 2**18))
+def test_the_size_that_a_frame_states_is_the_size_of_its_content(size):
+    from numcodecs.zstd import Zstd
+
+    frame = Zstd(level=1).encode(b"x" * size)
+    assert frame_content_size(bytes(frame[:18])) == size
