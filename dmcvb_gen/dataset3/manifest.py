@@ -378,6 +378,10 @@ class Manifest(_Described):
     @pydantic.model_validator(mode="after")
     def _whole(self) -> Manifest:
         _check_tree(self.subsets, self.layers)
+        for subset in self.subsets:
+            for layer in map(self.layer, subset.layers):
+                if layer.kind != "images" and layer.shards * layer.episodes_per_shard < subset.episodes:
+                    raise ValueError(f"{layer.name} has fewer episodes than {subset.name}")
         if sum(layer.shards for layer in self.layers) > 10 * MAX_SHARDS:
             raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
         return self

@@ -288,9 +288,15 @@ def plain_metadata(release: Release) -> dict[str, bytes]:
     roots = {path for path in nodes if path.endswith(".zarr")}
     for path, node in nodes.items():
         if path in roots:
-            members = {each.removeprefix(f"{path}/"): value for each, value in nodes.items() if each.startswith(f"{path}/")}
+            members = {
+                each.removeprefix(f"{path}/"): value for each, value in nodes.items() if each.startswith(f"{path}/")
+            }
             node = node | {
-                "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": dict(sorted(members.items()))}
+                "consolidated_metadata": {
+                    "kind": "inline",
+                    "must_understand": False,
+                    "metadata": dict(sorted(members.items())),
+                }
             }
         texts[f"{path}/{ZARR_JSON}"] = canonical_json(node)
     return texts
@@ -298,7 +304,11 @@ def plain_metadata(release: Release) -> dict[str, bytes]:
 
 def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: SubsetRecord, layer: Layer) -> None:
     root, _, setting = layer.group.partition(".zarr/")
-    shared: dict[str, Any] = {"task": subset.task, "level": subset.level, "release": f"{release.manifest.name} {release.manifest.version}"}
+    shared: dict[str, Any] = {
+        "task": subset.task,
+        "level": subset.level,
+        "release": f"{release.manifest.name} {release.manifest.version}",
+    }
     shared |= {"seconds_per_step": subset.seconds_per_step, "layout": ROW_LAYOUT}
     nodes.setdefault(f"{root}.zarr", _group(shared))
     facts = {} if layer.kind == "trajectories" else {"setting": subset.setting, "views": list(subset.views)}
@@ -393,5 +403,3 @@ def check_versions(store: Store) -> None:
 
 def _versions(made_by: Mapping[str, str]) -> str:
     return f"dmcvb-gen {made_by.get('dmcvb-gen', '?')} with mujoco {made_by.get('mujoco', '?')}"
-
-

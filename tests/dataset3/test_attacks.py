@@ -1,0 +1,137 @@
+"""Hostile releases: each row is the smallest change that once was believed, ran code, filled memory or hung."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numcodecs.zstd import Zstd
+
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import canonical_json
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import sha256_bytes
+from dmcvb_gen.storage.store import open_store
+from tests.dataset3 import made_up
+
+NAME = "hop/random/dynamic"
+
+
+def _rewrite_manifest(change: Callable[[dict], None]) -> Callable[[Path], None]:
+    def attack(root: Path) -> None:
+        manifest = json.loads((root / "manifest.json").read_bytes())
+        change(manifest)
+        (root / "manifest.json").write_bytes(canonical_json(manifest))
+
+    return attack
+
+
+def _chunk(root: Path, array: str = "pixels") -> Path:
+    return next(path for path in sorted((root / "hop/random.zarr").rglob(f"{array}/c/**/*")) if path.is_file())
+
+
+def _with_digests(root: Path, chunk: Path, data: bytes) -> None:
+    """Put other bytes into a chunk and make list and manifest agree with them, as an author of a release can."""
+    manifest = json.loads((root / "manifest.json").read_bytes())
+    for layer in manifest["layers"]:
+        listed = json.loads((root / f"layers/{layer['list']}.json").read_bytes())
+        for shard in listed["shards"][:1]:
+            for array, file in shard["files"].items():
+                if chunk.is_relative_to(root / layer["group"] / array):
+                    file |= {"bytes": len(data), "sha256": sha256_bytes(data)}
+        text = canonical_json(listed)
+        layer["list"] = sha256_bytes(text)
+        (root / f"layers/{layer['list']}.json").write_bytes(text)
+    (root / "manifest.json").write_bytes(canonical_json(manifest))
+    chunk.write_bytes(data)
+
+
+def _bomb(root: Path) -> None:
+    """A chunk of a few bytes that decodes to 512 MB."""
+    frame = Zstd(level=19).encode(np.zeros(2**29, np.uint8))
+    _with_digests(root, _chunk(root, "length"), bytes(frame) + b"\0\0\0\0")
+
+
+def _replaced(make: Callable[[Path], None], find: Callable[[Path], Path]) -> Callable[[Path], None]:
+    def attack(root: Path) -> None:
+        path = find(root)
+        path.unlink()
+        make(path)
+
+    return attack
+
+
+def _manifest_file(root: Path) -> Path:
+    return root / "manifest.json"
+
+
+def _list_file(root: Path) -> Path:
+    return next((root / "layers").iterdir())
+
+
+def _sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(2**36)
+
+
+def _link_out(path: Path) -> None:
+    (path.parent / "elsewhere").write_bytes(b"{}")
+    path.symlink_to(path.parent / "elsewhere")
+
+
+ATTACKS: dict[str, Callable[[Path], None]] = {
+    "an older format": _rewrite_manifest(lambda m: m.update(schema_version=2)),
+    "an unknown codec": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(codec="pickle")),
+    "an unknown dtype": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(dtype="object")),
+    "a group outside": _rewrite_manifest(lambda m: m["layers"][0].update(group="../../home")),
+    "a chunk of terabytes": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(shape=[10**7, 10**7])),
+    "more episodes than shards": _rewrite_manifest(lambda m: [s.update(episodes=10**8) for s in m["subsets"]]),
+    "a subset twice": _rewrite_manifest(lambda m: m["subsets"].append(m["subsets"][0])),
+    "names that differ in case alone": _rewrite_manifest(
+        lambda m: m["subsets"].append(m["subsets"][0] | {"name": m["subsets"][0]["name"].upper()})
+    ),
+    "a name that clears the screen": _rewrite_manifest(lambda m: m.update(license="\x1b[2J")),
+    "a layer that is not described": _rewrite_manifest(lambda m: m["subsets"][0]["layers"].append("hop/none")),
+    "another list": _rewrite_manifest(lambda m: m["layers"][0].update(list="0" * 64)),
+    "deep JSON": lambda root: _manifest_file(root).write_bytes(b"[" * 10**6),
+    "a manifest of 64 GB": _replaced(_sparse, _manifest_file),
+    "a manifest that is a pipe": _replaced(os.mkfifo, _manifest_file),
+    "a manifest that is a link": _replaced(_link_out, _manifest_file),
+    "a list of 64 GB": _replaced(_sparse, _list_file),
+    "a list that was altered": lambda root: _list_file(root).write_bytes(_list_file(root).read_bytes() + b" "),
+    "a chunk that is missing": lambda root: _chunk(root).unlink(),
+    "a chunk that is cut": lambda root: _chunk(root).write_bytes(_chunk(root).read_bytes()[:-9]),
+    "a chunk that is a pipe": _replaced(os.mkfifo, _chunk),
+    "a chunk that is a device": _replaced(lambda path: path.symlink_to("/dev/zero"), _chunk),
+    "a chunk that is a link": _replaced(_link_out, _chunk),
+    "a chunk that decodes to 512 MB": _bomb,
+}
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    root = tmp_path_factory.mktemp("sound") / "release"
+    made_up.make(open_store(root), made_up.recipe(3))
+    return root
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_an_attack_is_one_line(sound, tmp_path, name):
+    root = tmp_path / "release"
+    shutil.copytree(sound, root)
+    ATTACKS[name](root)
+    tracemalloc.start()
+    with pytest.raises(StoreError) as caught:
+        subset = Release.open(root)[NAME]
+        for array in subset.arrays:
+            subset.read(array)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "\n" not in str(caught.value) and "\x1b" not in str(caught.value)
+    assert peak < 2**28
