@@ -10,13 +10,17 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.spec import DIFFICULTIES, GOAL_PICTURES, REWARDS, SPLITS
+
+if TYPE_CHECKING:
+    from dmcvb_gen.progress import ProgressBar
 
 
 @dataclass(frozen=True)
@@ -147,3 +151,12 @@ def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:
         return ([] if annotation is type(None) else [annotation]), []
     parts = [parts_of(part) for part in typing.get_args(annotation)]
     return [kind for kinds, _ in parts for kind in kinds], [mark for _, marks in parts for mark in marks]
+
+
+@contextmanager
+def progress_bar(shown: bool, unit: str, name: str | None = None, scaled: bool = True) -> Iterator[ProgressBar]:
+    """A bar on standard error; drawn if `shown`."""
+    from dmcvb_gen.progress import ProgressBar
+
+    with ProgressBar(shown, unit=unit, unit_scale=scaled, desc=name) as bar:
+        yield bar

@@ -38,6 +38,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec, TransposeCodec, ZstdCodec
 from zarr.core.array import AsyncArray
+from zarr.core.buffer import default_buffer_prototype
 from zarr.core.metadata.v3 import ArrayV3Metadata
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore, StorePath
@@ -266,3 +267,21 @@ def encode(layer: Layer, spec: ArraySpec, values: np.ndarray) -> bytes | None:
     array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks), read_only=False)
     array[...] = values
     return next(iter(chunks.values())).to_bytes() if chunks else None
+
+
+def decode(layer: Layer, spec: ArraySpec, data: bytes | None) -> np.ndarray:
+    """The values of an array's file of one shard, see `encode`.
+
+    Raises:
+      StoreError: the bytes are damaged.
+    """
+    chunks: dict[str, Any] = {}
+    if data is not None:
+        key = layer.file_path(spec, 0).removeprefix(f"{layer.group}/{spec.stored_name}/")
+        chunks[key] = default_buffer_prototype().buffer.from_bytes(data)
+    array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks))
+    try:
+        return np.asarray(array[...])
+    except Exception as error:  # codecs raise anything
+        reason = type(error).__name__
+        raise StoreError(f"{spec.name} of {layer.name} cannot be decoded ({reason}); fetch it again") from None

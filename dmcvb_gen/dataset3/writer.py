@@ -33,7 +33,6 @@ from dmcvb_gen.dataset3.manifest import (
     Copy,
     FileRecord,
     Layer,
-    Manifest,
     Resolved,
     ShardFile,
     ShardRecord,

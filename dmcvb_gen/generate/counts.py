@@ -8,13 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import SubsetRecord
-from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
+from dmcvb_gen.dataset3.manifest import Layer
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.generate.plan import Plan
-from dmcvb_gen.generate.render import frame_count
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.generate.works import episodes_left
 from dmcvb_gen.text import format_bytes
 
 LEAST_SHARE = 0.05
@@ -27,8 +25,9 @@ class SubsetCount:
 
     Attributes:
       done, left: episodes that are there, and episodes to make.
-      frames: images to render (steps to make without images), if no episode ends early.
-      raw_bytes: bytes of what is to be made before compression, if no episode ends early.
+      frames: images to render, if no episode ends early.
+      raw_bytes: bytes of what is to be made before compression, if no episode ends early; of shared trajectories in
+        the first subset alone.
     """
 
     name: str
@@ -40,32 +39,33 @@ class SubsetCount:
 
 def count(plan: Plan) -> tuple[SubsetCount, ...]:
     """Counts of all subsets that a plan chose, whether something is left to do in them or not."""
-    left: Counter[str] = Counter()
-    for job in plan.jobs:
-        left.update({record.name: len(job.episodes) for record in job.subsets})
-    records = {record.name: record for job in plan.jobs for record in job.subsets}
-    found = []
-    for name, chosen in plan.chosen.items():
-        frames = raw = 0
-        if record := records.get(name):
-            frames = frame_count(record, left[name] * record.max_steps, left[name])
-            raw = left[name] * (record.max_steps + 1) * _row_bytes(record)
-        found.append(SubsetCount(name, chosen - left[name], left[name], frames, raw))
-    return tuple(found)
+    left = episodes_left(plan.works)
+    frames: Counter[str] = Counter()
+    raw: Counter[str] = Counter()
+    for work in plan.works:
+        rows, below = len(work.episodes) * work.trajectories.rows, [work.trajectories]
+        for setting in work.settings:
+            name, labels = setting.record.name, [setting.labels] if setting.labels else []
+            made = [layer for layer in (*below, *labels, *setting.images) if layer.name in work.make]
+            raw[name] += rows * sum(map(_row_bytes, made))
+            frames[name] += rows * sum(layer.kind == "images" for layer in made)
+            below = []
+    return tuple(
+        SubsetCount(name, chosen - left[name], left[name], frames[name], raw[name])
+        for name, chosen in plan.chosen.items()
+    )
 
 
-def _row_bytes(record: SubsetRecord) -> int:
+def _row_bytes(layer: Layer) -> int:
     """Bytes of a row of an episode: all arrays that have a value for each step."""
-    specs = subset_specs(EpisodeShape.of(get_task(record.task)), record)
-    entries = [(3 * record.size**2 if spec.picture else math.prod(spec.shape), spec) for spec in specs if spec.steps]
-    return sum(number * np.dtype(spec.dtype).itemsize for number, spec in entries)
+    return sum(math.prod(spec.shape) * np.dtype(spec.dtype).itemsize for spec in layer.arrays if spec.steps)
 
 
 def check_room(plan: Plan) -> None:
     """Raises StoreError if what a plan makes cannot fit on the disk of its folder, however well it is compressed."""
     needed = LEAST_SHARE * sum(subset.raw_bytes for subset in count(plan))
-    if plan.target.folder and needed > (free := free_bytes(plan.target.folder)):
+    if plan.store.folder and needed > (free := free_bytes(plan.store.folder)):
         raise StoreError(
-            f"at least {format_bytes(needed)} are needed and {format_bytes(free)} are free at {plan.target.place}; "
+            f"at least {format_bytes(needed)} are needed and {format_bytes(free)} are free at {plan.store.place}; "
             "make room, choose another --out or fewer --episodes"
         )

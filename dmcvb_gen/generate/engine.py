@@ -1,44 +1,53 @@
-"""The generation engine: take the states of a shard's episodes, render them, and commit the shard.
+"""The generation engine: make the layers of a work, each from what lies below it, and put, compare or repair them.
 
 ::
 
-    command      states                            what is written
-    rollout      simulated                         every array
-    regenerate   simulated                         every array, compared with the release's digests
-    repaint      read from another release         every array; distractors are stored or drawn anew
-    paint        read from the release itself      pictures, added to the shard
+    trajectories   simulated, or read
+    labels         drawn for them from the episodes' streams, or read
+    images         rendered from both
+
+Rollouts, paint, repaint, growth and resuming put what is missing. `regenerate` makes what is there again, and compares
+it or puts files back.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, commit_path, environment
-from dmcvb_gen.dataset.pictures import stored_pictures
-from dmcvb_gen.dataset.shards import damage
-from dmcvb_gen.dataset.writer import WrittenArrays, write_pictures, write_shard
+from dmcvb_gen.dataset3.manifest import ArraySpec, FileRecord, Layer, ShardFile, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset3.schema import decode, encode
+from dmcvb_gen.dataset3.writer import file_facts, put, put_back, put_record, wrong_bytes
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.inputs import Inputs
-from dmcvb_gen.generate.jobs import Job
-from dmcvb_gen.generate.render import distractor_state_of, label_arrays, len_rows, paint, paint_labels, renderers
-from dmcvb_gen.generate.target import staging_folder_of
-from dmcvb_gen.parallel import Future, ProgressCallback, ignore
+from dmcvb_gen.files import sha256_bytes
+from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
+from dmcvb_gen.generate.render import (
+    distractor_state_of,
+    label_arrays,
+    len_rows,
+    paint,
+    paint_labels,
+    renderers,
+    videos_of,
+)
+from dmcvb_gen.generate.resolve import stream_names
+from dmcvb_gen.generate.works import Setting, Work
+from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
+from dmcvb_gen.storage.store import NotThere, Store
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
-from dmcvb_gen.text import quoted
 
-COPIED = ("state", "action", "reward", "discount", "length", "terminated", "return", "seed", "behaviour", "goal_pair")
-"""Arrays that a repaint copies besides the physics states."""
+ANY_BITS = ("opengl",)
+"""Renderers whose images may differ from machine to machine: the first shard that is put is the release's."""
 
 
 @dataclass(frozen=True)
@@ -46,94 +55,140 @@ class Episodes:
     """Episodes before they are rendered; rows past an episode's end are zero.
 
     Attributes:
-      index: (episode,) int, in the subset.
-      physics: (episode, row, physics) float64.
-      length: (episode,) int32, transitions of each.
-      arrays: the values to store beside pictures and labels, by name.
-      labels: labels of the distractors, (episode, row up to the longest episode's last); None: drawn from the streams.
-      seconds: time spent so far, by part.
+      index: (episode,) int, in the set of trajectories.
+      arrays: the values to store, by name; at least "physics", (episode, row, physics) float64, "length" and "action".
     """
 
     index: np.ndarray
-    physics: np.ndarray
-    length: np.ndarray
-    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    labels: DistractorState | None = None
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    arrays: Mapping[str, np.ndarray]
+
+    physics = property(lambda self: self.arrays["physics"])
+    length = property(lambda self: self.arrays["length"])
 
 
 @dataclass(frozen=True)
-class JobResult:
-    """The result of a job.
+class ArrayDifference:
+    """Largest and mean absolute difference between an array of a shard and the released one; None if unknown."""
+
+    array: str
+    largest: float | None
+    mean: float | None
+
+
+@dataclass(frozen=True)
+class LayerOutcome:
+    """What became of one layer's shard.
 
     Attributes:
-      commits: one record for each subset of the job.
-      steps: transitions committed, over all subsets.
+      was: what was wrong with its files, in words; None if nothing was, or nobody looked.
+      equal: whether the bytes made are the recorded ones; None if no record was there.
+      differences: of the arrays whose bytes differ.
+    """
+
+    layer: str
+    shard: int
+    was: str | None = None
+    equal: bool | None = None
+    differences: tuple[ArrayDifference, ...] = ()
+
+
+@dataclass(frozen=True)
+class WorkResult:
+    """The result of a work.
+
+    Attributes:
+      outcomes: of each layer that was made.
+      episodes, steps: simulated or rendered, once for each setting.
       seconds: time spent in "physics", "policy", "rendering" and "storage".
     """
 
-    commits: tuple[CommitRecord, ...]
+    outcomes: tuple[LayerOutcome, ...]
+    episodes: int
     steps: int
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def run_job(job: Job, threads: int = 1, tick: ProgressCallback = ignore) -> JobResult | Future:
-    """Take the states of a job's episodes, render them for each subset, and commit the shards.
+def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> WorkResult:
+    """Make the layers of a work.
 
     Args:
       threads: threads of the physics.
-      tick: called with the number of frames rendered since the last call.
-
-    Returns:
-      The result, or a `Future` of it while shards are being uploaded.
+      tick: called with the number of frames rendered since the last call (of steps, without images).
 
     Raises:
-      StoreError: a source shard is damaged, or the disk is full or cannot be written.
+      StoreError: what is read is damaged, other bytes are there, or the place is full or cannot be written.
     """
-    episodes = stored_episodes(job) if job.stored else simulated_episodes(job, threads)
-    seconds = dict(episodes.seconds) | {"rendering": 0.0, "storage": 0.0}
-    sent, written = [], WrittenArrays(job.target.folder or staging_folder_of(job.target).folder)
-    for record in job.subsets:
-        started, rendering = time.perf_counter(), Stopwatch()
-        arrays = rendering.time(shard_arrays(job, record, episodes, tick))
-        sent.append(_write_and_commit(job, record, arrays, episodes.length, written))
-        seconds["rendering"] += rendering.seconds
-        seconds["storage"] += time.perf_counter() - started - rendering.seconds
-
-    def committed() -> JobResult:
-        for _, wait in sent:
-            wait()
-        commits = tuple(commit for commit, _ in sent)
-        return JobResult(commits, sum(commit.steps for commit in commits), seconds)
-
-    return Future(committed) if job.target.uploads else committed()
+    clock = _Clock()
+    first = work.settings[0].record
+    if work.simulates:
+        episodes = simulated_episodes(work, first, threads, clock)
+        outcomes = [_settle(work, work.trajectories, episodes.arrays.items(), clock)]
+    else:
+        episodes, outcomes = stored_episodes(work), []
+    if not work.images:
+        tick(int((episodes.length + 1).sum()))
+    for setting in work.settings:
+        outcomes += _make_setting(work, setting, episodes, tick, clock)
+    count = len(work.settings)
+    return WorkResult(tuple(outcomes), count * len(episodes.index), count * int(episodes.length.sum()), clock.seconds)
 
 
-# -- states ---------------------------------------------------------------------------------------
+def _make_setting(
+    work: Work, setting: Setting, episodes: Episodes, tick: ProgressCallback, clock: _Clock
+) -> Iterator[LayerOutcome]:
+    """The labels and images of one setting."""
+    images = [layer for layer in setting.images if layer.name in work.make]
+    makes_labels = setting.labels is not None and setting.labels.name in work.make
+    if setting.labels is None or not (images or makes_labels):
+        return
+    record, root = setting.record, local_inputs(work.store, work.inputs)
+    backgrounds = background_source(root, record, work.backgrounds)
+    if makes_labels:
+        with clock.of("rendering"):
+            labels = _drawn_labels(work, record, episodes, backgrounds)
+        yield _settle(work, setting.labels, label_arrays(labels, episodes.length, work.trajectories.rows), clock)
+    else:
+        labels = _stored_labels(work, setting.labels, episodes)
+    for size in dict.fromkeys(layer.arrays[0].shape[0] for layer in images):
+        layers = {_plain(layer.arrays[0]): layer for layer in images if layer.arrays[0].shape[0] == size}
+        rendered = _rendered(record.model_copy(update={"size": size}), layers, episodes, labels, backgrounds, tick)
+        for name, values in clock.items("rendering", rendered):
+            layer = layers[name]
+            yield _settle(work, layer, [(layer.arrays[0].name, values)], clock)
 
 
-def simulated_episodes(job: Job, threads: int = 1) -> Episodes:
-    """Simulate the episodes of a job.
+def _plain(spec: ArraySpec) -> str:
+    """ "at84/pixels/top" -> "pixels/top"."""
+    head, _, rest = spec.name.partition("/")
+    return rest if head.removeprefix("at").isdigit() else spec.name
 
-    Args:
-      threads: threads of the physics.
-    """
-    record = job.subsets[0]
-    task = get_task(record.task)
-    pairs = fixed_pairs(as_maze(task).layout, record.fixed_goals, job.seed) if record.fixed_goals else None
+
+# -- states and labels ----------------------------------------------------------------------------
+
+
+def simulated_episodes(work: Work, record: SubsetRecord, threads: int, clock: _Clock) -> Episodes:
+    """Simulate the episodes of a shard."""
+    task, makes = get_task(record.task), work.trajectories.makes
+    pairs = None
+    if makes["fixed_goals"]:
+        per_goal = makes["episodes_per_goal"]
+        pairs = fixed_pairs(as_maze(task).layout, makes["fixed_goals"], makes["seed"])
+        pairs = pairs * (-(-work.episodes.stop // (per_goal * len(pairs))))  # the last shard is full, too
+    files = policy_files(local_inputs(work.store, work.inputs), record)
     made = simulate(
         task,
-        _policies(record.task, inputs_of(job, record).policies, tuple(policy.digest for policy in record.policies)),
-        list(job.episodes),
-        job.seed,
-        job.names,
+        _policies(record.task, files, tuple(policy.digest for policy in record.policies)),
+        list(work.episodes),
+        makes["seed"],
+        stream_names(work.trajectories),
         deterministic=record.deterministic,
         goal_pairs=pairs,
-        episodes_per_goal=record.episodes_per_goal,
+        episodes_per_goal=makes["episodes_per_goal"],
         threads=threads,
         max_steps=record.max_steps,
     )
-    return Episodes(made.episodes, made.physics, made.length, made.arrays(), seconds=made.seconds)
+    clock.add(made.seconds)
+    return Episodes(made.episodes, made.arrays())
 
 
 @functools.lru_cache(maxsize=4)
@@ -154,96 +209,145 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
     return loaded or [random_policy(task)]
 
 
-def stored_episodes(job: Job) -> Episodes:
-    """Read the episodes of a job from the release that has them.
+def stored_episodes(work: Work) -> Episodes:
+    """Read what is rendered of the episodes of a shard.
 
     Raises:
       StoreError: the shard is damaged.
     """
-    assert job.stored
-    subset = job.stored.subset
-    if broken := damage(Path(subset.root), subset.record, job.shard):
-        raise StoreError(f"{subset.name} shard {job.shard}: {broken}; run `dmcvb-gen regenerate {quoted(subset.root)}`")
-    index = np.asarray(job.episodes)
-    physics, length = subset.read("physics", index), subset.read("length", index)
-    labels = None if job.stored.new_labels else subset.labels(index)[:, : int(length.max()) + 1]
-    copied = {} if job.stored.in_place else {name: subset.read(name, index) for name in COPIED} | {"physics": physics}
-    return Episodes(index, physics, length, copied, labels)
+    arrays = read_shard(work, work.trajectories, ("physics", "length", "action"))
+    return Episodes(np.asarray(work.episodes), arrays)
 
 
-def inputs_of(job: Job, record: SubsetRecord) -> Inputs:
-    """The policy files and videos of a subset on this machine."""
-    return job.inputs or staging_folder_of(job.target).inputs(record)
+def _drawn_labels(work: Work, record: SubsetRecord, episodes: Episodes, backgrounds: str) -> DistractorState:
+    videos = videos_of(record, backgrounds)
+    streams = (work.trajectories.makes["seed"], stream_names(work.trajectories), episodes.index)
+    return distractor_state_of(record, *streams, episodes.physics, episodes.length, videos, episodes.arrays["action"])
 
 
-# -- rendering and storing ------------------------------------------------------------------------
+def _stored_labels(work: Work, layer: Layer, episodes: Episodes) -> DistractorState:
+    arrays = read_shard(work, layer, [spec.name for spec in layer.arrays])
+    arrays = {name.removeprefix("exogenous/"): values for name, values in arrays.items()}
+    arrays.setdefault("material_rgb", np.zeros((*arrays["style"].shape, 0, 3), np.float32))
+    return DistractorState(**arrays)[:, : int(episodes.length.max()) + 1]
 
 
-def shard_arrays(
-    job: Job, record: SubsetRecord, episodes: Episodes, progress: ProgressCallback = ignore
-) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of a shard, made one at a time: pictures, labels, states, depth and segmentation.
-
-    Yields:
-      (name, (episode, row, ...)), or (name, (episode,)) for arrays without steps.
-    """
-    task, length, rows = get_task(record.task), episodes.length, episodes.physics.shape[1]
-    renderer, videos = renderers.get(record, inputs_of(job, record).backgrounds)
-    labels = episodes.labels
-    if labels is None:
-        streams, states = (record, job.seed, job.names, episodes.index), (episodes.physics, length)
-        labels = distractor_state_of(*streams, *states, videos, episodes.arrays["action"])
-    physics = episodes.physics[:, : len_rows(labels)]
-    if record.pixels:
-        pictures = stored_pictures(record, bool(task.goal_geoms))
-        yield from paint(task, renderer, physics, labels, length, rows, progress, pictures)
-    else:
-        progress(int((length + 1).sum()))
-    if job.in_place:
-        return
-    yield from label_arrays(labels, length, rows)
-    yield from episodes.arrays.items()
-    for label in job.labels:
-        yield from paint_labels(task, renderer, physics, labels, length, rows, label, record.hidden_goal, record.views)
-
-
-def _write_and_commit(
-    job: Job,
-    record: SubsetRecord,
-    arrays: Iterator[tuple[str, np.ndarray]],
-    lengths: np.ndarray,
-    written: WrittenArrays,
-) -> tuple[CommitRecord, Callable[[], None]]:
-    """Write a shard and commit it: its commit record, and a function that waits until it is in the release.
-
-    Args:
-      written: arrays of the job's subsets so far, to which equal ones are linked.
+def read_shard(work: Work, layer: Layer, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Arrays of a shard that exists, compared with their recorded digests.
 
     Raises:
-      StoreError: it cannot be written, or another machine has committed this shard with other bytes.
+      StoreError: a file is missing or has other bytes.
     """
-    made_by = environment()
-    if job.stored and job.in_place:
-        subset = job.stored.subset
-        added = write_pictures(Path(subset.root), record, subset.commits[job.shard], arrays, made_by)
-        return added, lambda: None
-    folder = staging_folder_of(job.target).prepare(record)
-    commit = write_shard(folder, record, job.shard, arrays, lengths, made_by, written)
-    (folder / commit_path(record.name, job.shard)).unlink()  # it is committed last
-    return commit, job.target.commit_shard(folder, commit)
+    record = work.known[layer.name]
+    return {name: _read_array(work.store, layer, layer.array(name), work.shard, record) for name in names}
 
 
-class Stopwatch:
-    """Measure the time that an iterator takes for its items, without what the caller does with them."""
+def _read_array(store: Store, layer: Layer, spec: ArraySpec, shard: int, record: ShardRecord) -> np.ndarray:
+    file, path = record.files.get(spec.name), layer.file_path(spec, shard)
+    data = store.read(path, file.bytes) if file else None
+    if file and sha256_bytes(data or b"") != file.sha256:
+        raise StoreError(f"{store.place}/{path} does not have its digest; run `dmcvb-gen regenerate {store.place}`")
+    return decode(layer, spec, data)
 
-    def __init__(self):
-        self.seconds = 0.0
 
-    def time(self, items: Iterator) -> Iterator:
-        """The same items."""
+# -- images ---------------------------------------------------------------------------------------
+
+
+def _rendered(
+    record: SubsetRecord,
+    layers: Mapping[str, Layer],
+    episodes: Episodes,
+    labels: DistractorState,
+    backgrounds: str,
+    tick: ProgressCallback,
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Image arrays of one size, one at a time: (plain name, (episode, row, ...))."""
+    task, length, rows = get_task(record.task), episodes.length, episodes.physics.shape[1]
+    renderer = renderers.get(record, backgrounds)
+    physics = episodes.physics[:, : len_rows(labels)]
+    modalities: dict[str, list[str]] = {}
+    for name, layer in layers.items():
+        if modality := layer.makes.get("modality"):
+            modalities.setdefault(modality, []).append(name)
+    pictures = [name for name, layer in layers.items() if "modality" not in layer.makes]
+    if pictures:
+        yield from paint(task, renderer, physics, labels, length, rows, tick, pictures)
+    for modality, names in modalities.items():
+        views = [view for view in record.views if names == [modality] or f"{modality}/{view}" in names]
+        hidden = layers[names[0]].makes["hidden_goal"]
+        yield from paint_labels(task, renderer, physics, labels, length, rows, modality, hidden, views)
+
+
+# -- what becomes of a layer's arrays -------------------------------------------------------------
+
+
+def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]], clock: _Clock) -> LayerOutcome:
+    """Put a layer's shard, or compare it with its record, as the work is for; one array is in memory at a time."""
+    with clock.of("storage"):
+        known = work.known.get(layer.name)
+        first_wins = layer.makes.get("renderer", {}).get("name") in ANY_BITS
+        files: dict[str, ShardFile] = {}
+        differences, was = [], None
+        for name, values in arrays:
+            spec = layer.array(name)
+            data = encode(layer, spec, np.ascontiguousarray(values, dtype=spec.dtype))
+            facts, promised = None if data is None else file_facts(data), known.files.get(name) if known else None
+            path = layer.file_path(spec, work.shard)
+            if promised and work.purpose != "make":
+                was = was or _fault(work.store, path, promised)
+            if known is not None and facts != promised:
+                differences.append(_difference(work, layer, spec, known, values))
+            elif data is not None and facts is not None:
+                files[name] = _put_file(work, path, data, facts, first_wins)
+        if work.purpose != "check" and not differences:
+            put_record(work.store, layer, work.shard, ShardRecord(key=layer.job_key(work.shard), files=files))
+        return LayerOutcome(layer.name, work.shard, was, None if known is None else not differences, tuple(differences))
+
+
+def _put_file(work: Work, path: str, data: bytes, facts: ShardFile, first_wins: bool) -> ShardFile:
+    if work.purpose == "make":
+        return put(work.store, path, data, first_wins=first_wins)
+    if work.purpose == "repair" and _fault(work.store, path, facts):
+        put_back(work.store, FileRecord(path=path, bytes=facts.bytes, sha256=facts.sha256), data)
+    return facts
+
+
+def _fault(store: Store, path: str, file: ShardFile) -> str | None:
+    wrong = wrong_bytes(store, FileRecord(path=path, bytes=file.bytes, sha256=file.sha256))
+    return f"{path} {wrong}" if wrong else None
+
+
+def _difference(work: Work, layer: Layer, spec: ArraySpec, known: ShardRecord, values: np.ndarray) -> ArrayDifference:
+    try:
+        other = _read_array(work.store, layer, spec, work.shard, known)
+    except (StoreError, NotThere):
+        return ArrayDifference(spec.name, None, None)
+    gap = np.abs(values.astype(np.float64) - other.astype(np.float64))
+    return ArrayDifference(spec.name, float(gap.max()), float(gap.mean()))
+
+
+class _Clock:
+    """Seconds spent, by part."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        for part, value in seconds.items():
+            self.seconds[part] = self.seconds.get(part, 0.0) + value
+
+    @contextlib.contextmanager
+    def of(self, part: str) -> Iterator[None]:
+        """Count the time of a block."""
         started = time.perf_counter()
-        for item in items:
-            self.seconds += time.perf_counter() - started
+        yield
+        self.add({part: time.perf_counter() - started})
+
+    def items(self, part: str, items: Iterator) -> Iterator:
+        """The same items; the time that they take counts, what the caller does with them does not."""
+        while True:
+            with self.of(part):
+                item = next(items, None)
+            if item is None:
+                return
             yield item
-            started = time.perf_counter()
-        self.seconds += time.perf_counter() - started

@@ -1,31 +1,30 @@
-"""Run many jobs: in this process, in worker processes or on a Ray cluster. The data do not depend on which."""
+"""Run many works: in this process, in worker processes or on a Ray cluster. The data do not depend on which."""
 
 from __future__ import annotations
 
 import math
-import queue
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
-from dmcvb_gen.dataset.schema import EpisodeShape, array_specs
+import numpy as np
+
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.engine import JobResult, run_job
-from dmcvb_gen.generate.jobs import Job
-from dmcvb_gen.generate.render import frame_count
-from dmcvb_gen.generate.target import leave
-from dmcvb_gen.parallel import Needs, Pool, ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.generate.engine import WorkResult, run_work
+from dmcvb_gen.generate.works import Work
+from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.parallel.memory import free_memory
-from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import format_bytes
 
 PROCESS_BYTES = 1 << 30
 """Memory that a worker takes before it holds any episode: libraries, models, a renderer's buffers."""
 
+STEPS_PER_PROCESS = 5_000
+"""Frames that are worth the start of another process, some four seconds."""
 
-def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallback = ignore) -> Iterator[JobResult]:
-    """Run jobs and yield their results as they finish.
+
+def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCallback = ignore) -> Iterator[WorkResult]:
+    """Run works and yield their results as they finish.
 
     Args:
       workers: processes, each with physics on one core; 1 works in this process, with physics on all cores; or a Ray
@@ -35,128 +34,98 @@ def run_jobs(jobs: Sequence[Job], workers: Workers = 1, progress: ProgressCallba
 
     Raises:
       StoreError: the shards need more memory than is free, or a worker was killed (often for memory); what was
-        committed is safe.
+        put is safe.
     """
-    check_memory(jobs, workers)
+    check_memory(works, workers)
     kept = "finished shards are saved: rerun the same command (fewer --episodes-per-shard need less memory)"
-    alone = workers == 1 or len(jobs) <= 1 and isinstance(workers, int)
-    with open_pool(workers, tick=progress, kept=kept, needs=needs_of(jobs), most=max(len(jobs), 1)) as pool:
-        for job in jobs:
-            pool.submit(job, run_job, job, usable_cores() if alone else 1)
-        expected = _Expected(jobs)
+    alone = workers == 1 or len(works) <= 1 and isinstance(workers, int)
+    with open_pool(workers, tick=progress, kept=kept, needs=needs_of(works), most=max(len(works), 1)) as pool:
+        for number, work in enumerate(works):
+            pool.submit(number, run_work, work, usable_cores() if alone else 1)
+        expected = _Expected(works)
         expect(progress, expected.frames)
-        try:
-            for job, result in pool.results():
-                expected.done(job, result)
-                expect(progress, expected.frames)
-                yield result
-        finally:
-            for target in {job.target for job in jobs}:
-                leave(target)
+        for number, result in pool.results():
+            expected.done(works[number], result)
+            expect(progress, expected.frames)
+            yield result
 
 
-def run_arriving(
-    arriving: queue.SimpleQueue, pool: Pool, job_of: Callable[[Any], Job | None]
-) -> Iterator[tuple[Job, JobResult]]:
-    """Run jobs as they come, e.g. while the shards that they read are still being downloaded.
-
-    Args:
-      arriving: items to do, an exception to raise, or None at the end.
-      job_of: the job of an item, None if nothing is left to do for it.
-    """
-    ended, running = False, 0
-    results: Iterator[tuple[Job, JobResult]] = iter(())
-    while not ended or running:
-        while not ended:
-            try:
-                item = arriving.get(block=not running)  # there is nothing else to wait for
-            except queue.Empty:
-                break
-            if isinstance(item, BaseException):
-                raise item
-            ended = item is None
-            if not ended and (job := job_of(item)) is not None:
-                pool.submit(job, run_job, job)
-                running += 1
-        done = next(results, None)
-        if done is not None:
-            running -= 1
-            yield done
-        elif running:
-            results = pool.results()
+def default_workers(works: Sequence[Work]) -> int:
+    """Processes for works if nobody says how many: a core each, as far as memory and the amount of work allow."""
+    cores, steps = usable_cores(), sum(work.frames for work in works)
+    free = free_memory()
+    room = cores if free is None or not works else int(free / max(map(_memory, works)))
+    return max(1, min(cores, len(works), room, steps // STEPS_PER_PROCESS))
 
 
 class _Expected:
-    """Expected frames of all jobs: of full episodes at first, then in proportion to the finished ones."""
+    """Expected frames of all works: of full episodes at first, then in proportion to the finished ones."""
 
-    def __init__(self, jobs: Sequence[Job]):
+    def __init__(self, works: Sequence[Work]):
         self._open: Counter = Counter()
         self._ended: Counter = Counter()
-        self._painted: Counter = Counter()
-        for job in jobs:
-            self._open[self._kind(job)] += self._planned(job)
+        self._rendered: Counter = Counter()
+        for work in works:
+            self._open[self._kind(work)] += work.frames
 
-    def done(self, job: Job, result: JobResult) -> None:
-        """Count a finished job: others of its task and level are taken to end as early."""
-        kind, planned, episodes = self._kind(job), self._planned(job), len(job.episodes) * len(job.subsets)
+    def done(self, work: Work, result: WorkResult) -> None:
+        """Count a finished work: others of its task and level are taken to end as early."""
+        kind, planned = self._kind(work), work.frames
         self._open[kind] -= planned
         self._ended[kind] += planned
-        known = job.stored is not None  # stored episodes were counted as long as they are
-        share = 1.0 if known else (result.steps + episodes) / (job.frames + episodes)
-        self._painted[kind] += round(planned * share)
+        count = len(work.settings)
+        full = count * (work.steps + len(work.episodes))
+        self._rendered[kind] += round(planned * (result.steps + result.episodes) / full)
 
     @property
     def frames(self) -> int:
-        shares = {kind: self._painted[kind] / planned for kind, planned in self._ended.items()}
+        shares = {kind: self._rendered[kind] / planned for kind, planned in self._ended.items()}
         to_come = (planned * shares.get(kind, 1) for kind, planned in self._open.items())
-        return sum(self._painted.values()) + round(sum(to_come))
+        return sum(self._rendered.values()) + round(sum(to_come))
 
     @staticmethod
-    def _kind(job: Job) -> tuple[str, str]:
-        return job.subsets[0].task, job.subsets[0].level
-
-    @staticmethod
-    def _planned(job: Job) -> int:
-        if job.stored:
-            steps = job.stored.subset.commits[job.shard].steps
-            return sum(frame_count(record, steps, len(job.episodes)) for record in job.subsets)
-        count = len(job.episodes)
-        return sum(frame_count(record, count * record.max_steps, count) for record in job.subsets)
+    def _kind(work: Work) -> tuple[str, str]:
+        record = work.settings[0].record
+        return record.task, record.level
 
 
-def check_memory(jobs: Sequence[Job], workers: Workers) -> None:
+def check_memory(works: Sequence[Work], workers: Workers) -> None:
     """Raises StoreError, before any work, if the shards in progress need more memory than this machine has free.
 
-    Ray is told what a job needs and finds it a place.
+    Ray is told what a work needs and finds it a place.
     """
     free = free_memory()
-    if not isinstance(workers, int) or not jobs or free is None:
+    if not isinstance(workers, int) or not works or free is None:
         return
-    largest, side_by_side = max(jobs, key=_memory), max(1, min(workers, len(jobs)))
+    largest, side_by_side = max(works, key=_memory), max(1, min(workers, len(works)))
     needed = _memory(largest) - PROCESS_BYTES
     if needed * side_by_side <= free:
         return
-    record = largest.subsets[0]
+    record, rows = largest.settings[0].record, largest.trajectories.rows
     advice = "fewer --workers or a machine with more memory" if side_by_side > 1 else "a machine with more memory"
-    if largest.stored is None:
+    if largest.simulates:
         advice = f"fewer --episodes-per-shard in a new release, or {advice}"
     raise StoreError(
-        f"a shard of {record.name} ({len(largest.episodes)} episodes of {record.max_steps} steps, {record.size} pixels "
+        f"a shard of {record.name} ({len(largest.episodes)} episodes of {rows - 1} steps, {record.size} pixels "
         f"a side) needs {format_bytes(needed)} of memory, {side_by_side} are made at once, and {format_bytes(free)} "
         f"are free; use {advice}"
     )
 
 
-def needs_of(jobs: Sequence[Job]) -> Needs:
-    """Return the most memory and scratch space that any job takes."""
-    return Needs(memory=max(map(_memory, jobs), default=0))
+def needs_of(works: Sequence[Work]) -> Needs:
+    """Return the most memory that any work takes."""
+    return Needs(memory=max(map(_memory, works), default=0))
 
 
-def _memory(job: Job) -> int:
-    """Bytes that a job holds at its peak: all states, and two picture arrays of one subset."""
-    record = max(job.subsets, key=lambda record: record.pixels)
-    specs = array_specs(EpisodeShape.of(get_task(record.task)), record.size)
-    rows = len(job.episodes) * (record.max_steps + 1)
-    simulated = sum(8 * math.prod(spec.shape) for spec in specs if not spec.picture)
-    pictures = [math.prod(spec.shape) for spec in specs if spec.picture] if record.pixels else []
-    return PROCESS_BYTES + rows * (simulated + 2 * max(pictures, default=0))
+def _memory(work: Work) -> int:
+    """Bytes that a work holds at its peak: all states, the labels of a setting, and two image arrays."""
+    layers = {layer.name: layer for setting in work.settings for layer in setting.images if layer.name in work.make}
+    rows = len(work.episodes) * work.trajectories.rows
+
+    def row_bytes(specs: Sequence) -> list[int]:
+        return [math.prod(spec.shape) * np.dtype(spec.dtype).itemsize for spec in specs if spec.steps]
+
+    labels = [sum(row_bytes(setting.labels.arrays)) for setting in work.settings if setting.labels]
+    images = [max(row_bytes(layer.arrays)) for layer in layers.values()]
+    states = 2 * sum(row_bytes(work.trajectories.arrays))
+    return PROCESS_BYTES + rows * (states + 2 * max(labels, default=0) + 2 * max(images, default=0))

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds, is_maze
-from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.version import __version__
-
-if TYPE_CHECKING:
-    from dmcvb_gen.dataset import Release
 
 PAPER_STEPS = {False: 500, True: 600}
 """Agent steps at the time limit of the paper's data: locomotion, mazes."""
@@ -38,10 +33,9 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     Raises:
       StoreError: there is no release at `path`.
     """
-    from dmcvb_gen.dataset import open_release  # loads zarr, which `list` needs not
-    from dmcvb_gen.dataset.sharing import disk_bytes
+    from dmcvb_gen.dataset3.gate import Release  # loads zarr, which `list` needs not
 
-    release = open_release(path, storage_options)
+    release = Release.open(path, storage_options)
     subsets = []
     for name, subset in release.subsets.items():
         subsets.append(
@@ -54,9 +48,8 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 bytes=subset.bytes,
                 bytes_per_step=subset.bytes / max(subset.steps, 1),
                 size=subset.record.size,
-                images=subset.record.pixels,
+                images=any(layer.kind == "images" for layer in subset.layers),
                 renderer=subset.record.renderer.get("name"),
-                digest=subset.record.digest,
                 returns=return_statistics(subset.returns),
                 other_length=subset.record.max_steps != PAPER_STEPS[is_maze(subset.task)],
                 paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
@@ -65,21 +58,14 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     return dict(
         name=release.manifest.name,
         version=release.manifest.version,
-        generator=release.manifest.generator,
-        complete=release.manifest.complete,
-        digest=release.manifest.digest,
+        complete=not (release.in_the_making or release.shortfalls),
+        digest=release.digest,
+        compared=release.compared,
         steps=sum(subset["steps"] for subset in subsets),
-        bytes=sum(subset["bytes"] for subset in subsets),
-        disk_bytes=None if is_url(str(path)) else disk_bytes(release.path, _files(release)),
+        bytes=sum(file.bytes for shard in release.shards() if shard.here for file in shard.files),
         subsets=subsets,
         missing={name: planned for name, (here, planned) in release.shortfalls.items() if not here},
     )
-
-
-def _files(release: Release) -> Iterator[str]:
-    """Paths of all committed shard files."""
-    for subset in release.subsets.values():
-        yield from (file.path for commit in subset.commits.values() for file in commit.files)
 
 
 def describe_package() -> dict[str, Any]:

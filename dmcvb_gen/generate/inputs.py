@@ -2,53 +2,51 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import functools
+import shutil
+import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset3.manifest import FileRecord, SubsetRecord
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE
+from dmcvb_gen.storage.store import NotThere, Store
 
 BUILTIN = "builtin"
 """The videos that the package brings."""
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """The files that a subset is made from, on this machine.
+def local_inputs(store: Store, files: Iterable[FileRecord]) -> Path:
+    """The folder with a release's copies of policies and videos: its own, or one of this process with what it lacks."""
+    if store.folder is not None:
+        return store.folder
+    folder = _brought(store)
+    for file in files:
+        if not (folder / file.path).exists():
+            with contextlib.suppress(NotThere):  # the package may bring the same
+                store.download(file.path, folder / file.path, file.bytes, file.sha256)
+    return folder
 
-    Attributes:
-      policies: files of the behaviour policies, in the record's order; none for uniform random actions.
-      backgrounds: "builtin", or the folder of the videos.
-    """
 
-    policies: tuple[str, ...] = ()
-    backgrounds: str = BUILTIN
+@functools.cache
+def _brought(store: Store) -> Path:
+    """A folder of this process for a store's files, which goes with it."""
+    folder = Path(tempfile.mkdtemp(prefix="dmcvb-gen-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
-def release_inputs(root: Path, records: Iterable[SubsetRecord], backgrounds: str | None = None) -> dict[str, Inputs]:
-    """Policies and videos of a release's subsets, checked by digest.
+def policy_files(root: str | Path, record: SubsetRecord) -> tuple[str, ...]:
+    """Files of a subset's policies: the release's own copies, else the bundled ones, by digest; names of own code.
 
     Args:
-      root: the release's folder, which has copies of what the package does not bring.
-      backgrounds: folder of the videos, instead of the manifest's.
-
-    Raises:
-      StoreError: a policy or the videos are not there, or not those of the manifest.
-    """
-    return {
-        record.name: Inputs(policy_files(root, record), background_source(root, record, backgrounds))
-        for record in records
-    }
-
-
-def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:
-    """Files of a subset's policies: the release's own copies, else the bundled ones, by digest; names of own code.
+      root: a folder with the release's copies.
 
     Raises:
       StoreError: neither is there.
@@ -58,7 +56,7 @@ def policy_files(root: Path, record: SubsetRecord) -> tuple[str, ...]:
         if policy.header.get("algorithm") == OWN_CODE:
             found.append(policy.name)  # its digest is checked when it is loaded, and its code is let run there
             continue
-        candidates = [root / policy.path] if policy.path else []
+        candidates = [Path(root) / policy.path] if policy.path else []
         with contextlib.suppress(DmcvbError):  # the release's own copy is enough
             candidates += resolve_policies(record.task, record.level)
         same = (str(path) for path in candidates if _digest(path) == policy.digest)
@@ -80,10 +78,11 @@ def _digest(path: Path) -> str | None:
         return None
 
 
-def background_source(root: Path, record: SubsetRecord, moved: str | None = None) -> str:
+def background_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:
     """Find a subset's videos and compare them with the manifest's digest.
 
     Args:
+      root: a folder with the release's copies.
       moved: folder of the videos, instead of the manifest's.
 
     Raises:
@@ -108,9 +107,8 @@ def video_source(root: str | Path, record: SubsetRecord, moved: str | None = Non
     """Return "builtin" or the folder of a subset's videos; nothing is opened.
 
     Args:
-      root: the release's folder, which has copies of videos that the package does not bring.
+      root: a folder with the release's copies of videos that the package does not bring.
       moved: folder of the videos, instead of the manifest's.
     """
     source = moved or (record.backgrounds or {}).get("source", BUILTIN)
-    inside = not (moved or source == BUILTIN or Path(source).is_absolute())  # absolute: in releases of version 1
-    return f"{root}/{source}" if inside else source
+    return source if moved or source == BUILTIN else f"{root}/{source}"

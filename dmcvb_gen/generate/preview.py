@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from dmcvb_gen.dataset import Subset, open_release
-from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.pictures import shown
+from dmcvb_gen.dataset3.reader import Subset
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.extras import installed
 from dmcvb_gen.spec import select
@@ -202,7 +203,7 @@ def write_preview(
     if kind not in FORMATS:
         raise UnknownNameError("kind of video", kind, FORMATS)
     target = local_path(out) if out else None
-    release = open_release(path)
+    release = Release.open(path)
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:

@@ -1,4 +1,4 @@
-"""Report how much of a release is done, from its commit records alone: shards, rates, and the time that is left."""
+"""Report how much of a release is done, from its records alone: shards, and the time that is left."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import MANIFEST, commit_path, shard_count
-from dmcvb_gen.dataset.shards import chosen_shards
-from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.jobs import make_jobs
-from dmcvb_gen.generate.target import Target
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import record_path
+from dmcvb_gen.generate.works import works_of
 
 RECENT = 3600.0
-"""Seconds before the last commit whose commits tell the rate; pauses before them do not count."""
+"""Seconds before the last record whose records tell the rate; pauses before them do not count."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +32,17 @@ class ReleaseProgress:
     """Progress of a release.
 
     Attributes:
-      done, total: shards.
-      late: shards that are not there although a job that was handed out later is through: in flight, or lost.
-      steps: transitions committed.
-      steps_per_second: rate of the last hour in which something was committed; None before the second commit.
-      silence: seconds since the last commit; None before the first.
+      done, total: shards of subsets; one is done if all its layers are.
+      late: shards that are not there although one that was handed out later is: in progress, or lost.
+      shards_per_hour: rate of the last hour in which something was finished; None if it is not known.
+      silence: seconds since the last record; None if it is not known.
       seconds_left: time left at that rate; None if it is not known.
-      complete: True if the release is finished.
+      complete: True if the manifest names all that was asked for.
     """
 
     name: str
     subsets: tuple[SubsetProgress, ...]
-    steps: int
-    steps_per_second: float | None
+    shards_per_hour: float | None
     silence: float | None
     seconds_left: float | None
     complete: bool
@@ -60,47 +56,49 @@ class ReleaseProgress:
         return dataclasses.asdict(self) | {"done": self.done, "late": self.late, "total": self.total}
 
 
-def progress_of(target: Target) -> ReleaseProgress:
-    """Return the progress of the release at a target.
+def progress_of(store: Any) -> ReleaseProgress:
+    """Return the progress of the release at a store.
 
     Raises:
       StoreError: there is none.
     """
-    manifest = target.manifest()
-    if manifest is None:
-        raise StoreError(f"{target.place} holds no release (no {MANIFEST}); give the place that `rollout --out` made")
-    commits = target.commits(manifest.subsets)
-    listed = target.storage.list()
-    late = dict.fromkeys((record.name for record in manifest.subsets), 0)
-    jobs = make_jobs(manifest, chosen_shards(manifest), target)
-    missing = [[r.name for r in job.subsets if job.shard not in commits.get(r.name, {})] for job in jobs]
+    asked = Release.in_making(store)
+    works = works_of(asked, wanted=lambda layer, shard: True)
+    missing = [
+        [s.record.name for s in work.settings if not {work.trajectories.name, *s.record.layers} <= work.known.keys()]
+        for work in works
+    ]
     through = [number for number, names in enumerate(missing) if not names]
-    for names in missing[: through[-1] if through else 0]:
-        for name in names:
-            late[name] += 1
-    times, steps = [], []
-    for name, shards in commits.items():
-        for shard, commit in shards.items():
-            at = listed.get(commit_path(name, shard))
-            if at is not None and at.time is not None:
-                times.append(at.time)
-                steps.append(commit.steps)
-    rate = _rate(np.array(times), np.array(steps))
-    subsets = tuple(
-        SubsetProgress(record.name, len(commits.get(record.name, ())), late[record.name], shard_count(record))
-        for record in manifest.subsets
-    )
-    done, total = sum(subset.done for subset in subsets), sum(subset.total for subset in subsets)
-    left = (total - done) * (sum(steps) / max(done, 1)) / rate if rate else None
-    silence = max(0.0, time.time() - max(times)) if times else None
-    return ReleaseProgress(manifest.name, subsets, int(sum(steps)), rate, silence, left, manifest.complete)
+    total, done, late = ({record.name: 0 for record in asked.manifest.subsets} for _ in range(3))
+    for number, (work, lacking) in enumerate(zip(works, missing, strict=True)):
+        for name in (setting.record.name for setting in work.settings):
+            total[name] += 1
+            done[name] += name not in lacking
+            late[name] += name in lacking and number < (through[-1] if through else 0)
+    subsets = tuple(SubsetProgress(name, done[name], late[name], total[name]) for name in total)
+    times = _times(asked)
+    rate = _rate(times)
+    open_ = sum(total.values()) - sum(done.values())
+    finished = Release.open(store)
+    complete = not open_ and not finished.in_the_making and finished.manifest.subsets == asked.manifest.subsets
+    silence = max(0.0, time.time() - times.max()) if len(times) else None
+    left = open_ / rate * 3600 if rate else None
+    return ReleaseProgress(asked.manifest.name, subsets, rate, silence, left, complete)
 
 
-def _rate(times: np.ndarray, steps: np.ndarray) -> float | None:
-    """Steps a second, between the first and the last of the recent commits (the first one's own time is not known)."""
+def _times(release: Release) -> np.ndarray:
+    """When the records of trajectories were written, if the release is in a folder."""
+    if release.store.folder is None:
+        return np.zeros(0)
+    names = [name for name, layer in release.layers.items() if layer.kind == "trajectories"]
+    paths = [release.store.folder / record_path(name, n) for name in names for n in release.records(name)]
+    return np.array([path.stat().st_mtime for path in paths])
+
+
+def _rate(times: np.ndarray) -> float | None:
+    """Shards an hour, between the first and the last of the recent records (the first one's own time is not known)."""
     if len(times) < 2:
         return None
-    recent = times >= times.max() - RECENT
-    first = times[recent].min()
-    span = times.max() - first
-    return float(steps[recent & (times > first)].sum() / span) if span > 0 else None
+    recent = times[times >= times.max() - RECENT]
+    span = recent.max() - recent.min()
+    return float((len(recent) - 1) / span * 3600) if span > 0 else None

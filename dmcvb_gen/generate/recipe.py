@@ -22,18 +22,16 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from dmcvb_gen.dataset.manifest import MAX_EPISODES, MAX_SHARDS
+from dmcvb_gen.dataset3.manifest import MAX_EPISODES, MAX_SHARDS
 from dmcvb_gen.errors import RecipeError, UnknownNameError
 from dmcvb_gen.files import read_yaml
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import (
     ANT_MAZE,
-    FAMILIES,
     FIXED,
     GOAL_MODES,
     LOCOMOTION,
-    VISIBLE,
-    DistractorSetting,
+    Distractor,
     SubsetSpec,
     distractor_kinds,
     is_maze,
@@ -122,6 +120,7 @@ class SubsetRequest(_Model):
 
     Attributes:
       name: "<task>/<level>/<setting>".
+      episodes_per_shard: None: nearly equal shards, of at most `DEFAULT_EPISODES_PER_SHARD`.
       policy: its policy's file or run folder; None for the bundled ones (or random).
     """
 
@@ -130,8 +129,8 @@ class SubsetRequest(_Model):
     level: str
     setting: str
     episodes: int
-    episodes_per_shard: int
     max_steps: int
+    episodes_per_shard: int | None = None
     policy: str | None = None
     deterministic: bool = False
     episodes_per_goal: int | None = None
@@ -164,12 +163,18 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
     if unused:
         raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
-    if (shards := sum(-(-each.episodes // each.episodes_per_shard) for each in requests.values())) > MAX_SHARDS:
+    if (shards := sum(map(_shards, requests.values()))) > MAX_SHARDS:
         raise RecipeError(
             f"recipe {recipe.name!r} comes to {shards:,} shards, and a release may have {MAX_SHARDS:,}; give more "
             "episodes_per_shard, or fewer episodes"
         )
     return tuple(requests.values())
+
+
+def _shards(request: SubsetRequest) -> int:
+    return -(
+        -request.episodes // (request.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[get_task(request.task).family])
+    )
 
 
 def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequest:
@@ -189,14 +194,13 @@ def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequ
         episodes = -(-pattern.steps // max_steps)
     if episodes > MAX_EPISODES:
         raise RecipeError(f"{name}: {episodes:,} episodes are more than the {MAX_EPISODES:,} that a subset may have")
-    shard = pattern.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[task.family]
     return SubsetRequest(
         name=name,
         task=task.id,
         level=level,
         setting=setting,
         episodes=episodes,
-        episodes_per_shard=min(shard, episodes),
+        episodes_per_shard=pattern.episodes_per_shard,
         policy=pattern.policies.get(level),
         max_steps=max_steps,
         deterministic=pattern.deterministic and level != "random",
@@ -247,50 +251,43 @@ def _canonical(setting: str) -> str:
     return DistractorSetting.parse(setting).name if setting.split("_")[0] in distractor_kinds() else setting
 
 
-SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps")
-GOAL_FIELDS = ("fixed_goals", "episodes_per_goal")
+SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps", "fixed_goals")
 
 
 def override(recipe: Recipe, **changes: Any) -> Recipe:
     """The recipe with other values: its own fields, and fields of all its subsets that they mean something for.
 
     Args:
-      changes: fields of `Recipe` or `SubsetPattern`; `episodes` takes the place of `steps` and the other way round;
-        `behaviour`: the policy of the one task and level that the recipe has.
+      changes: fields of `Recipe` or `SubsetPattern`; `episodes` takes the place of `steps` and the other way round, and
+        is shared among the fixed goals of a subset that has some (rounded up); `behaviour`: the policy of the one task
+        and level that the recipe has.
 
     Raises:
       RecipeError: a value that is wrong, or that means nothing for this recipe.
     """
     own = {name: value for name, value in changes.items() if name in Recipe.model_fields}
     each = {name: value for name, value in changes.items() if name in SUBSET_FIELDS}
-    goals = {name: value for name, value in changes.items() if name in GOAL_FIELDS}
-    settings = {setting for pattern in recipe.subsets for setting in pattern.settings}
-    fixed = FIXED in settings
-    if goals and not fixed:
-        raise RecipeError(f"recipe {recipe.name!r} has no fixed goals, so --{_option(goals)} means nothing for it")
-    amount = {"episodes", "steps"} & set(each)
-    if amount and fixed and not (goals and settings - {FIXED}):
-        others = sorted(settings - {FIXED})
-        flags = " ".join(f"--{'goal' if name in GOAL_MODES else 'distractor'} {name}" for name in others)
-        cure = f"give those too, or leave these subsets out: {flags}" if others else "give those"
-        raise RecipeError(
-            f"--{amount.pop()} means nothing for fixed goals, which have --fixed-goals x --episodes-per-goal episodes; "
-            f"{cure}"
-        )
-    if amount:
+    if {"episodes", "steps"} & each.keys():
         each = {"episodes": None, "steps": None} | each
     if "behaviour" in changes:
         each["policies"] = {_one_level(recipe): changes["behaviour"]}
     data = recipe.model_dump(mode="json") | own
-    for pattern in data["subsets"]:
-        only_fixed = set(pattern["settings"]) == {FIXED}
-        pattern |= {name: value for name, value in each.items() if not (only_fixed and name in ("episodes", "steps"))}
-        pattern |= goals
+    data["subsets"] = [part for pattern in data["subsets"] for part in _overridden(pattern, each)]
     return make_recipe(data, "command line")
 
 
-def _option(changes: dict[str, Any]) -> str:
-    return next(iter(changes)).replace("_", "-")
+def _overridden(pattern: dict[str, Any], each: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A pattern with other values; fixed goals, which count in another way, become a pattern of their own."""
+    fixed = [FIXED] * (FIXED in pattern["settings"])
+    others = [setting for setting in pattern["settings"] if setting != FIXED]
+    parts = [pattern | {key: value for key, value in each.items() if key != "fixed_goals"} | {"settings": others}]
+    if fixed:
+        changed = {key: value for key, value in each.items() if key not in ("episodes", "steps")}
+        part = pattern | changed | {"settings": fixed}
+        if count := each.get("episodes"):
+            part["episodes_per_goal"] = -(-count // part["fixed_goals"])
+        parts.append(part)
+    return [part for part in parts if part["settings"]]
 
 
 def _one_level(recipe: Recipe) -> str:
@@ -299,40 +296,6 @@ def _one_level(recipe: Recipe) -> str:
     if len(tasks) != 1 or len(levels) != 1 or levels == {"random"}:
         raise RecipeError("--behaviour needs one task and one --level of expert, medium or mixed")
     return levels.pop()
-
-
-def single_recipe(
-    tasks: Sequence[str],
-    levels: Sequence[str],
-    settings: Sequence[str] | None,
-    *,
-    name: str,
-    behaviour: str | None = None,
-    goals: dict[str, int] | None = None,
-    subset_fields: dict[str, Any],
-    **fields: Any,
-) -> Recipe:
-    """The recipe of a command line without --recipe: every task x level x setting.
-
-    Args:
-      settings: settings of the tasks' families; by default "none", and "visible" for mazes.
-      goals: fixed_goals and episodes_per_goal, if they are not the pattern's own.
-      subset_fields: fields of each `SubsetPattern`.
-      fields: fields of the `Recipe`.
-
-    Raises:
-      RecipeError: --behaviour with several tasks or levels, or with random.
-    """
-    patterns = []
-    for family in FAMILIES:
-        chosen = [task for task in tasks if is_maze(task) == (family == ANT_MAZE)]
-        if not chosen:
-            continue
-        default = "none" if family == LOCOMOTION else VISIBLE
-        pattern = {"tasks": chosen, "levels": list(levels), "settings": list(settings or (default,)), **subset_fields}
-        patterns.append(pattern | (goals or {}))
-    made = make_recipe({"name": name, "subsets": patterns, **fields}, "command line")
-    return override(made, behaviour=behaviour) if behaviour else made
 
 
 def check_options_used(recipe: Recipe, given: Collection[str]) -> None:

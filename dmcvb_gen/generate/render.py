@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import SubsetRecord
-from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
+from dmcvb_gen.dataset3.manifest import SubsetRecord
+from dmcvb_gen.dataset3.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.distractors import floor_alpha_for, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import Backgrounds, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.generate.modalities import Modality, Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
@@ -26,6 +26,8 @@ from dmcvb_gen.tasks.base import Task
 
 PAINT_FRAMES = 2004
 """Frames rendered between two calls of the progress callback."""
+MOST_RENDERERS = 4
+"""Renderers of a task that a process keeps."""
 LABEL_FRAMES = 512
 """Frames of depth, segmentation or flow that are rendered at once."""
 SIMULATION_STREAMS = ("initial_state", "policy")
@@ -49,7 +51,7 @@ def renderer_for(
       overrides: `name` and `samples`, instead of the record's.
     """
     task, setting = get_task(record.task), record.distractor
-    videos = None if setting.kind == "none" else load_backgrounds(backgrounds, split or record.split)
+    videos = videos_of(record.model_copy(update={"split": split or record.split}), backgrounds)
     choice = {"name": record.renderer["name"], "samples": record.renderer.get("samples")} | overrides
     name = choice.pop("name")
     renderer = make_renderer(
@@ -63,27 +65,33 @@ def renderer_for(
     return renderer, videos
 
 
+def videos_of(record: SubsetRecord, backgrounds: str) -> Backgrounds | None:
+    """The videos of a subset; None if its distractor shows none."""
+    return None if record.distractor.kind == "none" else load_backgrounds(backgrounds, record.split)
+
+
 class RendererCache:
-    """Keeps the last renderer, which is large, so that the shards of a subset share it."""
+    """Keeps the last renderers of a task, which are large: the settings of a work take turns."""
 
-    def __init__(self):
-        self._made: dict[tuple, tuple[Renderer, Any]] = {}
+    def __init__(self) -> None:
+        self._made: dict[tuple, Renderer] = {}
 
-    def get(self, record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:
+    def get(self, record: SubsetRecord, backgrounds: str) -> Renderer:
         """Return the renderer that `renderer_for` would make, from the cache if it is there."""
         setting = record.distractor
         key: tuple = (record.task, setting.name, record.size, str(sorted(record.renderer.items(), key=str)))
         key += (backgrounds, record.split)
         if key not in self._made:
-            self.close()
-            self._made[key] = renderer_for(record, backgrounds, record.split)
+            if len(self._made) == MOST_RENDERERS or any(task != record.task for task, *_ in self._made):
+                self.close()
+            self._made[key] = renderer_for(record, backgrounds, record.split)[0]
             atexit.unregister(self.close)
             atexit.register(self.close)  # now, before OpenGL's library ends: it may have come with this renderer
         return self._made[key]
 
     def close(self) -> None:
         """Free what is held."""
-        for renderer, _ in self._made.values():
+        for renderer in self._made.values():
             renderer.close()
         self._made.clear()
 
@@ -127,11 +135,6 @@ def distractor_state_of(
     before = np.zeros((len(padded), rows, task.action_size))
     before[:, 1:] = action[:, : rows - 1]
     return sample_distractors(task, setting, padded, generators, backgrounds, record.split, before)
-
-
-def frame_count(record: SubsetRecord, steps: int, episodes: int) -> int:
-    """Count the frames of some episodes of a subset for the progress callback: one for each step and stored view."""
-    return (steps + episodes) * (len(record.views) if record.pixels else 1)
 
 
 def paint(

@@ -1,41 +1,41 @@
-"""Write a release with the episodes of another one and new pictures: another distractor, size or renderer.
+"""Write a release with the episodes of another one and new images: another distractor, size, renderer or modality.
 
-Nothing is simulated: actions, rewards, states and physics are copied. If the distractor or split of a subset changes,
-its labels are drawn from the same random streams as a rollout's. With shared trajectories, the repainted subset then
-has the very bytes that rolling it out would give.
+Nothing is simulated: the trajectories' files are copied. Labels are copied too if the distractor stays; else they are
+drawn from the same random streams as a rollout's. So a repainted subset has the very bytes that rolling it out would
+give.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset import Release, open_release
-from dmcvb_gen.dataset.manifest import MANIFEST, Manifest, SubsetRecord, VersionEntry, environment
-from dmcvb_gen.dataset.pictures import view_arrays
-from dmcvb_gen.dataset.reader import Subset, load_manifest
-from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, subset_specs
-from dmcvb_gen.dataset.writer import create_subset, finish_together, read_commits, start_release
+from dmcvb_gen.dataset3.gate import Release, Shard, read_recipes
+from dmcvb_gen.dataset3.manifest import Layer, Resolved, SubsetRecord
+from dmcvb_gen.dataset3.writer import begin, finish, put, put_record, write_provenance
 from dmcvb_gen.errors import RecipeError, StoreError
-from dmcvb_gen.files import sha256_file
-from dmcvb_gen.generate.executors import run_jobs
-from dmcvb_gen.generate.inputs import BUILTIN, Inputs, policy_files, video_source
-from dmcvb_gen.generate.jobs import Stored, make_jobs, recipe_of, stream_names
-from dmcvb_gen.generate.modalities import get_modality
-from dmcvb_gen.generate.plan import copy_inputs, painting_facts, subset_attributes
-from dmcvb_gen.generate.recipe import Recipe, make_recipe
-from dmcvb_gen.generate.render import (
-    check_renderer,
+from dmcvb_gen.files import sha256_bytes
+from dmcvb_gen.generate.executors import default_workers, run_works
+from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
+from dmcvb_gen.generate.paint import bare
+from dmcvb_gen.generate.render import check_renderer
+from dmcvb_gen.generate.resolve import (
+    all_pictures,
+    file_records,
+    image_layers,
+    labels_layer,
+    modality_layers,
+    rendering_facts,
+    video_files,
 )
-from dmcvb_gen.generate.target import Target
+from dmcvb_gen.generate.works import works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
-from dmcvb_gen.spec import DistractorSetting, is_maze, select
+from dmcvb_gen.spec import Distractor, is_maze
 from dmcvb_gen.storage.remote import local_path
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.storage.store import Store, open_store
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class Repainting:
     Attributes:
       root, out: folders of the source and of the new release.
       only: subset patterns, all by default.
-      distractor, difficulty: the new setting.
+      distractor: the new setting, e.g. "dynamic_hard".
       size: pixels a side.
       renderer, samples: see `rollout`.
       backgrounds: "builtin" or a folder of videos.
       split: "train" or "val": the videos of locomotion, the styles of mazes.
-      labels: "depth", "segmentation" and "flow", stored beside the pixels.
+      labels: modalities, stored beside the images: "depth", "segmentation", "parts", "flow" or one's own.
       name: name of the new release.
     """
 
@@ -58,7 +58,6 @@ class Repainting:
     out: str | Path
     only: Sequence[str] = ()
     distractor: str | None = None
-    difficulty: str | None = None
     size: int | None = None
     renderer: str | None = None
     samples: int | None = None
@@ -68,119 +67,59 @@ class Repainting:
     name: str | None = None
 
 
-@dataclass(frozen=True)
-class Repainted:
-    """A subset to read from, the record of the one to write, and its policies and videos."""
-
-    source: Subset
-    record: SubsetRecord
-    inputs: Inputs
-
-    @property
-    def keeps_labels(self) -> bool:
-        """True if the distractor, the videos and the styles are those of the source."""
-        old, new = self.source.record, self.record
-        videos = [(record.backgrounds or {}).get("digest") for record in (old, new)]
-        styles = [record.split if record.goal_mode is not None else "" for record in (old, new)]
-        return old.setting == new.setting and videos[0] == videos[1] and styles[0] == styles[1]
-
-
-def label_specs(views: Sequence[str], size: int, labels: Sequence[str]) -> tuple[ArraySpec, ...]:
-    """Specs of modalities of a subset's views: "depth", or "depth/<view>" if its task has several."""
-    specs = []
-    for modality in map(get_modality, labels):
-        shape, dims = (size, size, *modality.shape), ("height", "width", "direction")
-        specs += [
-            ArraySpec(name, modality.dtype, shape, dims[: len(shape)]) for name in view_arrays(modality.name, views)
-        ]
-    return tuple(specs)
-
-
-def repaint(request: Repainting, workers: Workers = 1, progress: ProgressCallback = ignore) -> Manifest:
-    """Write a release with new pictures of the episodes of another one. Run again, it resumes.
+def repaint(request: Repainting, workers: Workers | None = None, progress: ProgressCallback = ignore) -> Release:
+    """Write a release with new images of the episodes of another one. Run again, it resumes.
 
     Args:
       workers: processes, or a Ray cluster that sees the same folders.
       progress: called with the number of frames rendered since the last call.
 
-    Returns:
-      The finished manifest.
-
     Raises:
       DmcvbError: nothing fits, two subsets would become one, a source shard is damaged, or `out` cannot be used.
     """
-    out = local_path(request.out)
-    release, target = _source(request), Target.at(out)
-    pairs: dict[str, Repainted] = {}
-    names = select(list(release.subsets), list(request.only))
-    for name in [name for name in names if not release[name].record.imported]:
-        pair = _pair(release, release[name], request)
-        taken = pairs.setdefault(pair.record.name, pair)
-        if taken is not pair:
-            raise RecipeError(
-                f"{taken.source.name} and {name} would both become {pair.record.name}; "
-                f"choose one with --only, e.g. '*/*/{pair.source.setting}'"
-            )
-    if not pairs:
+    store, release = open_store(local_path(request.out)), _source(request)
+    names = release.select(request.only)
+    chosen = [record for record in release.manifest.subsets if record.name in names and not record.imported]
+    if not chosen:
         raise StoreError(f"{request.root} was imported and has no physics states to paint from")
-    _check_options_used(request, [pair.record for pair in pairs.values()])
-    new = _new_manifest(release, pairs, request)
-    _check_out(out, new, request.name)
-    manifest = start_release(out, new)
-    todo: dict[tuple[str, int], SubsetRecord] = {}
-    for pair in pairs.values():
-        record, shape = pair.record, EpisodeShape.of(get_task(pair.record.task))
-        specs = subset_specs(shape, record) + label_specs(record.views, record.size, request.labels)
-        create_subset(out, record, specs, record.max_steps + 1, subset_attributes(record, manifest))
-        missing = sorted(set(pair.source.commits) - set(read_commits(out, record)))
-        todo |= {(record.name, shard): record for shard in missing}
-    inputs = {name: pair.inputs for name, pair in pairs.items()}
-    copy_inputs(out, [pair.record for pair in pairs.values()], inputs)
-    sources = {name: Stored(pair.source, new_labels=not pair.keeps_labels) for name, pair in pairs.items()}
-    jobs = make_jobs(manifest, todo, target, inputs, sources, tuple(request.labels))
-    for _ in run_jobs(jobs, workers, progress):
+    files: dict[str, Path] = {}
+    layers: dict[str, Layer] = {}
+    records: dict[str, SubsetRecord] = {}
+    for old in chosen:
+        record, made = _repainted(release, old, request, files)
+        if record.name in records:
+            raise RecipeError(
+                f"two subsets would become {record.name}; choose one with --only, e.g. '*/*/{old.setting}'"
+            )
+        layers |= {layer.name: layer for layer in made}
+        records[record.name] = record.model_copy(update={"layers": tuple(layer.name for layer in made)})
+    _check_options_used(request, records.values())
+    resolved = _resolved(release, request, layers, records, files)
+    _check_out(store, resolved)
+    begin(store, resolved, files)
+    write_provenance(store, "repaint")
+    for shard in release.shards([record.name for record in chosen], images=False):
+        if shard.here and layers.get(shard.layer.name) == bare(shard.layer):
+            _copy(release.store, store, shard)
+    target = Release.in_making(store)
+
+    def is_missing(layer: Layer, shard: int) -> bool:
+        here = shard in target.here(f"{layer.group.partition('.zarr/')[0]}/trajectories")
+        return layer.kind != "trajectories" and here and shard not in target.here(layer.name)
+
+    works = works_of(target, wanted=is_missing)
+    for _ in run_works(works, workers or default_workers(works), progress):
         pass
-    return finish_together(out)
-
-
-def _check_options_used(request: Repainting, records: Sequence[SubsetRecord]) -> None:
-    """Refuse options of distractors that none of the new subsets has."""
-    varied = any(record.distractor.kind != "none" for record in records)
-    videos = any(record.distractor.shows_videos for record in records)
-    heard = {
-        "difficulty": (varied, "have no distractors"),
-        "backgrounds": (videos, "show no videos"),
-        "split": (videos or any(is_maze(record.task) for record in records), "show no videos"),
-    }
-    for name, (has_effect, why) in heard.items():
-        if getattr(request, name) and not has_effect:
-            raise RecipeError(f"--{name} has no effect here: these subsets {why}; remove it")
-    if request.difficulty and "_" in (request.distractor or ""):
-        raise RecipeError(
-            f"{request.distractor} names its strength itself: remove --difficulty, or give the kind alone"
-        )
-
-
-def _check_out(out: Path, new: Manifest, name: str | None) -> None:
-    """Refuse a folder that holds any release but this very repaint, begun before."""
-    if not (out / MANIFEST).exists():
-        return
-    _, there = load_manifest(out)
-    if list(there.lineage) != json.loads(new.model_dump_json())["lineage"]:
-        raise StoreError(f"{out} holds {there.name} {there.version}, which is not this repaint; give another --out")
-    if name and there.name != name:
-        raise StoreError(f"{out} holds this repaint by the name {there.name}; remove --name, or give another --out")
+    return finish(store)
 
 
 def _source(request: Repainting) -> Release:
-    """The release to repaint, once all that can be wrong with the request as a whole has been looked at."""
-    release = open_release(request.root)
-    if Path(request.out).resolve() == release.path.resolve():
+    """The release to repaint, once all that can be wrong with the request as a whole was looked at."""
+    release = Release.open(open_store(request.root))
+    if Path(request.out).resolve() == Path(release.place).resolve():
         raise StoreError(f"--out {request.out} is the release itself; give another folder")
-    for label in request.labels:
-        get_modality(label)
     if not release.subsets:
-        raise StoreError(f"{request.root} has no committed episodes yet; run the rollout first")
+        raise StoreError(f"{request.root} has no finished episodes yet; run the rollout first")
     if request.size is not None:
         check_size(request.size)
     if request.renderer:
@@ -188,118 +127,85 @@ def _source(request: Repainting) -> Release:
     return release
 
 
-def _pair(release: Release, subset: Subset, request: Repainting) -> Repainted:
-    old = subset.record
-    setting = _new_setting(subset, request.distractor, request.difficulty)
+def _repainted(
+    release: Release, old: SubsetRecord, request: Repainting, files: dict[str, Path]
+) -> tuple[SubsetRecord, list[Layer]]:
+    """The record and layers of a repainted subset; its policies and videos are added to `files`."""
+    trajectories = bare(release.layers[old.layers[0]])
+    setting = _new_setting(old, request.distractor)
+    root = local_inputs(release.store, release.inputs_of([old.name]))
+    source = request.backgrounds or video_source(root, old)
     backend, samples = request.renderer or old.renderer["name"], request.samples
     if samples is None and backend == old.renderer["name"]:
         samples = old.renderer.get("samples")
-    record = old.model_copy(
-        update={
-            "name": f"{old.name.rsplit('/', 1)[0]}/{setting}",
-            "setting": setting,
-            "size": request.size or old.size,
-            "split": request.split or old.split,
-            "renderer": {"name": backend, "samples": samples},
-            "backgrounds": None,
-            "pixels": True,
-            "digest": None,
-        }
-    )
-    source = request.backgrounds or _old_backgrounds(release, old)
-    record = record.model_copy(update=painting_facts(record, source))
-    return Repainted(subset, record, Inputs(policy_files(release.path, old), source))
-
-
-def _old_backgrounds(release: Release, old: SubsetRecord) -> str:
-    """Find the videos of a release: the subset's own, or those of its recipe."""
-    recipe = {"source": release.manifest.recipe_of(old.name).get("backgrounds", BUILTIN)}
-    return video_source(release.path, old.model_copy(update={"backgrounds": old.backgrounds or recipe}))
-
-
-def _new_setting(subset: Subset, distractor: str | None, difficulty: str | None) -> str:
-    if distractor is None and difficulty is None:
-        return subset.setting
-    if is_maze(subset.task):
-        raise RecipeError(f"{subset.name} varies in style, not by distractor; remove --distractor or use --only")
-    old = DistractorSetting.parse(subset.setting)
-    given = DistractorSetting.parse(distractor) if distractor else old
-    return DistractorSetting(given.kind, difficulty or given.difficulty).name
-
-
-def _new_manifest(release: Release, pairs: Mapping[str, Repainted], request: Repainting) -> Manifest:
-    """The manifest of the new release; subsets that another recipe added there are additions here, too."""
-    old = release.manifest
-    groups: list[tuple[Recipe, list[SubsetRecord]]] = []
-    for pair in pairs.values():
-        recipe = recipe_of(old, pair.source.name)
-        group = next((records for known, records in groups if known == recipe), None)
-        if group is None:
-            groups.append((recipe, group := []))
-        group.append(pair.record)
-    first, *others = [(_new_recipe(old, recipe, records, request), records) for recipe, records in groups]
-    lineage = {
-        "kind": "repaint",
-        "from": f"{old.name} {old.version}",
-        "manifest_sha256": sha256_file(release.path / MANIFEST),
-        "subsets": {name: pair.source.name for name, pair in pairs.items()},
-        "streams": {name: list(stream_names(old, pair.source.record)) for name, pair in pairs.items()},
-        "new_labels": [name for name, pair in pairs.items() if not pair.keeps_labels],
-        "labels": list(request.labels),
+    changes: dict[str, Any] = {
+        "name": f"{old.name.rpartition('/')[0]}/{setting}",
+        "setting": setting,
+        "size": request.size or old.size,
+        "split": request.split or old.split,
+        "renderer": {"name": backend, "samples": samples},
     }
-    manifest = Manifest(
-        name=first[0].name,
-        version=first[0].version,
+    record = old.model_copy(update=changes)
+    record = record.model_copy(update=rendering_facts(record, source))
+    paths = policy_files(root, old)
+    files |= {policy.path: Path(path) for policy, path in zip(old.policies, paths, strict=True) if policy.path}
+    files |= video_files(record.backgrounds, source)
+    labels = labels_layer(record, trajectories)
+    images = image_layers(record, labels, all_pictures(record))
+    return record, [trajectories, labels, *images, *modality_layers(record, labels, dict.fromkeys(request.labels))]
+
+
+def _new_setting(old: SubsetRecord, distractor: str | None) -> str:
+    if distractor is None:
+        return old.setting
+    if is_maze(old.task):
+        raise RecipeError(f"{old.name} varies in style, not by distractor; remove --distractor or use --only")
+    return Distractor.parse(distractor).name
+
+
+def _check_options_used(request: Repainting, records: Iterable[SubsetRecord]) -> None:
+    """Refuse options of videos if none of the new subsets shows any."""
+    videos = any(record.distractor.shows_videos for record in records)
+    heard = {"backgrounds": videos, "split": videos or any(is_maze(record.task) for record in records)}
+    for name, has_effect in heard.items():
+        if getattr(request, name) and not has_effect:
+            raise RecipeError(f"--{name} has no effect here: these subsets show no videos; remove it")
+
+
+def _resolved(
+    release: Release,
+    request: Repainting,
+    layers: dict[str, Layer],
+    records: dict[str, SubsetRecord],
+    files: dict[str, Path],
+) -> Resolved:
+    old = release.manifest
+    return Resolved(
+        name=request.name or f"{old.name[:80]}-repainted",
+        version=old.version,
         license=old.license,
         authors=old.authors,
-        recipe=first[0].model_dump(mode="json"),
-        subsets=tuple(pair.record for pair in pairs.values()),
-        environments=(environment(),),
-        lineage=(*old.lineage, lineage),
-    )
-    additions = tuple(
-        VersionEntry(
-            version=manifest.version,
-            recipe=recipe.model_dump(mode="json"),
-            generator=manifest.generator,
-            subsets={record.name: (0, record.episodes) for record in records},
-        )
-        for recipe, records in others
-    )
-    return manifest.model_copy(update={"additions": additions})
-
-
-def _new_recipe(old: Manifest, recipe: Recipe, records: Sequence[SubsetRecord], request: Repainting) -> Recipe:
-    """The recipe that asks for repainted subsets of one recipe."""
-    first, splits = records[0], {record.split for record in records}
-    shown = {record.backgrounds["source"] for record in records if record.backgrounds}
-    return make_recipe(
-        recipe.model_dump(mode="json")
-        | {
-            "name": request.name or f"{old.name[:80]}-repainted",
-            "description": f"Repainted from {old.name} {old.version}. {recipe.description}".strip(),
-            "size": first.size,
-            "renderer": {"backend": first.renderer["name"], "samples": first.renderer.get("samples")},
-            "backgrounds": shown.pop() if shown else BUILTIN,
-            "split": splits.pop(),
-            "subsets": [_pattern(record) for record in records],
-        },
-        "the repainted release's recipe",
+        description=f"Repainted from {old.name} {old.version}. {old.description}".strip(),
+        inputs=file_records(files),
+        layers=tuple(layers.values()),
+        subsets=tuple(records.values()),
+        derived={"kind": "repaint", "name": old.name, "version": old.version, "digest": release.digest},
     )
 
 
-def _pattern(record: SubsetRecord) -> dict[str, Any]:
-    """The recipe's entry for one subset."""
-    pattern: dict[str, Any] = {
-        "tasks": [record.task],
-        "levels": [record.level],
-        "settings": [record.setting],
-        "episodes": record.episodes,
-        "episodes_per_shard": record.episodes_per_shard,
-        "deterministic": record.deterministic,
-        "max_steps": record.max_steps,
-    }
-    if record.fixed_goals:
-        goals = {"fixed_goals": record.fixed_goals, "episodes_per_goal": record.episodes_per_goal}
-        pattern |= goals | {"episodes": None}
-    return pattern
+def _check_out(store: Store, resolved: Resolved) -> None:
+    """Refuse a folder that holds any release but this very repaint, begun before."""
+    there = read_recipes(store)
+    if there and all(recipe.sha256 != resolved.sha256 for recipe in there):
+        held = f"{there[0].name} {there[0].version}"
+        raise StoreError(f"{store.place} holds {held}, which is not this repaint; give another --out")
+
+
+def _copy(source: Store, target: Store, shard: Shard) -> None:
+    """Copy the files of a shard, each compared with its digest, then its record."""
+    for file in shard.files:
+        data = source.read(file.path, file.bytes)
+        if sha256_bytes(data) != file.sha256:
+            raise StoreError(f"{source.place}/{file.path} is damaged; run `dmcvb-gen regenerate {source.place}`")
+        put(target, file.path, data)
+    put_record(target, shard.layer, shard.number, shard.record)

@@ -1,0 +1,255 @@
+"""The functions that make data: `dmcvb_gen.rollout(...)` does what `dmcvb-gen rollout ...` does.
+
+The options of a command are made from its function: types and defaults from the signature, help from "Args:" in the
+docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resumes if it is made again.
+"""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.options import (
+    Count,
+    GoalPictures,
+    Local,
+    Location,
+    Names,
+    Samples,
+    Seed,
+    Span,
+    Split,
+    checked,
+    progress_bar,
+)
+from dmcvb_gen.parallel import Workers, ignore
+from dmcvb_gen.text import as_names, quoted
+
+if TYPE_CHECKING:
+    from dmcvb_gen.generate.paint import RenderResult
+    from dmcvb_gen.generate.regenerate import Outcome
+    from dmcvb_gen.loaders.release import ReleaseReader
+
+
+@checked
+def rollout(
+    tasks: Names = (),
+    *,
+    recipe: Location | None = None,
+    only: Names = (),
+    levels: Names = (),
+    distractors: Names = (),
+    goals: Names = (),
+    episodes: Count | None = None,
+    steps: Count | None = None,
+    max_steps: Count | None = None,
+    episode_range: Span | None = None,
+    seed: Seed | None = None,
+    size: int | None = None,
+    renderer: str | None = None,
+    samples: Samples | None = None,
+    backgrounds: Location | None = None,
+    split: Split | None = None,
+    behaviour: Location | None = None,
+    sample: bool = False,
+    pixels: bool = True,
+    independent: bool = False,
+    workers: Workers | None = None,
+    episodes_per_shard: Count | None = None,
+    out: Location | None = None,
+    storage_options: dict[str, Any] | None = None,
+    other_versions: bool = False,
+    progress: bool = True,
+) -> "ReleaseReader":
+    """Roll out behaviour policies into a release of episodes, and open it.
+
+    `dmcvb_gen.rollout("walker-walk", levels="expert", distractors="dynamic", episodes=4, out="releases/demo")`
+
+    With a recipe, tasks, levels, distractors and goals select a part of it, and other arguments override its values.
+    Without tasks and recipe, the release at `out` resumes from its own recipes.
+
+    Args:
+      tasks (TASK): Tasks, all of one family; a maze of your own by its text file.
+      recipe (FILE|NAME): Recipe: a YAML file or the name of a shipped one.
+      only (PATTERN): Roll out only these subsets, e.g. 'walker-walk/*/static'.
+      levels: expert, medium, mixed, random. [default: expert]
+      distractors: none, static, dynamic, or at a strength: dynamic_hard, dynamic_camera0.1. [default: none]
+      goals: Mazes: visible, hidden, fixed, or fixed3 for 3 fixed pairs of start and goal. [default: visible]
+      episodes: Episodes per subset; fixed goals share them. [default: 20]
+      steps: Steps per subset, instead of --episodes.
+      max_steps: Longest episode, in steps. [default: 500, mazes 600]
+      episode_range (RANGE): Generate only the shards with episodes A to B - 1.
+      seed: Random seed of the release. [default: 0]
+      size: Width and height of the images, in pixels. [default: 64]
+      renderer: native or opengl. [default: native]
+      samples: Samples per pixel: 1, 2, 4 or 8; native has 4. [default: 4]
+      backgrounds: Background videos: builtin, or a folder. [default: builtin]
+      split: Background videos and maze styles: train or val. [default: train]
+      behaviour (BEHAVIOUR): Policy instead of the bundled one: a policy file, a training run, an SB3
+        zip, a torch state dict (.pt), or a function of your own.
+      sample: Sample actions instead of using the policy mean.
+      pixels: False: Store no images; `paint` renders them later.
+      independent: Simulate separate episodes for each distractor.
+      workers: Worker processes. [default: a core each, as far as memory allows]
+      episodes_per_shard: Episodes per shard. [default: at most 50, mazes 10]
+      out: Folder or URL (s3://bucket/name, gs://, ...). [default: releases/NAME]
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+      other_versions: Resume even if package versions have changed.
+
+    Raises:
+      DmcvbError: an unknown name, a value that is wrong, an option that would have no effect, or no room.
+    """
+    options = locals()
+    from dmcvb_gen.generate.plan import plan_of, run_plan, start
+    from dmcvb_gen.loaders.release import open_for_reading
+
+    plan = plan_of(options)
+    start(plan, other_versions)
+    with progress_bar(progress, f" {plan.unit}", plan.release.manifest.name) as bar:
+        run_plan(plan, workers, bar)
+    return open_for_reading(plan.release.place if out is None else str(out), storage_options)
+
+
+@checked
+def paint(
+    release: Location,
+    *,
+    only: Names = (),
+    episode_range: Span | None = None,
+    size: Count | None = None,
+    views: Names | None = None,
+    goal: GoalPictures | None = None,
+    workers: Workers | None = None,
+    backgrounds: Location | None = None,
+    progress: bool = True,
+    notify: Callable[[str], None] = ignore,
+) -> "RenderResult":
+    """Render the images of a release that has none, and compare them with their known digests.
+
+    Args:
+      release: Folder of the release.
+      only (PATTERN): Render only these subsets.
+      episode_range (RANGE): Use only the shards with episodes A to B - 1.
+      size: Width and height in pixels. [default: the manifest's]
+      views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
+      goal: Mazes: render only images with, or without, the goal. [default: both]
+      workers: Worker processes. [default: a core each, as far as memory allows]
+      backgrounds (FOLDER): Folder of the background videos, if the release has no copies.
+
+    `notify` is called with each difference to the environment that made the release, before rendering.
+
+    Raises:
+      DmcvbError: nothing matches, a shard is damaged, or the videos are not those of the manifest; a URL is given.
+    """
+    from dmcvb_gen.generate.paint import Wanted, paint_release
+    from dmcvb_gen.generate.request import background_source
+    from dmcvb_gen.storage.remote import is_url, local_path, public
+
+    if is_url(str(release)):
+        url = public(str(release))
+        cure = f"fetch and render it: dmcvb-gen fetch {quoted(url)} --paint --out FOLDER"
+        raise DmcvbError(f"{url} is a URL; give a local one, or {cure}")
+    wanted = Wanted(size, None if views is None else as_names(views), goal)
+    videos = None if backgrounds is None else background_source(backgrounds)
+    with progress_bar(progress, " frames") as bar:
+        given: dict[str, Any] = dict(workers=workers, backgrounds=videos, progress=bar, notify=notify)
+        return paint_release(local_path(release), as_names(only), episode_range, wanted, **given)
+
+
+@checked
+def repaint(
+    release: Location,
+    *,
+    only: Names = (),
+    distractor: str | None = None,
+    size: int | None = None,
+    renderer: str | None = None,
+    samples: Samples | None = None,
+    backgrounds: Location | None = None,
+    split: Split | None = None,
+    labels: Names = (),
+    name: str | None = None,
+    out: Local,
+    workers: Workers | None = None,
+    progress: bool = True,
+) -> "ReleaseReader":
+    """Give episodes new images, from their stored physics states, in a new release; open that.
+
+    Args:
+      release (RELEASE): Folder of the release.
+      only (PATTERN): Render only these subsets.
+      distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: the subset's own]
+      size: Width and height in pixels. [default: the subset's own]
+      renderer: native or opengl. [default: the subset's own]
+      samples: Samples per pixel: 1, 2, 4 or 8.
+      backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
+      split: Background videos and maze styles. [default: the recipe's]
+      labels: Also store a modality: depth, segmentation, parts, flow (optical flow to the next frame) or your own.
+      name: Name of the new release. [default: NAME-repainted]
+      out (FOLDER): Folder of the new release.
+      workers: Worker processes. [default: a core each, as far as memory allows]
+
+    Raises:
+      DmcvbError: nothing fits, a shard is damaged, or `out` cannot be used.
+    """
+    from dmcvb_gen.generate.repaint import Repainting
+    from dmcvb_gen.generate.repaint import repaint as run
+    from dmcvb_gen.generate.request import background_source
+    from dmcvb_gen.loaders.release import open_for_reading
+
+    videos = None if backgrounds is None else background_source(backgrounds)
+    look = (distractor, size, renderer, samples, videos, split, as_names(labels), name)
+    with progress_bar(progress, " frames") as bar:
+        run(Repainting(release, out, as_names(only), *look), workers, bar)
+    return open_for_reading(str(out))
+
+
+@checked
+def regenerate(
+    release: Location | None = None,
+    *,
+    manifest: Location | None = None,
+    only: Names = (),
+    episode_range: Span | None = None,
+    check: bool = False,
+    out: Local | None = None,
+    backgrounds: Location | None = None,
+    workers: Workers | None = None,
+    progress: bool = True,
+) -> "Outcome":
+    """Make a release's shards again from its manifest alone, bit for bit: to repair, to check, or into `out`.
+
+    Args:
+      release (RELEASE): Folder of the release.
+      manifest (NAME|FILE): A shipped manifest, or the manifest.json.xz of a card, instead of a release.
+      only (PATTERN): Regenerate only these subsets.
+      episode_range (RANGE): Use only the shards with episodes A to B - 1.
+      check: Compare digests and change nothing.
+      out (FOLDER): Write the shards to this folder instead.
+      backgrounds (FOLDER): Folder of the background videos, if it has moved.
+      workers: Worker processes. [default: a core each, as far as memory allows]
+
+    Raises:
+      DmcvbError: there is no such release, or its shards cannot be made here.
+    """
+    from dmcvb_gen.generate.regenerate import Regeneration
+    from dmcvb_gen.generate.shipped import manifest_source
+
+    if (release is None) == (manifest is None):
+        raise DmcvbError("give a RELEASE, or a manifest with --manifest")
+    add = "add --out FOLDER (in Python, out=FOLDER)"
+    if manifest is not None and check:
+        raise DmcvbError(
+            "remove --check: with --manifest, digests are always compared" + ("" if out else f"; and {add}")
+        )
+    if manifest is not None and not out:
+        raise DmcvbError(f"a manifest alone has no shards to repair: {add}")
+    if check and out:
+        raise DmcvbError("give --check or --out, not both")
+    videos = None if backgrounds is None else str(backgrounds)
+    with ExitStack() as stack:
+        source = release if manifest is None else stack.enter_context(manifest_source(manifest))
+        assert source is not None
+        bar = stack.enter_context(progress_bar(progress, " frames"))
+        work = Regeneration(source, as_names(only), episode_range, videos, workers)
+        return work.remake(out, bar) if out else work.check(bar) if check else work.repair(bar)
