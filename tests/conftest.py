@@ -9,14 +9,13 @@ os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linu
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-import zarr  # noqa: E402
 
-from dmcvb_gen.dataset import open_release  # noqa: E402
-from dmcvb_gen.dataset.manifest import parse_commit, write_json_atomically  # noqa: E402
-from dmcvb_gen.dataset.writer import finish_release  # noqa: E402
-from dmcvb_gen.files import sha256_file  # noqa: E402
-from dmcvb_gen.generate.executors import run_jobs  # noqa: E402
-from dmcvb_gen.generate.plan import finish, make_plan, prepare  # noqa: E402
+from dmcvb_gen.dataset3.gate import Release  # noqa: E402
+from dmcvb_gen.dataset3.manifest import record_path  # noqa: E402
+from dmcvb_gen.dataset3.schema import decode  # noqa: E402
+from dmcvb_gen.dataset3.writer import finish, put_shard  # noqa: E402
+from dmcvb_gen.generate.executors import run_works  # noqa: E402
+from dmcvb_gen.generate.plan import make_plan, start  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
 from dmcvb_gen.rendering.native import textures  # noqa: E402
 
@@ -46,12 +45,13 @@ def small_recipe(**changes):
     return make_recipe(fields | changes)
 
 
-def roll_out(recipe, folder, jobs=lambda jobs: jobs, workers=1, only=()):
-    """Make a release in this process (or in workers) and give its finished manifest."""
-    plan = prepare(make_plan(recipe, folder, only))
-    for _ in run_jobs(jobs(plan.jobs), workers):
+def roll_out(recipe, folder, works=lambda works: works, workers=1, only=(), pixels=True):
+    """Make a release in this process (or in workers) and give it as it is then."""
+    plan = make_plan(recipe, folder, only, pixels=pixels)
+    start(plan)
+    for _ in run_works(works(plan.works), workers):
         pass
-    return finish(plan)
+    return finish(plan.store)
 
 
 TINY_MAZE = "ant-maze-tiny:****/*..*/****"
@@ -100,14 +100,31 @@ def stack_channels(frames):
 
 
 def rewrite(folder, name, change):
-    """Change arrays of a subset and make all digests again, so that only what the data say can give it away."""
-    change(zarr.open_group(str(folder / f"{name}.zarr"), mode="r+", use_consolidated=False))
-    for path in sorted((folder / "commits" / name).glob("*.json")):
-        commit = parse_commit(path.read_text())
-        files = [
-            file.model_copy(update={"bytes": at.stat().st_size, "sha256": sha256_file(at)})
-            for file in commit.files
-            if (at := folder / file.path).exists()
-        ]
-        write_json_atomically(path, commit.model_copy(update={"files": tuple(files)}))
-    finish_release(folder, open_release(folder).manifest)
+    """Change arrays of a subset and make all digests again, so that only what the data say can give it away.
+
+    Args:
+      change: called with a dict of whole arrays by the reader's names, all shards of each, to change in place.
+    """
+    release = Release.open(folder)
+    store, subset = release.store, release[name]
+    specs = [(layer, spec) for layer in subset.layers for spec in layer.arrays]
+
+    def shard_of(layer, spec, number):
+        file = release.records(layer.name)[number].files.get(spec.name)
+        return decode(layer, spec, store.read(layer.file_path(spec, number), file.bytes) if file else None)
+
+    counts = {layer.name: len(release.records(layer.name)) for layer in subset.layers}
+    arrays = {
+        spec.name: np.concatenate([shard_of(layer, spec, number) for number in range(counts[layer.name])])
+        for layer, spec in specs
+    }
+    change(arrays)
+    for layer in subset.layers:
+        for number in range(counts[layer.name]):
+            span = layer.episodes_of(number)
+            store.delete(record_path(layer.name, number))
+            for spec in layer.arrays:
+                store.delete(layer.file_path(spec, number))
+            put_shard(store, layer, number, [(s.name, arrays[s.name][span.start : span.stop]) for s in layer.arrays])
+    store.delete("manifest.json")
+    return finish(store)

@@ -24,6 +24,7 @@ from dmcvb_gen.version import __version__
 GROUPS = {
     "Make data": {
         "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of episodes."),
+        "cluster": ("rollout:cluster", "Make a release on many machines: begin, part, finish, slurm."),
         "status": ("look:status", "Show the progress of a release that is being made."),
         "paint": ("paint:paint", "Render the images of a release stored without pixels."),
         "repaint": ("release:repaint", "Render stored episodes again: other distractors, size or renderer."),
@@ -57,7 +58,11 @@ GROUPS = {
 """Heading -> command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""
 COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in commands.items()}
 """Command -> ("module:attribute", short help)."""
-RESUMING = frozenset({"rollout", "paint", "repaint", "validate", "publish", "fetch", "export", "import"})
+
+
+ALIASES = {"questions": "claims"}
+"""Earlier name of a command -> its name."""
+RESUMING = frozenset({"rollout", "cluster", "paint", "repaint", "validate", "publish", "fetch", "export", "import"})
 """Commands that keep what they finished, and go on from there when they are run again."""
 
 

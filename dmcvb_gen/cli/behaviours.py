@@ -58,7 +58,7 @@ def train_behaviour(as_json, list_settings, **options):
         return click.echo(f"Next: {_leave(options['task'])}dmcvb-gen select-checkpoints {quoted(run.folder)}")
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
-        options = f"--layout {quoted(layout)} --level expert --behaviour {quoted(run.folder)} --goal visible"
+        options = f"{quoted(layout)} --level expert --behaviour {quoted(run.folder)} --goal visible"
         click.echo(f"Next: dmcvb-gen rollout {options}")
 
 

@@ -73,7 +73,8 @@ def info(path, options, as_json):
     if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
         click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {quoted(public(path))}")
     if facts["digest"]:
-        click.echo(f"digest {facts['digest']}")
+        compared = "" if facts["compared"] else " (not compared with one from elsewhere)"
+        click.echo(f"digest {facts['digest']}{compared}")
 
 
 @click.command()
@@ -168,17 +169,17 @@ def _list_remote(url, options, as_json) -> None:
 @remote_option
 @json_option
 def status(place, options, as_json):
-    """Show the progress of a release that is being made: shards done and late, steps/s, time left.
+    """Show the progress of a release that is being made: shards done and late, time left.
 
-    It reads the commit records, so it works from any machine.
+    It reads the records, so it works from any machine.
 
     \b
     dmcvb-gen status s3://bucket/mine
     """
     from dmcvb_gen.generate.progress import progress_of
-    from dmcvb_gen.generate.target import Target
+    from dmcvb_gen.storage.store import open_store
 
-    found = progress_of(Target.at(place, options))
+    found = progress_of(open_store(place, options))
     if as_json:
         return print_json(found.facts())
     print_table(
@@ -189,14 +190,17 @@ def status(place, options, as_json):
         ],
         title=f"{found.name}: {found.done:,} of {found.total:,} shards",
     )
-    if found.steps_per_second and found.done < found.total:
+    if found.shards_per_hour and found.done < found.total:
         last, left = format_duration(found.silence), format_duration(found.seconds_left)
-        rate = f"{found.steps_per_second:,.0f} steps/s"
-        click.echo(f"{found.steps:,} steps; {rate}, last shard {last} ago; {left} left")
+        click.echo(f"{found.shards_per_hour:,.0f} shards/h, last one {last} ago; {left} left")
     if found.late:
         click.echo(
-            f"{pluralize(found.late, 'shards')} late (later ones are done). They are in progress, belong to a --part "
+            f"{pluralize(found.late, 'shards')} late (later ones are done). They are in progress, belong to a part "
             "that has not run, or were lost with a worker. Rerun the rollout to make them."
         )
     if found.done == found.total:
-        click.echo("complete" if found.complete else "All shards are done; finish the release with --finish.")
+        click.echo(
+            "complete"
+            if found.complete
+            else f"All shards are done; finish the release: dmcvb-gen cluster finish {quoted(place)}"
+        )

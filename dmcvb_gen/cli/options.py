@@ -33,7 +33,12 @@ FLAGS = {"settings": "set", "storage_options": "option", "everything": "all", "e
 """Parameter -> flag, if it has another name."""
 
 
-def command_of(function: Callable, *arguments: str, groups: dict[str, tuple[str, ...]] | None = None) -> Callable:
+def command_of(
+    function: Callable,
+    *arguments: str,
+    groups: dict[str, tuple[str, ...]] | None = None,
+    only: Sequence[str] = (),
+) -> Callable:
     """Decorator: a click command with the parameters of a function.
 
     The decorated function gets their values by name, with `as_json` and `progress`. Its docstring is the command's
@@ -42,6 +47,7 @@ def command_of(function: Callable, *arguments: str, groups: dict[str, tuple[str,
     Args:
       arguments: parameters that have no flag, by default the first one.
       groups: see `GroupedCommand`.
+      only: names of the parameters that the command has, all by default.
     """
 
     def decorate(show: Callable) -> click.Command:
@@ -54,7 +60,8 @@ def command_of(function: Callable, *arguments: str, groups: dict[str, tuple[str,
         own = getattr(show, "__click_params__", [])
         callback.__click_params__ = []
         json_option(callback)
-        callback.__click_params__ += [*own, *reversed(parameters_of(function, arguments))]
+        parameters = [each for each in parameters_of(function, arguments) if not only or each.name in only]
+        callback.__click_params__ += [*own, *reversed(parameters)]
         return click.command(show.__name__.replace("_", "-"), cls=GroupedCommand, option_groups=groups)(callback)
 
     return decorate
@@ -155,7 +162,7 @@ def _executor(workers: int, executor: str, address: str | None) -> Workers:
 def parse_range(flag: str, text: str) -> tuple[int, int]:
     """ "100:150" -> (100, 150)."""
     first, colon, last = text.partition(":")
-    if not (colon and first.isdigit() and last.isdigit() and int(first) < int(last)):
+    if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
         raise click.UsageError(f"{flag} {text!r} is not A:B with A < B, e.g. 100:150")
     return int(first), int(last)
 
@@ -163,21 +170,9 @@ def parse_range(flag: str, text: str) -> tuple[int, int]:
 def parse_part(flag: str, text: str) -> tuple[int, int]:
     """ "2/8" -> (2, 8)."""
     number, slash, count = text.partition("/")
-    if not (slash and number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
+    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise click.UsageError(f"{flag} {text!r} is not K/N with K from 1 to N, e.g. 2/8.")
     return int(number), int(count)
-
-
-UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
-
-
-def parse_bytes(flag: str, text: str) -> int:
-    """ "20GB" -> 20000000000."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)B?", text.strip().upper())
-    size = int(float(found[1]) * UNITS[found[2]]) if found else 0
-    if size < 1:
-        raise click.UsageError(f"{flag} {text!r} is no size; give bytes, or e.g. 500MB or 20GB.")
-    return size
 
 
 def split_names(flag: str, text: str) -> tuple[str, ...]:
@@ -191,10 +186,7 @@ def split_names(flag: str, text: str) -> tuple[str, ...]:
 
 FORMATS: dict[str | None, Callable[[str, str], Any]] = {
     "A:B": parse_range,
-    "K/N": parse_part,
-    "BYTES": parse_bytes,
     "A,B": split_names,
-    "PART,...": split_names,
 }
 """Metavar -> function that reads the value of a flag."""
 

@@ -9,10 +9,11 @@ import click
 from dmcvb_gen import commands
 from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.generate import public
 from dmcvb_gen.text import pluralize
 
 
-@command_of(commands.paint)
+@command_of(public.paint)
 def paint(release, as_json, **options):
     """Render the images of a release stored without pixels, and compare them with their known digests.
 
@@ -24,7 +25,7 @@ def paint(release, as_json, **options):
     dmcvb-gen rollout walker-walk --level expert --episodes 20 --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
-    done = commands.paint(release, notify=_tell, **options)
+    done = public.paint(release, notify=_tell, **options)
     facts = {"out": release} | _painted_facts(done)
     answer(as_json, facts, *_painted(release, done), code=1 if done.differing else 0)
 
@@ -36,11 +37,11 @@ def fetch(as_json, **options):
     With --paint, images are rendered during the download; the exit code is 1 if they differ from the published ones.
 
     \b
-    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --episodes 0:200 --out data/mini
+    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --range 0:200 --out data/mini
     dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
     """
     moved, done = commands.download(options, notify=_tell)
-    out, episodes = options["out"], options["episodes"]
+    out, episodes = options["out"], options["episode_range"]
     facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
     lines = [f"{out}: {moved_files(moved)}", *(_whole_shards(out, episodes) if episodes else ())]
     lines += _painted(out, done) if done else ()
@@ -49,17 +50,14 @@ def fetch(as_json, **options):
 
 def _whole_shards(out, episodes):
     """A line if shards brought more episodes than were asked for."""
-    from dmcvb_gen.dataset import open_release
+    from dmcvb_gen.dataset3.gate import Release
 
     first, last = episodes
-    for name, subset in open_release(out).subsets.items():
-        spans = [commit.episodes for commit in subset.commits.values()]
-        spans = [span for span in spans if span[0] < last and span[1] > first]
-        if not spans:
-            continue
-        least, most = min(span[0] for span in spans), max(span[1] for span in spans)
-        if least < first or most > last:
-            yield f"Shards are fetched whole: {name} has the episodes {least}:{most}; you asked for {first}:{last}."
+    for name, subset in Release.open(out).subsets.items():
+        here = subset.episodes
+        if len(here) and (here[0] < first or here[-1] >= last):
+            span = f"{here[0]}:{here[-1] + 1}"
+            yield f"Shards are fetched whole: {name} has the episodes {span}; you asked for {first}:{last}."
             return
 
 
@@ -75,8 +73,8 @@ def _painted_facts(done):
         known=done.known,
         differing=list(done.differing),
         drift=list(done.drift),
-        complete=done.manifest.complete,
-        digest=done.manifest.digest,
+        complete=not done.release.shortfalls,
+        digest=done.release.digest,
     )
 
 

@@ -13,6 +13,7 @@ from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.dataset.index import is_card, is_video
 from dmcvb_gen.dataset.manifest import MANIFEST
+from dmcvb_gen.generate import public
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import pluralize, quoted
@@ -55,9 +56,7 @@ def _verified(path, result):
         planned = here + sum(planned - count for count, planned in result.incomplete.values())
         verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
-        verdict = f"sound, not finished: dmcvb-gen rollout --out {path} --finish"
-    elif result.sound and result.unchecked:
-        verdict = f"sound as far as it was checked; {pluralize(len(result.unchecked), 'subsets')} not checked"
+        verdict = f"sound, not finished: dmcvb-gen cluster finish {path}"
     yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; values were checked of {checked}"
     if result.digest:
         yield f"digest {'of what is here ' if result.incomplete else ''}{result.digest}"
@@ -79,7 +78,7 @@ def _cures(path, places):
         yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` copies the videos from FOLDER again."
 
 
-@command_of(commands.regenerate)
+@command_of(public.regenerate)
 def regenerate(release, out, as_json, **options):
     """Make a release's shards again from its manifest alone, bit for bit.
 
@@ -88,11 +87,11 @@ def regenerate(release, out, as_json, **options):
     how far the values are apart. With --check, exit code 3 if all shards here match, but some shards are missing.
 
     \b
-    dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --episodes 100:150 --check
+    dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --range 100:150 --check
     dmcvb-gen regenerate releases/mini
-    dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --episodes 0:3 --out data/part
+    dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --range 0:3 --out data/part
     """
-    outcome = commands.regenerate(release, out=out, **options)
+    outcome = public.regenerate(release, out=out, **options)
     facts = {"sound": outcome.sound, "shards": [dataclasses.asdict(shard) for shard in outcome.shards]}
     facts |= {"environment": outcome.environment, "not_here": outcome.left, "restored": outcome.restored}
     code = 1 if not outcome.sound else 3 if outcome.left else 0
@@ -117,7 +116,7 @@ def _regenerated(place, outcome):
         yield f"{place}: " + ("none of these shards is here" if outcome.left else "nothing is damaged or missing")
 
 
-@command_of(commands.repaint)
+@command_of(public.repaint)
 def repaint(release, out, as_json, **options):
     """Render stored episodes again from their physics states. Nothing is simulated.
 
@@ -125,9 +124,10 @@ def repaint(release, out, as_json, **options):
     dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\
         --out releases/mini84
     """
-    manifest = commands.repaint(release, out=out, **options).manifest
-    facts = {"out": out, "complete": manifest.complete, "subsets": [subset.name for subset in manifest.subsets]}
-    made = (f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}" for subset in manifest.subsets)
+    release = public.repaint(release, out=out, **options)
+    subsets = release.manifest.subsets
+    facts = {"out": out, "complete": not release.shortfalls, "subsets": [subset.name for subset in subsets]}
+    made = (f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}" for subset in subsets)
     answer(as_json, facts, *made, f"{out}: repainted; look at it: dmcvb-gen preview {quoted(out)}")
 
 
@@ -181,7 +181,7 @@ def card(path, check, out, url, as_json):
 def export(release, to, out, as_json, **options):
     """Write subsets in another format: a folder for each subset. Rerun the command to resume.
 
-    An incomplete subset is refused, unless --episodes names what is there.
+    An incomplete subset is refused, unless --range names what is there.
 
     \b
     dmcvb-gen export releases/mini --to hdf5 --only 'walker-walk/*/none' --out exports/mini

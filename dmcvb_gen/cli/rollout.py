@@ -1,4 +1,4 @@
-"""rollout."""
+"""rollout, cluster."""
 
 from __future__ import annotations
 
@@ -7,88 +7,147 @@ import shlex
 
 import click
 
-from dmcvb_gen import commands
-from dmcvb_gen.cli.common import answer, print_json, print_table
-from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.cli.common import answer, print_json, print_table, remote_option
+from dmcvb_gen.cli.options import command_of, parse_part
 from dmcvb_gen.cli.slurm import script_for_slurm
-from dmcvb_gen.cli.unused_options import check_exclusive_options
-from dmcvb_gen.storage.remote import check_place, is_url
+from dmcvb_gen.generate import public
+from dmcvb_gen.options import progress_bar
+from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.text import format_bytes, pluralize
 
 OPTION_GROUPS = {
-    "What": ("recipe", "only", "levels", "behaviour", "sample", "independent", "seed"),
-    "Distractors": ("distractors", "difficulty", "intensity", "vary", "video_count", "correlated"),
-    "Mazes": ("goals", "fixed_goals", "episodes_per_goal", "layouts", "reward"),
+    "What": ("recipe", "only", "levels", "distractors", "goals", "behaviour", "sample", "independent", "seed"),
     "How many": ("episodes", "steps", "max_steps", "episode_range", "episodes_per_shard"),
     "Images": ("size", "renderer", "samples", "backgrounds", "split", "pixels"),
-    "Where": ("out", "storage_options", "scratch", "scratch_size"),
-    "Workers and many machines": (
-        *("workers", "executor", "ray_address", "init", "part", "finishing", "other_versions", "slurm_script"),
-    ),
+    "Where": ("out", "storage_options"),
 }
-"""Heading -> options of `rollout --help`."""
+"""Heading -> options of `rollout --help` and `cluster begin --help`."""
+DISTRACTORS = """
+\b
+Distractors:
+  none                       the model's own colors, camera and sky
+  static, dynamic            drawn once an episode, or changing; at strength medium (0.2)
+  dynamic_easy, dynamic_hard strengths 0.1 and 0.3, with 4 and all background videos
+  dynamic_0.35               any strength up to 1
+  dynamic_camera0.1          only these parts vary: camera, color, background, shake, light,
+  static_color-background4   each with a strength of its own; of a background, the number of videos
+  dynamic_color-cue0.8       also a cue that correlates with the last action
+"""
 
 
-@command_of(commands.rollout, groups=OPTION_GROUPS)
-@click.option("--init", is_flag=True, help="Create the release without generating any episodes.")
-@click.option("--finish", "finishing", is_flag=True, help="Finish the release: write its digests. Generates nothing.")
-@click.option(
-    "--slurm-script", type=click.IntRange(1), metavar="N", help="Print a Slurm script for an array of N tasks."
-)
+def _with_table(command: click.Command) -> click.Command:
+    command.epilog = DISTRACTORS
+    return command
+
+
+@_with_table
+@command_of(public.rollout, groups=OPTION_GROUPS)
 @click.option("--dry-run", is_flag=True, help="Show what is there and what would be made, and write nothing.")
-def rollout(init, finishing, slurm_script, dry_run, as_json, progress, **options):
+def rollout(dry_run, as_json, progress, workers, other_versions, **options):
     """Roll out behaviour policies into a release of episodes.
 
     Rerun the same command to resume: finished shards are kept. With --recipe, TASK, --level, --distractor and
     --goal select a part of the recipe, and other options override its values. Without TASK and --recipe, the
-    release at --out resumes from its own manifest.
-
-    On many machines: run --init once, then --part 1/N to --part N/N anywhere, then --finish; see docs/scale.md.
+    release at --out resumes from its own recipes. On many machines: `dmcvb-gen cluster`.
 
     \b
-    dmcvb-gen rollout walker-walk --level random --distractor dynamic --episodes 8
+    dmcvb-gen rollout walker-walk --distractor dynamic --episodes 8
     dmcvb-gen rollout walker-walk cheetah-run --level expert --level medium \\
-        --distractor none --distractor static --distractor dynamic --episodes 20 --workers 2 --out releases/mine
+        --distractor none --distractor static --distractor dynamic --episodes 20 --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
     """
-    from dmcvb_gen.generate.plan import describe, finish_target
-    from dmcvb_gen.generate.rollout import prepare_rollout, request_of, rollout_plan, target_for
+    from dmcvb_gen.generate.counts import check_room
+    from dmcvb_gen.generate.plan import start
 
-    check_exclusive_options(click.get_current_context())
-    request, workers = request_of(options), options["workers"]
-    if slurm_script:
-        check_place(options["out"] or "")
-        if not request and target_for(options, request).manifest() is None:
-            raise click.UsageError(f"{options['out']} holds no release to go on with; give TASKs or --recipe.")
-        if request:
-            describe(request, pixels=options["pixels"])  # or says why each task would be refused; this needs no GPU
-        return click.echo(script_for_slurm(slurm_script, workers), nl=False)
-    target = target_for(options, request)
-    if finishing:
-        begun = target.manifest() is not None
-        if begun and request and (more := rollout_plan(options, request, target).growth):
-            raise click.UsageError(
-                f"{target.place} does not have {', '.join(more[:3])}, and --finish makes nothing; remove --finish."
-            )
-        return _finish(target, finish_target, as_json)
-    plan = rollout_plan(options, request, target)
-    if request:
-        _tell_what_is_asked(request)
-    _tell_what_is_there(plan, shared=dry_run or init or bool(options["part"]))
-    _tell_what_stays(plan, options)
+    plan = _plan(options)
     if dry_run:
         return _show_plan(plan, as_json)
-    plan = prepare_rollout(plan, options, init)
-    if init:
-        return _tell_begun(plan, as_json)
-    _run(plan, workers, as_json, whole=not options["part"])
+    check_room(plan)
+    start(plan, other_versions)
+    _run(plan, workers, as_json)
 
 
-def _tell_what_is_asked(request):
-    """A note on the use of one's own videos."""
+@click.group()
+def cluster():
+    """Make a release on many machines: begin it once, make its parts anywhere, finish it.
+
+    \b
+    dmcvb-gen cluster begin --recipe dmcvb-v1 --out s3://bucket/mine
+    dmcvb-gen cluster part s3://bucket/mine 1/64        # on each machine, 1/64 to 64/64
+    dmcvb-gen cluster finish s3://bucket/mine
+    """
+
+
+WHAT = tuple(name for names in OPTION_GROUPS.values() for name in names)
+
+
+@_with_table
+@command_of(public.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
+def begin(as_json, progress, **options):
+    """Create a release without generating any episodes. The options are those of `rollout`."""
+    from dmcvb_gen.generate.plan import start
+
+    plan = _plan(options)
+    start(plan, command="cluster begin")
+    place = shlex.quote(str(plan.store.place))
+    begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N"
+    answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
+
+
+@command_of(public.make_part, "release", "part")
+def part(release, part, as_json, workers, other_versions, only, episode_range, storage_options, progress):
+    """Make part K of N of a release that was begun: every N-th shard, starting with the K-th."""
+    from dmcvb_gen.generate.plan import make_plan, start
+    from dmcvb_gen.storage.store import open_store
+
+    store = open_store(release, storage_options)
+    plan = make_plan(None, store, only or (), episode_range, parse_part("PART", part))
+    start(plan, other_versions, "cluster part")
+    _run(plan, workers, as_json, whole=False)
+
+
+@click.command()
+@click.argument("release", metavar="RELEASE|URL")
+@remote_option
+@click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
+def finish(release, options, as_json):
+    """Write the manifest of all that is there. Exit code 1 while shards are missing."""
+    from dmcvb_gen.dataset3.gate import Release
+    from dmcvb_gen.dataset3.writer import finish as write
+    from dmcvb_gen.storage.store import open_store
+
+    store = open_store(release, options)
+    asked = {record.name: record.episodes for record in Release.in_making(store).manifest.subsets}
+    done = write(store)
+    there = {} if done.in_the_making else {record.name: record.episodes for record in done.manifest.subsets}
+    missing = [name for name, episodes in asked.items() if there.get(name, 0) < episodes]
+    state = "complete"
+    if missing:
+        state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
+    facts = {"out": store.place, "complete": not missing, "incomplete": missing, "digest": done.digest}
+    answer(as_json, facts, f"{store.place}: {state}", code=1 if missing else 0)
+
+
+@command_of(public.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
+@click.option("--tasks", "count", type=click.IntRange(1), required=True, metavar="N", help="Tasks of the Slurm array.")
+@click.option("--cores", type=click.IntRange(1), default=1, show_default=True, help="Cores of each task.")
+def slurm(count, cores, as_json, progress, **options):
+    """Print a script for `sbatch` that makes a release by an array of N tasks."""
+    plan = _plan(options)  # or says why each task would be refused
+    click.echo(script_for_slurm(count, cores, plan.store.place), nl=False)
+
+
+for subcommand in (begin, part, finish, slurm):
+    cluster.add_command(subcommand)
+
+
+def _plan(options):
+    """The plan of a command line, with notes on what is asked for and what is there."""
     from dmcvb_gen.distractors.backgrounds import videos_by_split
+    from dmcvb_gen.generate.plan import plan_of
 
-    source, split = request.backgrounds, request.split
+    plan = plan_of(options)
+    source, split = options["backgrounds"] or "builtin", options["split"] or "train"
     if source != "builtin" and (counts := videos_by_split(source)):
         other = {"train": "evaluation (--split val)", "val": "training (--split train)"}[split]
         click.echo(
@@ -96,78 +155,37 @@ def _tell_what_is_asked(request):
             "To choose them yourself, put them into folders named train and val.",
             err=True,
         )
-
-
-def _tell_what_is_there(plan, shared):
-    """Notes on a release that gains subsets or episodes, and on another rollout that works on it."""
-    from dmcvb_gen.generate.target import rollouts_at_work
-
-    if plan.growth:
+    if plan.growth and plan.there:
         added = ", ".join(plan.growth[:3]) + (f" and {len(plan.growth) - 3} more" if len(plan.growth) > 3 else "")
-        there = plan.target.manifest()
-        click.echo(f"{plan.target.place} holds {there.name} {there.version} already; this adds {added}.", err=True)
-    if not shared and (others := rollouts_at_work(plan.target)):
-        click.echo(
-            f"Another rollout is writing to {plan.target.place} ({', '.join(others)}), and both may make the same "
-            "shards. To share work, stop one and give --part 1/2 and --part 2/2.",
-            err=True,
-        )
-
-
-def _tell_what_stays(plan, options):
-    """Notes on how new episodes of subsets that are there are stored, if it is not as the options say."""
-    there, asked = plan.target.manifest() if plan.jobs else None, {record.name for record in plan.manifest.subsets}
-    records = [record for record in there.subsets if record.name in asked] if there else []
-    if records and not options["pixels"] and any(record.pixels for record in records):
-        click.echo(f"{plan.target.place} has images, so its new episodes get images, too.", err=True)
-    given = options["episodes_per_shard"]
-    for record in [record for record in records if given and given > record.episodes_per_shard][:1]:
-        kept = pluralize(record.episodes_per_shard, "episodes")
-        click.echo(f"{record.name} keeps its shards of {kept}.", err=True)
-
-
-def _tell_begun(plan, as_json):
-    begun = f"begun, {pluralize(len(plan.jobs), 'jobs')} to do; make them with --part 1/N to N/N"
-    facts = {"out": plan.target.place, "jobs": len(plan.jobs), "already_done": plan.done}
-    answer(as_json, facts, f"{plan.target.place}: {begun}")
-
-
-def _finish(target, finish_target, as_json):
-    manifest = finish_target(target)
-    missing = [subset.name for subset in manifest.subsets if subset.digest is None]
-    state = "complete"
-    if missing:
-        state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
-    facts = {"out": target.place, "complete": manifest.complete, "incomplete": missing}
-    answer(as_json, facts, f"{target.place}: {state}", code=0 if manifest.complete else 1)
+        click.echo(f"{plan.store.place} holds {plan.there} already; this adds {added}.", err=True)
+    return plan
 
 
 def _run(plan, workers, as_json, whole=True):
-    from dmcvb_gen.generate.rollout import run_plan
+    from dmcvb_gen.generate.plan import run_plan
 
     finished = 0
 
     def count(result):
         nonlocal finished
-        finished += sum(commit.episode_count for commit in result.commits)
+        finished += result.episodes
         bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
 
-    with commands.progress_bar(not as_json, f" {plan.unit}", plan.manifest.name) as bar:
+    with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
-    manifest, steps, place = made.manifest, made.steps, plan.target.place
-    facts = dict(out=place, complete=manifest.complete, steps=steps, seconds=round(made.seconds, 2))
+    release, steps, place = made.release, made.steps, plan.store.place
+    complete = whole and not release.in_the_making and not release.shortfalls
+    facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
     facts |= dict(seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()})
-    facts |= dict(already_done=plan.done, digests={subset.name: subset.digest for subset in manifest.subsets})
     named = shlex.quote(str(place))
-    state = "complete" if manifest.complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
+    state = "complete" if complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
     if not whole:
-        state = "finished with --finish when all parts are there"
-    kept = f", {pluralize(plan.done, 'shards')} there already" if plan.done else ""
+        state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are there"
     rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
-    done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}{kept}; the release is {state}."
-    painted = not is_url(str(place)) and any(record.pixels for record in manifest.subsets)
-    look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if painted else "")
-    answer(as_json, facts, done, look)
+    done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}; the release is {state}."
+    images = not is_url(str(place)) and any(layer.kind == "images" for layer in release.layers.values())
+    look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if images else "")
+    answer(as_json, facts, done, *([look] if whole else []))
 
 
 def _show_plan(plan, as_json):
@@ -175,16 +193,16 @@ def _show_plan(plan, as_json):
 
     counts = count(plan)
     left, frames, raw = (sum(getattr(subset, name) for subset in counts) for name in ("left", "frames", "raw_bytes"))
-    facts = dict(out=plan.target.place, jobs=len(plan.jobs), shards_done=plan.done, episodes=left, frames=frames)
+    facts = dict(out=plan.store.place, shards=len(plan.works), episodes=left, frames=frames, raw_bytes=raw)
     if as_json:
-        return print_json(facts | dict(raw_bytes=raw, subsets=[dataclasses.asdict(subset) for subset in counts]))
+        return print_json(facts | dict(subsets=[dataclasses.asdict(subset) for subset in counts]))
     print_table(
-        ("subset", "done", "to make", plan.unit, "uncompressed"),
+        ("subset", "done", "to make", "images", "uncompressed"),
         [(c.name, f"{c.done:,}", f"{c.left:,}", f"{c.frames:,}", format_bytes(c.raw_bytes)) for c in counts],
-        title=f"Plan of {plan.manifest.name} {plan.manifest.version}",
+        title=f"Plan of {plan.release.manifest.name} {plan.release.manifest.version}",
     )
-    click.echo(f"release: {plan.target.place}")
+    click.echo(f"release: {plan.store.place}")
     click.echo(
-        f"{pluralize(len(plan.jobs), 'jobs')} to do, {pluralize(plan.done, 'shards')} done; {left:,} episodes, "
-        f"{frames:,} {plan.unit}, at most {format_bytes(raw)} before compression"
+        f"{pluralize(len(plan.works), 'shards')} to make; {left:,} episodes, {frames:,} images, at most "
+        f"{format_bytes(raw)} before compression"
     )
