@@ -32,6 +32,7 @@ from dmcvb_gen.dataset3.manifest import (
     ListedLayer,
     Manifest,
     Resolved,
+    ShardFile,
     ShardRecord,
     SubsetRecord,
     check_record,
@@ -137,7 +138,7 @@ class Release:
         copy = cls._read_copy(store)
         if copy is not None and copy.manifest != found:
             raise StoreError(
-                f"{store.place} is a copy of release {copy.manifest[:12]}, but its manifest is {found[:12]}; fetch it again"
+                f"{store.place} is a copy of release {copy.manifest[:12]}, and its manifest is {found[:12]}; fetch again"
             )
         return cls(store, manifest, found, digest is not None or copy is not None, copy)
 
@@ -392,11 +393,11 @@ def read_records(store: Store, layer: Layer, known: Mapping[int, ShardRecord] | 
 
 def array_files(
     shards: Mapping[int, ShardRecord], layer: Layer, spec: ArraySpec, here: Collection[int]
-) -> dict[str, Any]:
-    """Key below an array's folder ("c/3/0/0") -> bytes of its file, of the shards that are here."""
+) -> dict[str, ShardFile]:
+    """Key below an array's folder ("c/3/0/0") -> its file, of the shards that are here."""
     prefix = f"{layer.group}/{spec.stored_name}/"
     found = {}
     for number, record in shards.items():
         if number in here and (file := record.files.get(spec.name)):
-            found[layer.file_path(spec, number).removeprefix(prefix)] = file.bytes
+            found[layer.file_path(spec, number).removeprefix(prefix)] = file
     return found

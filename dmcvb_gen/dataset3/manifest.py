@@ -129,7 +129,7 @@ class Layer(_Model):
       kind: "trajectories", "labels" or "images".
       rows: rows of the step axis, max_steps + 1.
       episodes_per_shard: every shard has as many; arrays cut off what was not asked for.
-      makes: what decides its bytes besides: policies, streams, seed, renderer, ... and "of", the key of the layer below.
+      makes: what else decides its bytes: policies, streams, seed, renderer, ... and "of", the key of the layer below.
       source: where an imported layer comes from; it cannot be made again, and no copy leaves it out.
     """
 
@@ -419,7 +419,7 @@ class Copy(_Model):
 
 
 def canonical_json(value: Any) -> bytes:
-    """The bytes of a value (plain, or a model) that its SHA-256 is taken of: sorted keys, no spaces, one last newline."""
+    """The bytes of a value (plain, or a model) of which its SHA-256 is taken: sorted keys, no spaces, a newline."""
     if isinstance(value, pydantic.BaseModel):
         value = value.model_dump(mode="json")
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)

@@ -210,7 +210,7 @@ def _filters(codec: Codec) -> tuple[Any, ...]:
 
 
 def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metadata:
-    """Zarr's metadata of an array, from its spec alone; readers build arrays from it, plain readers get it as zarr.json.
+    """Zarr's metadata of an array, from its spec alone; our readers build arrays from it, others get zarr.json.
 
     Args:
       episodes: length of the first axis.

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.parallel import ProgressCallback, ignore
@@ -29,6 +29,15 @@ LONGEST_PATH = 1000
 """Characters of a path; S3 takes 1024 bytes."""
 ANY: Final = "*"
 """Of `Store.replace`: whatever is there."""
+
+
+class Recorded(Protocol):
+    """Size and SHA-256 (hex) of a file, as a record has them."""
+
+    @property
+    def bytes(self) -> int: ...
+    @property
+    def sha256(self) -> str: ...
 
 
 class NotThere(StoreError):
@@ -214,12 +223,13 @@ class Store(abc.ABC):
         out.flush()
         os.fsync(out.fileno())
 
-    def zarr_store(self, prefix: str, files: Mapping[str, int]) -> ZarrStore:
+    def zarr_store(self, prefix: str, files: Mapping[str, Recorded]) -> ZarrStore:
         """The files below a folder for Zarr, to read.
 
         Args:
-          files: key below `prefix` -> bytes, as recorded. Other keys are absent without a request; one of these that
-            is not there, or has other bytes, is an error, never zeros.
+          files: key below `prefix` -> size and SHA-256, as recorded. Other keys are absent without a request; one of
+            these that is not there, or has other bytes, is an error, never zeros. The digest of a file is compared if
+            all of it is read; parts have checksums of their own.
         """
         from dmcvb_gen.storage.zarr_files import ZarrFiles
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from collections.abc import AsyncIterator, Iterable, Mapping
 from typing import Protocol
 
@@ -22,7 +23,7 @@ class ZarrFiles(Store):
     supports_writes = supports_deletes = False
     supports_listing = True
 
-    def __init__(self, store: Files, prefix: str, files: Mapping[str, int]):
+    def __init__(self, store: Files, prefix: str, files: Mapping[str, Recorded]):
         super().__init__(read_only=True)
         self.store, self.prefix, self.files = store, prefix.strip("/"), files
 
@@ -34,12 +35,17 @@ class ZarrFiles(Store):
         )
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        size = self.files.get(key)
-        if size is None:
+        file = self.files.get(key)
+        if file is None:
             return None
-        start, end = _range(byte_range, size)
+        start, end = _range(byte_range, file.bytes)
         path = f"{self.prefix}/{key}" if self.prefix else key
-        return prototype.buffer.from_bytes(await asyncio.to_thread(self.store.read_range, path, start, end - start))
+        data = await asyncio.to_thread(self.store.read_range, path, start, end - start)
+        if len(data) == file.bytes and hashlib.sha256(data).hexdigest() != file.sha256:
+            raise StoreError(
+                f"{self.store.place}/{path} is damaged: it does not have its SHA-256; regenerate or fetch it"
+            )
+        return prototype.buffer.from_bytes(data)
 
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]

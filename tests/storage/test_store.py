@@ -14,6 +14,7 @@ import uuid
 
 import pytest
 
+from dmcvb_gen.dataset3.manifest import ShardFile
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.storage import folder as folder_module
 from dmcvb_gen.storage.places import Place, shown
@@ -27,6 +28,11 @@ ODD = "a [b]*::c#d?e%20f~/ü.json"
 
 def sha256(data):
     return hashlib.sha256(data).hexdigest()
+
+
+def recorded(data):
+    """Size and SHA-256 of bytes, as a record has them."""
+    return ShardFile(bytes=len(data), sha256=sha256(data))
 
 
 class ReadTests:
@@ -98,18 +104,19 @@ class ReadTests:
         put("g/x/zarr.json", meta := array.store._store_dict["zarr.json"].to_bytes())
         put("g/x/c/0", b"\x01\x02")
         put("g/x/c/1", b"\x03\x04")
-        both = {"zarr.json": len(meta), "c/0": 2, "c/1": 2}
-        opened = [zarr.open_array(store.zarr_store("g/x", files), mode="r") for files in (both, {**both, "c/1": 3})]
-        np.testing.assert_array_equal(opened[0][:], [1, 2, 3, 4])
-        with pytest.raises(StoreError, match="g/x/c/1"):
-            opened[1][:]
-        partly = store.zarr_store("g/x", {"zarr.json": len(meta), "c/0": 2})
-        np.testing.assert_array_equal(zarr.open_array(partly, mode="r")[:], [1, 2, 7, 7])
-        lost = store.zarr_store("g/x", {"zarr.json": len(meta), "c/0": 2, "c/1": 2, "c/lost": 2})
-        np.testing.assert_array_equal(zarr.open_array(pickle.loads(pickle.dumps(lost)), mode="r")[:], [1, 2, 3, 4])
+        files = {"zarr.json": recorded(meta), "c/0": recorded(b"\x01\x02"), "c/1": recorded(b"\x03\x04")}
+
+        def read(prefix, files):
+            return zarr.open_array(pickle.loads(pickle.dumps(store.zarr_store(prefix, files))), mode="r")[:]
+
+        np.testing.assert_array_equal(read("g/x", files), [1, 2, 3, 4])
+        np.testing.assert_array_equal(read("g/x", {k: f for k, f in files.items() if k != "c/1"}), [1, 2, 7, 7])
+        for other in (b"\x03\x04\x05", b"\x03\x05"):
+            with pytest.raises(StoreError, match="g/x/c/1"):
+                read("g/x", files | {"c/1": recorded(other)})
         put("h/zarr.json", meta)
         with pytest.raises(NotThere, match="h/c/0 is not there"):
-            zarr.open_array(store.zarr_store("h", {"zarr.json": len(meta), "c/0": 2}), mode="r")[:]
+            read("h", files)
 
     def test_it_pickles_equals_itself_and_reads_after_a_fork(self, store, put):
         put("a", b"1")
