@@ -138,7 +138,7 @@ class Release:
         copy = cls._read_copy(store)
         if copy is not None and copy.manifest != found:
             raise StoreError(
-                f"{store.place} is a copy of release {copy.manifest[:12]}, and its manifest is {found[:12]}; fetch again"
+                f"{store.place} is a copy of release {copy.manifest[:12]}, its manifest is {found[:12]}; fetch again"
             )
         return cls(store, manifest, found, digest is not None or copy is not None, copy)
 

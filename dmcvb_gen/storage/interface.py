@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.parallel import ProgressCallback, ignore
@@ -23,21 +23,14 @@ from dmcvb_gen.storage.remote import storage_errors
 if TYPE_CHECKING:
     from zarr.abc.store import Store as ZarrStore
 
+    from dmcvb_gen.storage.zarr_files import Recorded
+
 PIECE = 16 * 2**20
 """Bytes that are in memory at once while a file passes."""
 LONGEST_PATH = 1000
 """Characters of a path; S3 takes 1024 bytes."""
 ANY: Final = "*"
 """Of `Store.replace`: whatever is there."""
-
-
-class Recorded(Protocol):
-    """Size and SHA-256 (hex) of a file, as a record has them."""
-
-    @property
-    def bytes(self) -> int: ...
-    @property
-    def sha256(self) -> str: ...
 
 
 class NotThere(StoreError):

@@ -10,9 +10,23 @@ from typing import Protocol
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 
+from dmcvb_gen.errors import StoreError
+
+
+class Recorded(Protocol):
+    """Size and SHA-256 (hex) of a file, as a record has them."""
+
+    @property
+    def bytes(self) -> int: ...
+    @property
+    def sha256(self) -> str: ...
+
 
 class Files(Protocol):
     """What a store has of it."""
+
+    @property
+    def place(self) -> str: ...
 
     def read_range(self, path: str, start: int, length: int) -> bytes: ...
 
