@@ -36,6 +36,7 @@ from dmcvb_gen.dataset3.manifest import (
     ShardRecord,
     SubsetRecord,
     check_record,
+    layer_order,
     list_bytes_limit,
     list_path,
     merged_layers,
@@ -140,6 +141,8 @@ class Release:
             raise StoreError(
                 f"{store.place} is a copy of release {copy.manifest[:12]}, its manifest is {found[:12]}; fetch again"
             )
+        if store.folder is not None:
+            manifest = _with_own_images(store, manifest)
         return cls(store, manifest, found, digest is not None or copy is not None, copy)
 
     @classmethod
@@ -335,6 +338,26 @@ class Release:
         return self.store.folder
 
 
+def _with_own_images(store: Store, manifest: Manifest) -> Manifest:
+    """The manifest, with image layers that recipes beside it add to its subsets: rendered in part, or in a copy."""
+    layers: dict[str, Layer] = {layer.name: layer for layer in manifest.layers}
+    subsets = {subset.name: subset for subset in manifest.subsets}
+    for digest in _recipes_at(store):
+        recipe = read_recipe(store, digest) if digest not in manifest.recipes else None
+        for subset in recipe.subsets if recipe else ():
+            added = {layer.name: layer for layer in recipe.layers if layer.name in subset.layers}  # type: ignore[union-attr]
+            below = [layer for name, layer in added.items() if layer.kind != "images"]
+            if subset.name in subsets and all(
+                layers[each.name].key == each.key for each in below if each.name in layers
+            ):
+                old = subsets[subset.name]
+                images = {name: layer for name, layer in added.items() if layer.kind == "images"}
+                layers = images | layers
+                names = tuple(sorted({*old.layers, *images}, key=layer_order))
+                subsets[subset.name] = old.model_copy(update={"layers": names})
+    return manifest.model_copy(update={"layers": tuple(layers.values()), "subsets": tuple(subsets.values())})
+
+
 # -- small files ----------------------------------------------------------------------------------
 
 
@@ -353,8 +376,13 @@ def read_recipe(store: Store, digest: str) -> Resolved:
 
 def read_recipes(store: Store) -> list[Resolved]:
     """All recipes at a place, in the order of their digests."""
+    return [read_recipe(store, digest) for digest in _recipes_at(store)]
+
+
+def _recipes_at(store: Store) -> list[str]:
+    """Digests of all recipes at a place, sorted."""
     found = [re.fullmatch(rf"{RECIPES}([0-9a-f]{{64}})\.json", path) for path in store.list(RECIPES)]
-    return [read_recipe(store, digest) for digest in sorted(match[1] for match in found if match)]
+    return sorted(match[1] for match in found if match)
 
 
 def recorded_shards(store: Store, layer: str) -> frozenset[int]:

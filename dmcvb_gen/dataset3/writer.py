@@ -108,12 +108,19 @@ def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) ->
         return
     if not there and (strange := next(iter(sorted(store.list())), None)) and not _only_inputs(store):
         raise StoreError(f"{store.place} holds no release but other files ({strange}); choose an empty place for --out")
-    if store.size(COPY) is not None:
+    if store.size(COPY) is not None and not _adds_images_alone(Release.open(store), recipe):
         raise StoreError(f"{store.place} is a copy of a release and does not grow; choose another --out")
     check_agree([*there, recipe])
     for file in recipe.inputs:
         put(store, file.path, inputs[file.path])
     put(store, f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
+
+
+def _adds_images_alone(release: Release, recipe: Resolved) -> bool:
+    """Return True if a recipe has nothing but subsets of a release, with more images."""
+    known = {subset.name for subset in release.manifest.subsets}
+    strange = [layer for layer in recipe.layers if layer.name not in release.layers and layer.kind != "images"]
+    return not strange and known >= {subset.name for subset in recipe.subsets}
 
 
 def _only_inputs(store: Store) -> bool:

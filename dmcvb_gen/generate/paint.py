@@ -152,7 +152,8 @@ def _layers_of(release: Release, record: SubsetRecord, wanted: Wanted, source: s
 
 def _recipe_with(release: Release, records: Iterable[SubsetRecord], layers: Mapping[str, Sequence[Layer]]) -> Resolved:
     """The recipe of subsets with more image layers than the release has."""
-    subsets, described = [], {}
+    subsets: list[SubsetRecord] = []
+    described: dict[str, Layer] = {}
     for record in records:
         own = {name: bare(release.layers[name]) for name in record.layers}
         own |= {layer.name: bare(layer) for layer in layers[record.name]}

@@ -5,7 +5,6 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 """
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.errors import DmcvbError
@@ -264,8 +263,9 @@ def regenerate(
     Raises:
       DmcvbError: there is no such release, or its shards cannot be made here.
     """
-    from dmcvb_gen.generate.regenerate import Regeneration
-    from dmcvb_gen.generate.shipped import manifest_source
+    from dmcvb_gen.generate.regenerate import Regeneration, remake
+    from dmcvb_gen.generate.request import background_source
+    from dmcvb_gen.generate.shipped import load_shipped
 
     if (release is None) == (manifest is None):
         raise DmcvbError("give a RELEASE, or a manifest with --manifest")
@@ -278,10 +278,10 @@ def regenerate(
         raise DmcvbError(f"a manifest alone has no shards to repair: {add}")
     if check and out:
         raise DmcvbError("give --check or --out, not both")
-    videos = None if backgrounds is None else str(backgrounds)
-    with ExitStack() as stack:
-        source = release if manifest is None else stack.enter_context(manifest_source(manifest))
-        assert source is not None
-        bar = stack.enter_context(progress_bar(progress, " frames"))
-        work = Regeneration(source, as_names(only), episode_range, videos, workers)
-        return work.remake(out, bar) if out else work.check(bar) if check else work.repair(bar)
+    videos = None if backgrounds is None else background_source(backgrounds)
+    how = Regeneration(release or "", as_names(only), episode_range, videos, workers)
+    with progress_bar(progress, " frames") as bar:
+        if manifest is not None:
+            assert out is not None
+            return remake(load_shipped(manifest), out, None, how, bar)
+        return how.remake(out, bar) if out else how.check(bar) if check else how.repair(bar)

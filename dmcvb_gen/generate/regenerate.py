@@ -6,12 +6,13 @@ damaged or missing, if they come out with their recorded digests. `remake` write
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dmcvb_gen.dataset3.gate import Release, read_records
-from dmcvb_gen.dataset3.manifest import Layer, LayerList, ListedLayer, Resolved, canonical_json, list_path
+from dmcvb_gen.dataset3.manifest import Layer, LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
 from dmcvb_gen.dataset3.writer import (
     begin,
     finish,
@@ -28,8 +29,10 @@ from dmcvb_gen.generate.executors import default_workers, run_works
 from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
 from dmcvb_gen.generate.paint import environment_diff
 from dmcvb_gen.generate.resolve import video_files
+from dmcvb_gen.generate.shipped import Shipped, record_digests
 from dmcvb_gen.generate.works import Work, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.spec import select
 from dmcvb_gen.storage.store import NotThere, Store, open_store
 
 
@@ -125,7 +128,7 @@ class Regeneration:
         works = self._works(release, is_here, "check")
         chosen = list(release.shards(release.select(self.only), self.episodes))
         left = sum(not shard.here for shard in chosen)
-        return Outcome(self._run(works, progress), environment_diff(release.store), left)
+        return Outcome(self.run(works, progress), environment_diff(release.store), left)
 
     def repair(self, progress: ProgressCallback = ignore) -> Outcome:
         """Put back damaged and missing files, in place; the others are not touched.
@@ -141,45 +144,29 @@ class Regeneration:
         faulty = self._faults(release)
         works = self._works(release, lambda layer, shard: (layer.name, shard) in faulty, "repair")
         restored += self._restore_inputs(release)
-        outcomes = self._run(works, progress)
+        outcomes = self.run(works, progress)
         if works:
             write_provenance(store, "regenerate")
         write_plain_metadata(Release.open(store))
         return Outcome(outcomes, environment_diff(store), restored=tuple(restored))
 
     def remake(self, out: str | Path, progress: ProgressCallback = ignore) -> Outcome:
-        """Write a new release from the recipes of this one; run again, it resumes.
-
-        Args:
-          out: folder or URL of the new release, which may have grown or been painted since.
-
-        Raises: see `check`; `out` holds another release.
-        """
-        release, store = Release.open(open_store(self.place)), open_store(out)
-        if release.place == store.place:
+        """Write a new release from the recipes of this one, see `remake`."""
+        store = open_store(self.place)
+        release = Release.open(store)
+        if store.place == open_store(out).place:
             raise StoreError(f"--out {out} is the release itself; remove --out to repair it in place")
-        check_makeable(release, release.select(self.only))
-        for recipe in release.recipes:
-            begin(store, recipe, self._input_files(release, recipe))
-        write_provenance(store, "regenerate")
-        target = Release.in_making(store)
-        works = works_of(target, self.only, self.episodes, backgrounds=self.backgrounds)
-        self._run(works, progress)
-        finish(store)
-        made = Release.in_making(store)
-        outcomes = []
-        for shard in release.shards(release.select(self.only), self.episodes):
-            record = made.records(shard.layer.name).get(shard.number)
-            found = LayerOutcome(shard.layer.name, shard.number, None, record == shard.record)
-            outcomes.append(_told(found, shard.layer))
-        return Outcome(tuple(outcomes), environment_diff(release.store))
+        known = Shipped(release.manifest, release.recipes, record_digests(release))  # type: ignore[arg-type]
+        made = remake(known, out, store, self, progress)
+        return dataclasses.replace(made, environment=environment_diff(store))
 
     def _works(self, release: Release, wanted, purpose) -> tuple[Work, ...]:
-        check_makeable(release, release.select(self.only))
+        check_makeable(release.manifest, release.select(self.only))
         return works_of(release, self.only, self.episodes, wanted, backgrounds=self.backgrounds, purpose=purpose)
 
-    def _run(self, works: Sequence[Work], progress: ProgressCallback) -> tuple[ShardOutcome, ...]:
-        found = []
+    def run(self, works: Sequence[Work], progress: ProgressCallback) -> tuple[ShardOutcome, ...]:
+        """Run works, and tell their outcomes."""
+        found: list[LayerOutcome] = []
         for result in run_works(works, self.workers or default_workers(works), progress):
             found += result.outcomes
         layers = {layer.name: layer for work in works for layer in work.layers}
@@ -188,7 +175,7 @@ class Regeneration:
 
     def _faults(self, release: Release) -> set[tuple[str, int]]:
         """(layer, shard) of those whose record or files are not as listed."""
-        asked, found = bool(self.only or self.episodes), set()
+        asked, found = bool(self.only or self.episodes), set[tuple[str, int]]()
         for shard in release.shards(release.select(self.only), self.episodes):
             if not asked and release.copy is not None and not _is_promised(release, shard.layer.name, shard.number):
                 continue
@@ -202,29 +189,70 @@ class Regeneration:
         broken = [file for file in release.manifest.inputs if wrong_bytes(release.store, file)]
         if not broken:
             return []
-        files = self._input_files(release, release.manifest)
+        files = input_files(release.store, release.manifest, self.backgrounds)
         for file in broken:
             put_back(release.store, file, files[file.path])
         return [file.path for file in broken]
 
-    def _input_files(self, release: Release, described: Resolved | object) -> dict[str, Path]:
-        """Path in the release -> file here, of all inputs of a recipe."""
-        root = local_inputs(release.store, described.inputs)  # type: ignore[attr-defined]
-        found: dict[str, Path] = {}
-        for record in described.subsets:  # type: ignore[attr-defined]
-            paths = policy_files(root, record)
-            found |= {p.path: Path(path) for p, path in zip(record.policies, paths, strict=True) if p.path}
-            found |= video_files(record.backgrounds, video_source(root, record, self.backgrounds))
-        for file in described.inputs:  # type: ignore[attr-defined]
-            if file.path not in found:
-                raise StoreError(f"{file.path} is neither in {release.place} nor given; give --backgrounds FOLDER")
-        return found
+
+def remake(
+    known: Shipped, out: str | Path, source: Store | None, how: Regeneration, progress: ProgressCallback = ignore
+) -> Outcome:
+    """Write a release from its recipes, and compare its records; run again, it resumes.
+
+    Args:
+      out: folder or URL of the new release, which may have grown or been painted since.
+      source: where copies of its policies and videos are, if not in the package.
+      how: which shards, and how.
+
+    Raises:
+      DmcvbError: the shards cannot be made here, or `out` holds another release.
+    """
+    store = open_store(out)
+    names = select([record.name for record in known.manifest.subsets], list(how.only))
+    check_makeable(known.manifest, names)
+    for recipe in known.recipes:
+        begin(store, recipe, input_files(source or store, recipe, how.backgrounds))
+    write_provenance(store, "regenerate")
+    target = Release.in_making(store)
+    works = works_of(target, names, how.episodes, backgrounds=how.backgrounds)
+    how.run(works, progress)
+    finish(store)
+    made, outcomes = Release.in_making(store), {}
+    for work in works_of(target, names, how.episodes, wanted=lambda layer, shard: True):
+        for layer in (layer for layer in work.layers if layer.name in known.records):
+            record, digests = made.records(layer.name).get(work.shard), known.records[layer.name]
+            if work.shard < len(digests):
+                equal = record is not None and sha256_bytes(canonical_json(record)) == digests[work.shard]
+                outcomes[layer.name, work.shard] = _told(LayerOutcome(layer.name, work.shard, None, equal), layer)
+    return Outcome(tuple(outcomes.values()), {})
 
 
-def check_makeable(release: Release, names: Iterable[str]) -> None:
+def input_files(store: Store, described: Resolved | Manifest, backgrounds: str | None) -> dict[str, Path]:
+    """Path in the release -> file here, of all policies and videos that a recipe or manifest names.
+
+    Args:
+      backgrounds: folder of the videos, if not the release's own copies.
+
+    Raises:
+      StoreError: one is neither at the store nor in the package.
+    """
+    root = local_inputs(store, described.inputs)
+    found: dict[str, Path] = {}
+    for record in described.subsets:
+        paths = policy_files(root, record)
+        found |= {policy.path: Path(path) for policy, path in zip(record.policies, paths, strict=True) if policy.path}
+        found |= video_files(record.backgrounds, video_source(root, record, backgrounds))
+    for file in described.inputs:
+        if file.path not in found:
+            raise StoreError(f"{file.path} is neither in {store.place} nor given; give --backgrounds FOLDER")
+    return found
+
+
+def check_makeable(described: Resolved | Manifest, names: Iterable[str]) -> None:
     """Raises StoreError for subsets whose shards cannot be made from the manifest."""
     chosen = set(names)
-    for record in release.manifest.subsets:
+    for record in described.subsets:
         if record.name in chosen and record.imported:
             raise StoreError(
                 f"{record.name} was imported, so there is nothing to make it from; import it again, or choose other "

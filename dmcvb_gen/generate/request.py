@@ -159,6 +159,6 @@ def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[s
             raise RecipeError(f"{tasks[0]} has no distractor {strange[0]}: mazes vary in style; ask for --goal visible")
         raise RecipeError(f"{tasks[0]} has no goal {strange[0]}; --goal is for mazes, ask for --distractor")
     name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))[:80].rstrip("-.")
-    pattern = {"tasks": list(tasks), "levels": list(levels)}
+    pattern: dict[str, Any] = {"tasks": list(tasks), "levels": list(levels)}
     pattern |= {"settings": list(settings) or [VISIBLE if True in mazes else "none"], "episodes": EPISODES}
     return make_recipe({"name": name, "subsets": [pattern]}, "command line")

@@ -225,7 +225,7 @@ def modality_layers(record: SubsetRecord, labels: Layer, modalities: Iterable[st
     """The layers of modalities of a subset's images: "depth", or "depth/<view>" if its task has several views."""
     for modality in map(get_modality, modalities):
         dims = ("direction",)[: len(modality.shape)]
-        makes = {"of": labels.key, "renderer": record.renderer}
+        makes: dict[str, Any] = {"of": labels.key, "renderer": record.renderer}
         makes |= {"modality": modality.name, "hidden_goal": record.hidden_goal}
         for name in view_arrays(modality.name, record.views):
             facts: dict[str, Any] = dict(dtype=modality.dtype, shape=modality.shape, dims=dims)
