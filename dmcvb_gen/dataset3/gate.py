@@ -136,7 +136,7 @@ class Release:
                 f"{store.place} is release {found}, not {digest}: do not use it for the one that you meant"
             )
         manifest = parse(Manifest, text, f"{store.place}/{MANIFEST}")
-        copy = cls._read_copy(store)
+        copy = cls.read_copy(store)
         if copy is not None and copy.manifest != found:
             raise StoreError(
                 f"{store.place} is a copy of release {copy.manifest[:12]}, its manifest is {found[:12]}; fetch again"
@@ -168,7 +168,8 @@ class Release:
         return cls(store, wanted, None, False, None)
 
     @staticmethod
-    def _read_copy(store: Store) -> Copy | None:
+    def read_copy(store: Store) -> Copy | None:
+        """What a place is a copy of; None if it is none."""
         try:
             return parse(Copy, store.read(COPY, COPY_BYTES), f"{store.place}/{COPY}")
         except NotThere:
@@ -238,8 +239,15 @@ class Release:
             if self.copy is None:
                 self._here[layer] = frozenset(self.records(layer))
             else:
-                self._here[layer] = recorded_shards(self.store, layer)
+                self._here[layer] = self._copied(layer)
         return self._here[layer]
+
+    def _copied(self, layer: str) -> Collection[int]:
+        try:
+            return recorded_shards(self.store, layer)
+        except StoreError:  # a web server gives no lists
+            runs = self.copy.promised.get(layer, ()) if self.copy else ()
+            return frozenset(number for first, last in runs for number in range(first, last))
 
     def shards(
         self, names: Collection[str] = (), episodes: tuple[int, int] | None = None, images: bool = True

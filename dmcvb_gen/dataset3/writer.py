@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset3.environment import environment
-from dmcvb_gen.dataset3.gate import READERS, Release, read_recipes, read_records
+from dmcvb_gen.dataset3.gate import READERS, Release, Shard, read_recipes, read_records
 from dmcvb_gen.dataset3.manifest import (
     COPY,
     MANIFEST,
@@ -356,6 +356,20 @@ def finish_copy(store: Store, manifest_text: bytes, source: str, promised: Mappi
     release = Release.open(store)
     write_plain_metadata(release)
     return release
+
+
+def copy_of(release: Release, shards: Iterable[Shard]) -> Release:
+    """The release as a copy that promises these shards alone; the release itself if they are all."""
+    promised: dict[str, set[int]] = {}
+    for shard in shards:
+        promised.setdefault(shard.layer.name, set()).add(shard.number)
+    if release.digest is None or all({*release.records(name)} <= promised.get(name, set()) for name in release.layers):
+        return release
+    runs = {name: _runs(promised[name]) for name in sorted(promised)}
+    copy = Copy(manifest=release.digest, source=f"{release.manifest.name} {release.manifest.version}", promised=runs)
+    part = Release(release.store, release.manifest, release.digest, release.compared, copy)
+    part._here |= {name: frozenset(promised.get(name, ())) for name in release.layers}
+    return part
 
 
 def _runs(numbers: Collection[int]) -> tuple[tuple[int, int], ...]:

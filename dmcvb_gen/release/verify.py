@@ -1,42 +1,47 @@
-"""Check that a release is what it says: bytes, shapes, values, physics, pixels and returns.
+"""Check that a release is what its manifest says: bytes of every file, then values, physics and images.
 
-Every finding names subset, episode and step. Digests and values are checked everywhere; a sample of steps is
-simulated again and a sample of frames painted again.
+The manifest names lists, lists name files; each is compared with its SHA-256 where it lies, in a folder or at a URL. In
+a folder, values are checked everywhere, a sample of steps is simulated and a sample of frames rendered.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from dmcvb_gen.dataset import Subset, open_release
-from dmcvb_gen.dataset.index import INDEX, Index, is_card, read_index, root_digest
-from dmcvb_gen.dataset.manifest import (
+import numpy as np
+
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import (
+    COPY,
+    LAYERS,
     MANIFEST,
-    CommitRecord,
+    MANIFESTS,
+    PROVENANCE,
+    RECIPES,
+    RECORDS,
     FileRecord,
-    Manifest,
-    SubsetRecord,
-    checked_commit,
-    commit_path,
-    parse_manifest,
-    shard_count,
-    subset_path,
+    is_attachment,
 )
-from dmcvb_gen.dataset.shards import wrong_bytes
-from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset3.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
-from dmcvb_gen.files import sha256_file
+from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.release.issue import NOT_PART, UNCHECKED, Issue
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.release.tree import Listed, described_files, layer_files, list_files
 
-SHARDS = 8
-"""Shards whose bytes are checked as one piece of work."""
+SAMPLE_FILES = 40
+"""Files of a URL that are read if not all are asked for; spread evenly over the release."""
+THREADS = 8
+"""Files whose bytes are read at a time."""
 PREVIEWS = "preview/"
-"""Folder that `dmcvb-gen preview` writes to; no part of a release."""
+"""Folder that `preview` and `view` write to; no part of a release."""
+KNOWN = (RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE, PREVIEWS)
 
 log = logging.getLogger(__name__)
 
@@ -46,20 +51,18 @@ class Verification:
     """Result of a verification: what was checked, and the issues.
 
     Attributes:
-      checked: number of subsets, episodes and steps.
+      checked: number of subsets, episodes, steps and files.
       findings: faults that were found.
       incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
-      digest: the release's root digest, None while it is made (and of version 1).
-      finished: True if its digests were written once everything was there.
-      unchecked: what could not be looked at on this machine, and why; nothing is known to be damaged there.
+      digest: the release's digest; None while it is made.
+      compared: whether the digest was compared with one from outside.
     """
 
     checked: dict[str, int]
     findings: tuple[Issue, ...]
     incomplete: dict[str, tuple[int, int]] = field(default_factory=dict)
     digest: str | None = None
-    finished: bool = True
-    unchecked: tuple[Issue, ...] = ()
+    compared: bool = False
 
     @property
     def sound(self) -> bool:
@@ -67,193 +70,176 @@ class Verification:
         return not self.findings
 
     @property
+    def finished(self) -> bool:
+        """True if the release has a manifest."""
+        return self.digest is not None
+
+    @property
     def complete(self) -> bool:
         """True if everything that belongs to the release is here, and was checked."""
         return self.finished and not self.incomplete and not self.unchecked
 
 
-# -- bytes ----------------------------------------------------------------------------------------
-
-
-def check_files(root: Path, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> Iterator[Issue]:
-    """Every file of a local release has its digest and every shard of a complete one is there; see `dataset.index`.
-
-    Args:
-      workers: processes, a Ray cluster that sees the folder, or an open pool.
-      tick: told the subset's name for each few shards; expects one more for each subset, whose values may follow.
-    """
-    try:
-        with storage_errors(root / MANIFEST):
-            manifest = parse_manifest((root / MANIFEST).read_bytes(), MANIFEST)
-    except StoreError as error:
-        yield Issue("files", MANIFEST, f"is damaged: {error}")
-        return
-    try:
-        index = read_index(root)
-    except StoreError as error:
-        yield Issue("files", INDEX, f"is damaged: {error}")
-        index = None
-    else:
-        if index is None and manifest.digest is not None:
-            yield Issue("files", INDEX, "is missing; `dmcvb-gen regenerate` writes it again")
-    works, checked = _works(root, manifest), set()
-    expect(tick, len(works) + len(manifest.subsets))
-    found = in_order(_check_shards, works, workers, tick)
-    for record in manifest.subsets:
-        commits: dict[int, CommitRecord] = {}
-        for work, part in zip(works, found, strict=True):
-            if work.record is record:
-                yield from part.findings
-                checked |= set(part.files)
-                commits |= part.commits
-        yield from _check_digest(record, commits)
-    if index is not None:
-        yield from _check_index(root, manifest, index, checked)
-        if manifest.complete:
-            yield from _check_extra(root, manifest, index)
-
-
-def _check_index(root: Path, manifest: Manifest, index: Index, checked: set[str]) -> Iterator[Issue]:
-    for file in index.files:
-        if file.path not in checked:
-            yield from _check_file(root, file, subset_of(manifest, file.path))
-    if sha256_file(root / MANIFEST) != index.manifest_sha256:
-        yield Issue("files", MANIFEST, f"does not have the digest that {INDEX} says")
-    elif manifest.digest is not None and root_digest(index.files, manifest) != manifest.digest:
-        yield Issue("files", MANIFEST, f"its root digest does not fit the files in {INDEX}")
-
-
-def _check_extra(root: Path, manifest: Manifest, index: Index) -> Iterator[Issue]:
-    """Files of a finished release that no digest speaks of, and that readers may yet take for data."""
-    listed = {file.path for file in index.files} | {MANIFEST, INDEX}
-    with storage_errors(root):
-        for path in sorted(root.rglob("*")):
-            name = path.relative_to(root).as_posix()
-            ours = name.startswith(PREVIEWS) or any(part.startswith(".") for part in name.split("/"))
-            if not ours and name not in listed and path.is_file():
-                place = subset_of(manifest, name)
-                told = NOT_PART if place == name else f"{name} {NOT_PART}"
-                cure = "run `dmcvb-gen card` again" if is_card(name) else "move it elsewhere"
-                yield Issue("files", place, f"{told}; {cure}")
-
-
-def subset_of(manifest: Manifest, path: str) -> str:
-    """The subset that a file belongs to; the file itself if it belongs to none."""
-    for record in manifest.subsets:
-        if path.startswith((f"{subset_path(record.name)}/", f"commits/{record.name}/")):
-            return record.name
-    return path
-
-
-def _check_file(root: Path, file: FileRecord, where: str, what: str = "") -> Iterator[Issue]:
-    if wrong := wrong_bytes(root, file):
-        yield Issue("files", where, wrong if where == file.path else f"{file.path}{what} {wrong}")
-
-
-@dataclass(frozen=True)
-class _Shards:
-    """Some shards of a subset, whose bytes are to be checked; travels to a worker."""
-
-    root: Path
-    record: SubsetRecord
-    shards: range
-    wanted: bool
-    """Whether each must be there."""
-
-
-@dataclass(frozen=True)
-class _Checked:
-    """Result of checking some shards' bytes: issues, files that were checked, and readable records."""
-
-    findings: tuple[Issue, ...]
-    files: tuple[str, ...]
-    commits: Mapping[int, CommitRecord]
-
-
-def _works(root: Path, manifest: Manifest) -> list[_Shards]:
-    return [
-        _Shards(root, record, range(first, min(first + SHARDS, shard_count(record))), manifest.complete)
-        for record in manifest.subsets
-        for first in range(0, shard_count(record), SHARDS)
-    ]
-
-
-def _check_shards(work: _Shards, tick: ProgressCallback = ignore) -> _Checked:
-    """Commit records and their files."""
-    root, record, commits, checked, findings = work.root, work.record, {}, [], []
-    tick(record.name)
-    for shard in work.shards:
-        path = commit_path(record.name, shard)
-        if not (root / path).is_file():
-            if work.wanted:
-                findings.append(Issue("files", record.name, f"shard {shard} is missing: no {path}"))
-            continue
-        try:
-            with storage_errors(root / path):
-                commit = commits[shard] = checked_commit((root / path).read_bytes(), path, record, shard)
-        except StoreError as error:
-            findings.append(Issue("files", record.name, f"{path} is damaged: {error}"))
-            continue
-        for file in commit.files:
-            checked.append(file.path)
-            findings += _check_file(root, file, record.name, f" of shard {shard}")
-    return _Checked(tuple(findings), tuple(checked), commits)
-
-
-def _check_digest(record: SubsetRecord, commits: Mapping[int, CommitRecord]) -> Iterator[Issue]:
-    if record.digest and len(commits) == shard_count(record) and subset_digest(commits) != record.digest:
-        yield Issue("files", record.name, "its commit records do not give the digest of the manifest")
-
-
 def verify(
-    path: str | Path,
+    place: str | Path,
     backgrounds: str | None = None,
     tick: ProgressCallback = ignore,
     workers: Workers | Pool = 1,
     names: Collection[str] | None = None,
 ) -> Verification:
-    """Check a release.
+    """Check a release in a folder.
 
     Args:
-      backgrounds: present place of the manifest's videos, if they moved.
-      names: the subsets whose values are looked at; all by default. Bytes are checked everywhere.
-      tick: told the subset's name for each few shards whose bytes, and each subset whose values, are looked at.
-      workers: processes, a Ray cluster that sees the folder, or an open pool (whose tick is told): bytes are checked a
-        few shards at a time, values a subset.
+      backgrounds: present folder of the release's videos, if they moved.
+      names: subsets whose values are checked; all by default. Bytes are checked everywhere.
+      tick: told the place of each file whose bytes, and each subset whose values are checked.
+      workers: processes, a Ray cluster that sees the folder, or an open pool, for the values.
 
     Raises:
-      DmcvbError: there is no release, or nothing is committed.
+      DmcvbError: there is no release, or it has no shards yet.
     """
-    root = Path(path)
-    with storage_errors(root / MANIFEST):
-        there = (root / MANIFEST).is_file()
-    if not there:
-        open_release(path)  # says what is the matter
     if not isinstance(workers, Pool):
-        with open_pool(workers, tick=tick) as pool:  # one for bytes and values: its workers are slow to start
-            return verify(path, backgrounds, tick, pool, names)
-    findings = list(check_files(root, workers, tick))
+        with open_pool(workers, tick=tick) as pool:
+            return verify(place, backgrounds, tick, pool, names)
+    release = Release.open(place)
+    files, findings = _expected(release)
+    expect(tick, len(files) + len(release.manifest.subsets))
+    findings += [*_wrong(release, files, tick), *_strange(release, files)]
     damaged = {finding.subset for finding in findings}
-    counts = {"subsets": 0, "episodes": 0, "steps": 0}
-    if damaged & {MANIFEST, INDEX}:
-        return Verification(counts, tuple(findings))  # nothing says what the rest should be
-    release = open_release(path, skip=damaged)
-    if not release.subsets and not findings:
-        raise DmcvbError(f"{path} has no committed episodes yet; run the rollout first")
-    chosen = [subset for name, subset in release.subsets.items() if names is None or name in names]
-    for subset in chosen:
-        counts["subsets"] += 1
-        counts["episodes"] += len(subset.episodes)
-        counts["steps"] += subset.steps
-    works = [(subset, release.manifest, backgrounds) for subset in chosen]
-    for found in in_order(_check_subset, works, workers, tick):
+    sound = {
+        record.name: Subset(release, record) for record in release.manifest.subsets if not damaged & {*record.layers}
+    }
+    chosen = [subset for name, subset in sound.items() if len(subset) and (names is None or name in names)]
+    if not chosen and not findings:
+        raise DmcvbError(f"{place} has no episodes yet; run the rollout first")
+    for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
         findings += found
-    incomplete = {name: count for name, count in release.shortfalls.items() if name not in damaged}
-    manifest = release.manifest
-    finished = manifest.complete and (manifest.digest is not None or manifest.schema_version == 1)
-    unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
-    faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
-    return Verification(counts, faults, incomplete, release.manifest.digest, finished, unchecked)
+    return _verification(release, chosen, findings, len(files), sound)
+
+
+def verify_url(
+    url: str,
+    options: dict[str, Any] | None = None,
+    everything: bool = False,
+    tick: ProgressCallback = ignore,
+    workers: int = THREADS,
+) -> Verification:
+    """Check the bytes of a release at a URL; nothing is stored on this machine.
+
+    Args:
+      url: its URL, or "<URL>@sha256:<digest>".
+      options: options of the storage client.
+      everything: read all files. A sample is read otherwise, and of the other files the size is compared.
+      tick: told the place of each file.
+      workers: files at a time.
+
+    Raises:
+      StoreError: no release is there, or it cannot be read.
+    """
+    release = Release.open(url, options)
+    files, findings = _expected(release)
+    sample = files
+    if not everything:
+        places = np.unique(np.linspace(0, len(files) - 1, min(SAMPLE_FILES, len(files))).round().astype(int))
+        sample = [files[place] for place in places]
+    expect(tick, len(sample))
+    findings += _wrong(release, sample, tick, workers)
+    if not everything:
+        findings += _wrong_sizes(release, [file for file in files if file not in sample])
+    damaged = {finding.subset for finding in findings}
+    sound = {
+        record.name: Subset(release, record) for record in release.manifest.subsets if not damaged & {*record.layers}
+    }
+    return _verification(release, [each for each in sound.values() if len(each)], findings, len(sample), sound)
+
+
+def _verification(
+    release: Release, chosen: Sequence[Subset], findings: list[Issue], files: int, sound: dict[str, Subset]
+) -> Verification:
+    counts = {"subsets": len(chosen), "episodes": 0, "steps": 0, "files": files}
+    for subset in chosen:
+        counts["episodes"] += len(subset)
+        counts["steps"] += subset.steps
+    incomplete = {
+        name: (len(subset), subset.record.episodes)
+        for name, subset in sound.items()
+        if len(subset) < subset.record.episodes
+    }
+    return Verification(counts, tuple(findings), incomplete, release.digest, release.compared)
+
+
+# -- bytes ----------------------------------------------------------------------------------------
+
+
+def check_files(place: str | Path) -> list[Issue]:
+    """What is wrong with the bytes of a release's files, and files that belong to no release."""
+    release = Release.open(place)
+    files, findings = _expected(release)
+    return [*findings, *_wrong(release, files), *_strange(release, files)]
+
+
+def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
+    """All files that must be here, and issues of what should name them."""
+    files: list[Listed] = []
+    findings: list[Issue] = []
+    used: set[str] = set()  # layers of which shards are here
+    for name in release.layers:
+        try:
+            files += layer_files(release, name)
+            used |= {name} if release.here(name) else set()
+        except StoreError as error:
+            findings.append(Issue("files", name, str(error)))
+    here = {name for name, layer in release.layers.items() if name in used or layer.kind == "images"}
+    names = [record.name for record in release.manifest.subsets if {*record.layers} <= here]
+    try:
+        files += [Listed(file.path, file) for file in described_files(release, names)]
+    except StoreError as error:
+        findings.append(Issue("files", RECIPES, str(error)))
+    if not release.in_the_making and not findings:
+        files += [Listed(file.path, file) for file in list_files(release, used)]
+        for path, text in plain_metadata(release).items():
+            files.append(Listed(path, FileRecord(path=path, bytes=len(text), sha256=sha256_bytes(text))))
+    return files, findings
+
+
+def _wrong(
+    release: Release, files: Sequence[Listed], tick: ProgressCallback = ignore, workers: int = THREADS
+) -> list[Issue]:
+    """Issues of files that are not as recorded, in their order."""
+
+    def look(listed: Listed) -> str | None:
+        tick(listed.place)
+        return wrong_bytes(release.store, listed.file)
+
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        looked = zip(files, pool.map(look, files), strict=True)
+        return [Issue("files", one.place, _told(one, wrong)) for one, wrong in looked if wrong]
+
+
+def _told(listed: Listed, wrong: str) -> str:
+    return wrong if listed.place == listed.file.path else f"{listed.file.path} {wrong}"
+
+
+def _wrong_sizes(release: Release, files: Sequence[Listed]) -> list[Issue]:
+    """Issues of files that are missing or have another size, as far as the place can be listed."""
+    try:
+        sizes = release.store.list()
+    except StoreError:
+        return []  # a sample was read
+    text = "is missing or has another size"
+    return [Issue("files", one.place, _told(one, text)) for one in files if sizes.get(one.file.path) != one.file.bytes]
+
+
+def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
+    """Files that belong to no release."""
+    known = {listed.file.path for listed in files} | {MANIFEST, COPY}
+    folders = (*KNOWN, *(f"{layer.group}/" for layer in release.layers.values()))
+    for path in release.store.list():
+        if path not in known and not path.startswith(folders) and not is_attachment(path):
+            yield Issue("files", path, f"{NOT_PART}; move it elsewhere")
+
+
+# -- values ---------------------------------------------------------------------------------------
 
 
 def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallback) -> list[Issue]:
@@ -265,7 +251,7 @@ def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallb
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
     except ModuleNotFoundError as error:
-        # Whoever only reads has no simulator; bytes are checked all the same, and this says what was not.
+        # Fetch-only installs have no simulator; bytes are checked all the same, and this says what was not.
         log.warning("values, physics and images of %s were not checked: %s is not installed", subset.name, error.name)
         return []
     try:
