@@ -1,4 +1,4 @@
-"""Write and check a release's card: README.md, croissant.json, pictures and a table of episodes.
+"""Write and check a release's card: README.md, croissant.json, pictures and a table of episodes; attachments all.
 
 Everything in a card comes from the manifest and the data. `check_card` writes another one and compares the files.
 """
@@ -18,33 +18,40 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from dmcvb_gen.dataset import Release, open_release
-from dmcvb_gen.dataset.index import CARD_FOLDER, take_in_card
-from dmcvb_gen.dataset.manifest import Manifest
-from dmcvb_gen.dataset.schema import stored_name
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import CARD_FOLDER, Manifest, Resolved
+from dmcvb_gen.dataset3.writer import read_provenance
 from dmcvb_gen.distractors import background, camera, color, cue, light, shake
 from dmcvb_gen.distractors.base import KINDS, DistractorSetting
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import folder_in_the_making, remove_partial, replacing, write_text
 from dmcvb_gen.generate.info import describe_release
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.policies.header import OWN_CODE, origin_of
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.release.croissant import HOME, Publication, croissant, page_of
+from dmcvb_gen.release.croissant import (
+    HOME,
+    Publication,
+    croissant,
+    derived_from,
+    generator,
+    groups,
+    is_imported,
+    page_of,
+)
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_rows, write_table
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
 from dmcvb_gen.release.templates import fill
 from dmcvb_gen.spec import CUE, FIXED, LIGHT, SHAKE
 from dmcvb_gen.storage.remote import local_path
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.text import pluralize
 
-README, CROISSANT, CHANGELOG = "README.md", "croissant.json", "CHANGELOG.md"
-PLOT, SHEET = f"{CARD_FOLDER}/returns.png", f"{CARD_FOLDER}/contact_sheet.png"
-STATES = f"{CARD_FOLDER}/states.json"
+README, CROISSANT = "README.md", "croissant.json"
+PLOT, SHEET = f"{CARD_FOLDER}returns.png", f"{CARD_FOLDER}contact_sheet.png"
+STATES = f"{CARD_FOLDER}states.json"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Hugging Face's size categories, counted in steps."""
 FEW_RETURNS = 20
@@ -60,7 +67,7 @@ CITATION = """@inproceedings{ortiz2024dmcvb,
 
 
 def write_card(root: str | Path, out: str | Path | None = None, url: str | None = None) -> list[Path]:
-    """Write README.md, croissant.json, pictures and the table of episodes; CHANGELOG.md gets the versions it lacks.
+    """Write README.md, croissant.json, pictures and the table of episodes.
 
     Args:
       out: folder of these files; the release by default.
@@ -69,24 +76,14 @@ def write_card(root: str | Path, out: str | Path | None = None, url: str | None 
     Raises:
       StoreError: there is no release, it has no episodes, or the folder cannot be written or has another README.md.
     """
-    target = local_path(out) if out else None
     release = _open(root)
-    folder = target or release.path
-    own = folder.resolve() == release.path.resolve()
-    try:
-        if not own:
-            _refuse_another_readme(folder)
-        (folder / CARD_FOLDER).mkdir(parents=True, exist_ok=True)
-        for place in (folder, folder / CARD_FOLDER):
-            remove_partial(place, below=False)  # left by a killed writer
-        with folder_in_the_making(folder, CARD_FOLDER) as made:  # so that a failure leaves no half of a card
-            names = _write_files(release, made, folder, _published(folder, release.manifest, url))
-            for name in names:
-                (made / name).replace(folder / name)
-    except OSError as error:
-        raise StoreError(f"cannot write the card to {folder}: {error.strerror or error}; give --out") from None
-    if own:
-        take_in_card(folder)
+    folder = local_path(out) if out else release.path
+    _refuse_another_readme(folder)
+    store = open_store(folder)
+    with tempfile.TemporaryDirectory() as scratch:  # so that a failure leaves no half of a card
+        names = _write_files(release, Path(scratch), folder, _published(folder, release.manifest, url))
+        for name in names:
+            store.replace(name, (Path(scratch) / name).read_bytes())
     return [folder / name for name in names]
 
 
@@ -100,7 +97,7 @@ def _refuse_another_readme(folder: Path) -> None:
 def _write_files(
     release: Release, made: Path, folder: Path, published: Publication, keep_table: bool = False
 ) -> list[str]:
-    """Write a card's files below `made`; the changelog goes on from that in `folder`.
+    """Write a card's files below `made`.
 
     Args:
       keep_table: take the table of `folder` if it has the same rows: other versions of pyarrow pack them differently.
@@ -109,42 +106,18 @@ def _write_files(
       The files' names.
     """
     (made / CARD_FOLDER).mkdir()
-    with replacing(made / TABLE) as part:
-        write_table(release, part)
+    write_table(release, made / TABLE)
     if keep_table and table_rows(folder / TABLE) == table_rows(made / TABLE):
         shutil.copyfile(folder / TABLE, made / TABLE)
     texts = _texts(release, made / TABLE, published)
-    texts[CHANGELOG] = _changelog(release.manifest, folder / CHANGELOG)
     for name, text in texts.items():
-        write_text(made / name, text)
-    with replacing(made / PLOT) as part:
-        plot_returns(release, part)
-    with replacing(made / SHEET) as part:
-        Image.fromarray(_sheet(release)).save(part, "PNG")
+        (made / name).write_text(text)
+    plot_returns(release, made / PLOT)
+    Image.fromarray(_sheet(release)).save(made / SHEET, "PNG")
     return [*texts, PLOT, SHEET, TABLE]
 
 
-def _changelog(manifest: Manifest, path: Path) -> str:
-    """The text of CHANGELOG.md, the newest version first: what is there, and what each version added that it lacks."""
-    first = manifest.recipe.get("version", manifest.version) if manifest.additions else manifest.version
-    versions = [(first, ["First release."])]
-    for entry in manifest.additions:
-        counts = {name: pluralize(end - start, "episodes") for name, (start, end) in entry.subsets.items()}
-        more = {name: "more episodes" if start else "a new subset" for name, (start, _) in entry.subsets.items()}
-        versions.append((entry.version, [f"`{name}`: {more[name]}, {count}." for name, count in counts.items()]))
-    there = path.read_text(errors="replace") if path.is_file() else f"# Changelog of {manifest.name}\n"
-    parts = [
-        f"## {version}\n\n" + "".join(f"- {line}\n" for line in lines)
-        for version, lines in versions[::-1]
-        if f"## {version}\n" not in there
-    ]
-    if not parts:
-        return there
-    head, mark, older = there.partition("\n## ")
-    return "\n".join([head.rstrip("\n") + "\n", *parts, *([f"## {older}"] if mark else [])])
-
-
-def _published(folder: Path, manifest: Manifest, url: str | None = None) -> Publication:
+def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> Publication:
     """Place and day of publication: the given one, else those of the existing card of this version, else today."""
     try:
         known = json.loads((folder / CROISSANT).read_text())
@@ -159,8 +132,8 @@ def _published(folder: Path, manifest: Manifest, url: str | None = None) -> Publ
 def check_card(root: str | Path) -> list[str]:
     """List the files of a release's card that are missing or do not fit its data; empty if the card is right.
 
-    If only a part of the release was fetched, the card describes the whole release, and only the rows of the part are
-    compared (see `left_unchecked`).
+    The card of a copy describes the whole release, so only the rows of the episodes that are here are compared (see
+    `left_unchecked`).
 
     Raises:
       StoreError: there is no release, or it has no episodes.
@@ -170,7 +143,7 @@ def check_card(root: str | Path) -> list[str]:
     with tempfile.TemporaryDirectory() as scratch:
         made = Path(scratch)
         names = _write_files(release, made, folder, _published(folder, release.manifest), keep_table=True)
-        if _is_of_the_whole(release):
+        if release.copy:
             fits = table_rows(made / TABLE) <= table_rows(folder / TABLE)
             return [] if fits else [f"{TABLE} does not fit the episodes that are here"]
         return [
@@ -182,19 +155,8 @@ def check_card(root: str | Path) -> list[str]:
 
 def left_unchecked(root: str | Path) -> int:
     """Number of episodes in the card that are not here, because only a part of the release was fetched."""
-    release = open_release(root)
-    return sum(planned - here for here, planned in release.shortfalls.values()) if _is_of_the_whole(release) else 0
-
-
-def _is_of_the_whole(release: Release) -> bool:
-    """Return True if only a part of the release was fetched, with the card of the whole."""
-    try:
-        text = (release.path / README).read_text(errors="replace")
-    except OSError:
-        return False
-    parts = () if release.manifest.complete else release.manifest.lineage
-    digests = {entry.get("digest") for entry in parts if entry["kind"] == "fetch"} - {None}
-    return any(f"# digest {digest}" in text for digest in digests)
+    release = Release.open(root)
+    return sum(planned - here for here, planned in release.shortfalls.values()) if release.copy else 0
 
 
 def _same(path: Path, made: Path) -> bool:
@@ -211,15 +173,15 @@ def _same(path: Path, made: Path) -> bool:
 
 
 def _open(root) -> Release:
-    release = open_release(root)
+    release = Release.open(root)
     if not release.subsets:
-        raise StoreError(f"{root} has no committed episodes yet; run the rollout first")
+        raise StoreError(f"{root} has no episodes yet; run the rollout first")
     return release
 
 
 def _texts(release: Release, table: Path, published: Publication) -> dict[str, str]:
     facts = describe_release(release.path)
-    summary = _summary(release.manifest, facts)
+    summary = _summary(release, facts)
     limits = _limits(release)
     metadata = croissant(release, facts, summary, CITATION, limits, table, published)
     text = card_text(release, facts, summary, limits, header_facts(table))
@@ -235,23 +197,24 @@ def _sheet(release: Release) -> np.ndarray:
 # -- text -----------------------------------------------------------------------------------------
 
 
-def _summary(manifest: Manifest, facts: dict[str, Any]) -> str:
+def _summary(release: Release, facts: dict[str, Any]) -> str:
+    manifest = release.manifest
     tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
     held = "pixels and states"
-    if not manifest.imported:
+    if not is_imported(release):
         held = "pixels, states, full physics states and the labels of every visual distractor"
-    if not any(record.pixels for record in manifest.subsets):
+    if not any(subset["images"] for subset in facts["subsets"]):
         held = "states, full physics states and the labels of every visual distractor, from which `dmcvb-gen paint` "
         held += "makes the pictures"
     text = (
-        f"{manifest.recipe.get('description', '')} Offline-RL episodes of {tasks} with {held}: "
+        f"{manifest.description} Offline-RL episodes of {tasks} with {held}: "
         f"{pluralize(len(facts['subsets']), 'subsets')}, "
         f"{pluralize(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
     )
     return text.strip()
 
 
-def header(manifest: Manifest, steps: int, table: dict[str, Any]) -> str:
+def header(manifest: Manifest | Resolved, steps: int, table: dict[str, Any]) -> str:
     """The YAML header that the Hugging Face Hub reads.
 
     Args:
@@ -276,6 +239,8 @@ def card_text(
     text = fill(
         "card.md.jinja",
         manifest=manifest,
+        digest=release.digest,
+        imported=is_imported(release),
         facts=facts,
         summary=summary,
         limits=limits,
@@ -290,9 +255,10 @@ def card_text(
         level_episodes=STATISTICS_EPISODES,
         distractors=_distractors(manifest),
         has_mazes=any(record.goal_mode is not None for record in manifest.subsets),
-        making=_making(manifest),
+        making=_making(release),
         policies=_policies(manifest),
         first=next(iter(release.subsets)),
+        group=groups(release)[0],
         sheet=SHEET,
         plot=PLOT,
         states=STATES,
@@ -308,7 +274,7 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
     for name, subset in release.subsets.items():
         arrays = [(array, subset.array(array)) for array in subset.arrays]
         rows = tuple(
-            (stored_name(n), str(a.dtype), " x ".join(a.dimensions), " x ".join(map(str, a.shape[1:])))
+            (subset.spec(n).stored_name, str(a.dtype), " x ".join(a.dimensions), " x ".join(map(str, a.shape[1:])))
             for n, a in arrays
         )
         kinds.setdefault(rows, []).append(name)
@@ -341,7 +307,7 @@ def _of_other_length(subsets: Sequence[Mapping[str, Any]]) -> str:
     return "" if not count else "all subsets" if count == len(subsets) else pluralize(count, "subsets")
 
 
-def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
+def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, ...]]:
     """Rows (setting, scale, camera, colors, background) of the table of distractors; none for mazes alone."""
     settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
@@ -380,28 +346,26 @@ def _distractors(manifest: Manifest) -> list[tuple[str, ...]]:
     return rows
 
 
-def _making(manifest: Manifest) -> list[str]:
-    records = manifest.subsets
-    if manifest.imported:
-        lines = [f"Imported by {manifest.generator}; nothing was simulated or painted again."]
+def _making(release: Release) -> list[str]:
+    records, made_by = release.manifest.subsets, generator(release)
+    if is_imported(release):
+        lines = [f"Imported by {made_by}; nothing was simulated or rendered again."]
     else:
-        seeds = sorted({str(manifest.recipe_of(record.name).get("seed")) for record in records})
-        lines = [f"Made by {manifest.generator} from the recipe in `manifest.json` (seed {', '.join(seeds)})."]
-        painted = sorted({f"{r.renderer.get('name')} ({r.renderer.get('samples')} samples a pixel)" for r in records})
-        lines.append(f"Renderer: {', '.join(painted)}.")
+        seeds = sorted({str(layer.makes["seed"]) for layer in release.layers.values() if "seed" in layer.makes})
+        lines = [f"Made by {made_by} from the recipe in `recipes/` (seed {', '.join(seeds)})."]
+        used = sorted({f"{r.renderer.get('name')} ({r.renderer.get('samples')} samples a pixel)" for r in records})
+        lines.append(f"Renderer: {', '.join(used)}.")
     videos = sorted({f"`{r.backgrounds['digest'][:12]}` ({r.backgrounds['split']})" for r in records if r.backgrounds})
     if videos:
         lines.append(f"Background videos: digest {', '.join(videos)}.")
-    for number, made in enumerate(manifest.environments):
-        names = ("system", "cpu", "python", "mujoco", "torch", "zarr")
-        where = ", ".join(f"{name} {made[name]}" for name in names if name in made)
-        lines.append(f"Environment {number + 1}: {where}.")
-    for entry in manifest.lineage:
-        lines.append(f"Derived: {entry.get('kind')} from {entry.get('from')}.")
-    return lines
+    names = ("system", "cpu", "python", "mujoco", "torch", "zarr")
+    environments = [note["environment"] for note in read_provenance(release.store)]
+    said = [", ".join(f"{name} {made[name]}" for name in names if name in made) for made in environments]
+    lines += [f"Environment {number}: {where}." for number, where in enumerate(dict.fromkeys(said), 1)]
+    return [*lines, *(f"Derived: {source}." for source in derived_from(release))]
 
 
-def _policies(manifest: Manifest) -> list[tuple[str, str, str]]:
+def _policies(manifest: Manifest | Resolved) -> list[tuple[str, str, str]]:
     """Rows (task, level, policies) of the table of behaviour policies."""
     rows = []
     for record in {(r.task, r.level): r for r in manifest.subsets}.values():
@@ -413,7 +377,7 @@ def _policies(manifest: Manifest) -> list[tuple[str, str, str]]:
 
 def _limits(release: Release) -> list[str]:
     manifest, limits = release.manifest, []
-    if not manifest.complete:
+    if release.in_the_making or release.shortfalls:
         limits.append("Not complete: only a part of the recipe's shards is here.")
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
@@ -432,9 +396,9 @@ def _limits(release: Release) -> list[str]:
     if small:
         which = "All" if len(small) == len(steps) else f"{len(small)} of {len(steps)}"
         limits.append(f"{which} subsets have fewer steps than the paper's million.")
-    seconds = {ACTION_REPEAT * get_task(record.task).control_timestep for record in manifest.subsets}
+    seconds = {record.seconds_per_step for record in manifest.subsets}
     limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
-    if manifest.imported:
+    if is_imported(release):
         limits.append("Imported data have no physics states and no labels: nothing of them can be made again.")
     else:
         limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")

@@ -10,16 +10,14 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.pictures import picture_of
-from dmcvb_gen.dataset.schema import EpisodeShape, subset_specs
+from dmcvb_gen.dataset3.pictures import picture_of
+from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset3.schema import EpisodeShape, trajectory_arrays
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
-from dmcvb_gen.generate.inputs import video_source
+from dmcvb_gen.generate.inputs import local_inputs, video_source
 from dmcvb_gen.generate.modalities import modality_of, stored_in
 from dmcvb_gen.generate.render import modality_of_frames, renderer_for
-from dmcvb_gen.policies.simulate import replay
-from dmcvb_gen.release.import_tfds import imported_specs
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks import get_task
@@ -64,16 +62,15 @@ def _sample(count: int, wanted: int) -> np.ndarray:
 def check_values(subset: Subset) -> Iterator[Issue]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task)
-    specs = subset_specs(EpisodeShape.of(task), subset.record)
-    for spec in imported_specs(subset.record) if subset.record.imported else specs:
+    for spec in trajectory_arrays(EpisodeShape.of(task)):
+        if spec.name == "physics" and subset.record.imported:
+            continue
         if spec.name not in subset.arrays:
             yield Issue("shapes", subset.name, f"array {spec.name} is missing")
             return
-        array = subset.array(spec.name)
-        rows = (subset.record.max_steps + 1,) if spec.steps else ()
-        wanted = (subset.record.episodes, *rows, *spec.shape)
-        if array.shape != wanted or array.dtype != np.dtype(spec.dtype):
-            yield Issue("shapes", subset.name, f"{spec.name} is {array.dtype} {array.shape}, expected {wanted}")
+        stored = subset.spec(spec.name)
+        if (stored.dtype, stored.shape, stored.steps) != (spec.dtype, spec.shape, spec.steps):
+            yield Issue("shapes", subset.name, f"{spec.name} is {stored.dtype} {stored.shape}, expected {spec.shape}")
             return
     seen: dict[bytes, int] = {}
     names = [name for name in ("state", "action", "reward", "physics", "discount") if name in subset.arrays]
@@ -178,7 +175,9 @@ def check_replays(subset: Subset, seed: int, names: tuple[str, ...]) -> Iterator
 def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
     """Sampled frames painted again from physics and labels; frames that are black or never change."""
     recorded = subset.record.backgrounds
-    source = video_source(subset.root, subset.record, backgrounds)
+    release = subset.release
+    root = local_inputs(release.store, release.inputs_of([subset.name]))
+    source = video_source(root, subset.record, backgrounds)
     split = recorded["split"] if recorded else "train"
     if recorded:
         digest = load_backgrounds(source, split).digest

@@ -8,20 +8,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
-from dmcvb_gen.dataset.writer import sha256_file, subset_path
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import MANIFEST, ZARR_JSON
+from dmcvb_gen.dataset3.writer import read_provenance
+from dmcvb_gen.files import sha256_file
 from dmcvb_gen.release.episode_table import COLUMNS, PICTURE, TABLE
 from dmcvb_gen.release.templates import fill
-from dmcvb_gen.storage.hub import on_the_hub, parse_hub_url
-from dmcvb_gen.storage.remote import public
+from dmcvb_gen.storage.hugging_face import HubStore
+from dmcvb_gen.storage.places import shown
+from dmcvb_gen.storage.store import open_store
 
+PROGRAM = "dmcvb-gen"
 HOME = "https://arxiv.org/abs/2409.18330"
 """The page of the benchmark that releases follow."""
 TYPES = {"string": "sc:Text", "bool": "sc:Boolean", "double": "sc:Float", str(PICTURE): "sc:ImageObject"}
 """Types of the table of episodes that are no integers."""
 FIELDS = {
-    "name": ("sc:Text", "task/level/distractor, the subset's folder without .zarr"),
+    "name": ("sc:Text", "task/level/distractor"),
     "task": ("sc:Text", "what is done"),
     "level": ("sc:Text", "skill of the behaviour policies"),
     "setting": ("sc:Text", "distractors or goals"),
@@ -30,7 +33,6 @@ FIELDS = {
     "bytes": ("sc:Integer", "bytes of all shards"),
     "return_mean": ("sc:Float", "mean episode return"),
     "return_std": ("sc:Float", "standard deviation of the episode returns"),
-    "digest": ("sc:Text", "SHA-256 over the digests of all shard files"),
 }
 """Fields of the table of subsets: name -> (type, meaning)."""
 
@@ -50,11 +52,33 @@ class Publication:
 
 def page_of(url: str) -> str:
     """The web page of a URL: on the Hub the page of the data set, else the URL itself."""
-    if on_the_hub(url):
-        repository, folder, _ = parse_hub_url(url)
-        page = f"https://huggingface.co/datasets/{repository}"
-        return f"{page}/tree/main/{folder.rstrip('/')}" if folder else page
-    return public(url)
+    if url.startswith("hf:") and isinstance(store := open_store(url), HubStore):
+        page = f"https://huggingface.co/datasets/{store.repository}"
+        return f"{page}/tree/main/{store.folder_there.rstrip('/')}" if store.folder_there else page
+    return shown(url)
+
+
+def groups(release: Release) -> list[str]:
+    """Folders of the Zarr groups that are here, one a set of trajectories."""
+    used = [layer.group.partition(".zarr/")[0] for layer in release.layers.values() if release.here(layer.name)]
+    return [f"{name}.zarr" for name in dict.fromkeys(used)]
+
+
+def generator(release: Release) -> str:
+    """The program that made a release, with its versions."""
+    notes = read_provenance(release.store)
+    return " and ".join(dict.fromkeys(f"dmcvb-gen {n['environment'].get('dmcvb-gen', '?')}" for n in notes)) or PROGRAM
+
+
+def is_imported(release: Release) -> bool:
+    """Return True if a subset was imported."""
+    return any(record.imported for record in release.manifest.subsets)
+
+
+def derived_from(release: Release) -> list[str]:
+    """What a release was made from, in words."""
+    found = [recipe.derived for recipe in release.recipes if recipe.derived]
+    return [f"{facts.get('kind')} of {facts.get('name')} {facts.get('version', '')}".strip() for facts in found]
 
 
 def croissant(
@@ -80,14 +104,17 @@ def croissant(
     text = fill(
         "croissant.json.jinja",
         manifest=manifest,
+        generator=generator(release),
+        imported=is_imported(release),
+        derived=derived_from(release),
         summary=summary,
         citation=citation,
         limits=limits,
         published=published,
         tasks=", ".join(dict.fromkeys(record.task for record in manifest.subsets)),
-        inputs=_inputs(manifest),
+        inputs=_inputs(release),
         files=list(_files(release, table)),
-        folders=[f"{subset_path(name)}/**" for name in release.subsets],
+        folders=[f"{group}/**" for group in groups(release)],
         fields=FIELDS,
         rows=_rows(release, facts),
         columns={name: (TYPES.get(str(kind), "sc:Integer"), text) for name, (kind, text) in COLUMNS.items()},
@@ -96,20 +123,27 @@ def croissant(
     return json.dumps(json.loads(text), indent=1) + "\n"
 
 
-def _inputs(manifest: Manifest) -> list[str]:
+def _inputs(release: Release) -> list[str]:
     """What the data were made from: recipe, policies, videos."""
+    manifest = release.manifest
     policies = {f"policy {policy.name} {policy.digest[:12]}" for r in manifest.subsets for policy in r.policies}
     videos = {f"videos {r.backgrounds['digest'][:12]}" for r in manifest.subsets if r.backgrounds}
-    return ["the recipe in manifest.json", *sorted(policies), *sorted(videos)]
+    return ["the recipe in recipes/", *sorted(policies), *sorted(videos)]
 
 
 def _files(release: Release, table: Path) -> Iterator[dict[str, Any]]:
     """Manifest, Zarr groups and the table of episodes."""
     root = release.path
-    yield _file(root / MANIFEST, MANIFEST, "application/json", "Recipe, versions, policies, digests of the release.")
-    for name in release.subsets:
-        path = f"{subset_path(name)}/zarr.json"
-        yield _file(root / path, path, "application/json", f"Zarr group of {name}: arrays, dimensions, state fields.")
+    yield _file(
+        root / MANIFEST,
+        MANIFEST,
+        "application/json",
+        "Subsets and layers, with the SHA-256 of each layer's list.",
+    )
+    for group in groups(release):
+        path = f"{group}/{ZARR_JSON}"
+        text = f"Zarr group {group}: arrays, dimensions, state fields."
+        yield _file(root / path, path, "application/json", text)
     yield _file(table, TABLE, "application/x-parquet", "A row an episode, with its first frame.")
 
 
@@ -124,6 +158,5 @@ def _rows(release: Release, facts: dict[str, Any]) -> list[dict[str, Any]]:
         record = release[subset["name"]].record
         row = subset | {"task": record.task, "level": record.level, "setting": record.setting}
         row |= {f"return_{key}": subset["returns"][key] for key in ("mean", "std")}
-        row["digest"] = subset["digest"] or ""
         rows.append({f"subsets/{key}": row[key] for key in FIELDS})
     return rows

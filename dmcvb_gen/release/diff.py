@@ -1,24 +1,23 @@
-"""Compare two releases: subsets, episodes, digests, and what they were made with."""
+"""Compare two releases: subsets, episodes, and what made their layers; no data are read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.dataset import Release, Subset, open_release
-from dmcvb_gen.dataset.manifest import CommitRecord, SubsetRecord, subset_path
-from dmcvb_gen.dataset.pictures import picture_of
-from dmcvb_gen.storage.remote import check_no_options, is_url
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import Layer, SubsetRecord
+from dmcvb_gen.storage.places import is_url
 from dmcvb_gen.text import pluralize
 
 SHOWN = 5
-"""Shards named of a subset before the rest is counted."""
+"""Shards named of an array before the rest is counted."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One difference: the subset it is in ("" for the release), and what it is, in words."""
+    """One difference: the subset or layer it is in ("" for the release), and what it is, in words."""
 
     subset: str
     message: str
@@ -28,89 +27,76 @@ class Difference:
 
 
 def diff(one: str | Path, other: str | Path, options: dict | None = None) -> list[Difference]:
-    """List what differs between two releases, by manifests and commit records alone.
+    """List what differs between two releases, by manifests, lists and records alone.
 
     Args:
       one, other: folders or URLs.
-      options: options of fsspec, for URLs.
+      options: options of the storage client, for URLs.
 
     Raises:
       StoreError: one of them is no release, or cannot be read; options without a URL.
     """
-    if not (is_url(one) or is_url(other)):
-        check_no_options(one, options)
-    a, b = (open_release(place, options if is_url(place) else None) for place in (one, other))
-    return [*_releases(a, b), *(found for name in _names(a, b) for found in _subsets(a, b, name))]
+    given = [options if is_url(place) or not (is_url(one) or is_url(other)) else None for place in (one, other)]
+    a, b = Release.open(one, given[0]), Release.open(other, given[1])
+    return [*_releases(a, b), *_subsets(a, b), *_layers(a, b)]
 
 
-def _names(a: Release, b: Release) -> list[str]:
-    return list(dict.fromkeys(record.name for release in (a, b) for record in release.manifest.subsets))
-
-
-def _releases(a: Release, b: Release) -> list[Difference]:
-    found = []
-    for field in ("name", "version", "license", "generator", "digest"):
+def _releases(a: Release, b: Release) -> Iterator[Difference]:
+    for field in ("name", "version", "license", "authors"):
         one, other = getattr(a.manifest, field), getattr(b.manifest, field)
         if one != other:
-            found.append(Difference("", f"{field}: {one} and {other}"))
-    return found
+            yield Difference("", f"{field}: {_short(one)} and {_short(other)}")
+    if a.digest != b.digest:
+        yield Difference("", f"digest: {a.digest} and {b.digest}")
 
 
-def _subsets(a: Release, b: Release, name: str) -> list[Difference]:
-    records = [{r.name: r for r in release.manifest.subsets}.get(name) for release in (a, b)]
-    for mine, side in zip(records, ("second", "first"), strict=True):
-        if mine is None:
-            return [Difference(name, f"only in the {side}")]
-    found = []
-    images = [record.pixels for record in records if record]
-    if len(set(images)) == 2:
-        found.append(Difference(name, f"only the {'first' if images[0] else 'second'} has images"))
-    found += [
-        Difference(name, f"{field}: {_short(getattr(records[0], field))} and {_short(getattr(records[1], field))}")
-        for field in SubsetRecord.model_fields
-        if field not in ("digest", "pixels") and getattr(records[0], field) != getattr(records[1], field)
-    ]
-    one, other = a.subsets.get(name), b.subsets.get(name)
-    here = [len(subset.episodes) if subset else 0 for subset in (one, other)]
-    if here[0] != here[1]:
-        found.append(Difference(name, f"episodes that are there: {here[0]} and {here[1]}"))
-    if one and other:
-        found += _shards(one, other)
-    return found
+def _subsets(a: Release, b: Release) -> Iterator[Difference]:
+    mine, theirs = ({record.name: record for record in release.manifest.subsets} for release in (a, b))
+    for name in dict.fromkeys((*mine, *theirs)):
+        if name not in mine or name not in theirs:
+            yield Difference(name, f"only in the {'first' if name in mine else 'second'}")
+            continue
+        for field in SubsetRecord.model_fields:
+            one, other = getattr(mine[name], field), getattr(theirs[name], field)
+            if field != "layers" and one != other:
+                yield Difference(name, f"{field}: {_short(one)} and {_short(other)}")
+        here = [len(release.subsets[name]) if name in release.subsets else 0 for release in (a, b)]
+        if here[0] != here[1]:
+            yield Difference(name, f"episodes that are here: {here[0]} and {here[1]}")
 
 
-def _shards(one: Subset, other: Subset) -> list[Difference]:
-    """Shards of the same episodes that have other bytes, and arrays that only one has."""
-    mine = {commit.episodes: commit for commit in one.commits.values()}
-    theirs = {commit.episodes: commit for commit in other.commits.values()}
-    found = []
-    alone = sorted(mine.keys() ^ theirs.keys())
-    if alone and len(one.episodes) == len(other.episodes):  # else their number has been said
-        found.append(Difference(one.name, f"only one has shards of the episodes {_spans(alone)}"))
-    arrays: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for episodes in sorted(mine.keys() & theirs.keys()):
-        files = [_digests(mine[episodes]), _digests(theirs[episodes])]
-        for array in sorted(files[0].keys() | files[1].keys()):
-            digests = [side.get(array) for side in files]
-            if digests[0] != digests[1]:
-                kind = "has other bytes" if all(digests) else f"is only in the {'first' if digests[0] else 'second'},"
-                arrays.setdefault((array, kind), []).append(episodes)
-    for (array, kind), spans in arrays.items():
-        if one.record.pixels != other.record.pixels and picture_of(array):
-            continue  # which has images has been said
-        found.append(Difference(one.name, f"{array} {kind} in the episodes {_spans(spans)}"))
-    return found
+def _layers(a: Release, b: Release) -> Iterator[Difference]:
+    """Layers of common subsets that only one has, and shards of common layers that have other bytes."""
+    names = {record.name for record in a.manifest.subsets} & {record.name for record in b.manifest.subsets}
+    records = [record for release in (a, b) for record in release.manifest.subsets if record.name in names]
+    for name in dict.fromkeys(layer for record in records for layer in record.layers):
+        if name not in a.layers or name not in b.layers:
+            yield Difference(name, f"only in the {'first' if name in a.layers else 'second'}")
+        else:
+            yield from _shards(a, b, a.layers[name], b.layers[name])
+
+
+def _shards(a: Release, b: Release, one: Layer, other: Layer) -> Iterator[Difference]:
+    if one.key != other.key:
+        fields = [n for n in ("rows", "episodes_per_shard", "arrays") if getattr(one, n) != getattr(other, n)]
+        fields += sorted(key for key in {*one.makes, *other.makes} if one.makes.get(key) != other.makes.get(key))
+        yield Difference(one.name, f"made in another way: {', '.join(fields) or 'what lies below it'}")
+    if one.episodes_per_shard != other.episodes_per_shard:
+        return
+    mine, theirs = a.records(one.name), b.records(one.name)
+    arrays: dict[str, list[tuple[int, int]]] = {}
+    for number in sorted(mine.keys() & theirs.keys()):
+        files, span = (mine[number].files, theirs[number].files), one.episodes_of(number)
+        for array in sorted({*files[0], *files[1]}):
+            if files[0].get(array) != files[1].get(array):
+                arrays.setdefault(array, []).append((span.start, span.stop))
+    for array, spans in arrays.items():
+        yield Difference(one.name, f"{array} has other bytes in the episodes {_spans(spans)}")
 
 
 def _spans(spans: Sequence[tuple[int, int]]) -> str:
     named = ", ".join(f"{first}:{last}" for first, last in spans[:SHOWN])
     return named + (f" and {pluralize(len(spans) - SHOWN, 'shards')} more" if len(spans) > SHOWN else "")
-
-
-def _digests(commit: CommitRecord) -> dict[str, str]:
-    """Path of an array in its group -> digest of its file."""
-    start = len(subset_path(commit.subset)) + 1
-    return {file.path[start:].split("/c/")[0]: file.sha256 for file in commit.files}
 
 
 def _short(value: object) -> str:

@@ -17,14 +17,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from dmcvb_gen.dataset import Release, Subset
-from dmcvb_gen.dataset.index import CARD_FOLDER
-from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import CARD_FOLDER
+from dmcvb_gen.dataset3.pictures import Pictures, shown, training_pictures
+from dmcvb_gen.dataset3.reader import Subset
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
 
-TABLE = f"{CARD_FOLDER}/episodes.parquet"
+TABLE = f"{CARD_FOLDER}episodes.parquet"
 CONFIG = "episodes"
 FRAME = 64
 """Largest width and height of a first frame in pixels."""
@@ -138,7 +139,7 @@ def _pictures(subset: Subset) -> Pictures:
 def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
     """First frames, rendered from the stored physics states and labels."""
     pictures = _pictures(subset)
-    renderer, _ = renderer_for(subset.record, background_source(Path(subset.root), subset.record))
+    renderer, _ = renderer_for(subset.record, background_source(subset.release.path, subset.record))
     try:
         physics = subset.read("physics", episodes)[:, 0]
         labels = subset.labels(episodes)[:, 0]

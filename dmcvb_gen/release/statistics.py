@@ -10,8 +10,9 @@ from itertools import islice
 import mujoco
 import numpy as np
 
-from dmcvb_gen.dataset import Release, Subset
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 EPISODES = 20
@@ -134,7 +135,7 @@ def _speed(task: Task, subset: Subset) -> float | None:
     else:
         fields = states[VELOCITY].start + velocity
         return _mean_length([rows[:, fields] for rows in _episodes(subset, "state")])
-    return _mean_length(moved) / (ACTION_REPEAT * task.control_timestep)
+    return _mean_length(moved) / (subset.record.seconds_per_step)
 
 
 def _moved(subset: Subset, name: str, columns: np.ndarray) -> list[np.ndarray]:

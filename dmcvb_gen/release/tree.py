@@ -11,6 +11,7 @@ from dmcvb_gen.dataset3.manifest import (
     CARD_FOLDER,
     MANIFEST,
     MANIFEST_BYTES,
+    PROVENANCE,
     RECIPES,
     FileRecord,
     LayerList,
@@ -18,6 +19,7 @@ from dmcvb_gen.dataset3.manifest import (
     canonical_json,
     list_path,
 )
+from dmcvb_gen.dataset3.writer import PROVENANCE_BYTES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import NotThere, Store
@@ -25,8 +27,8 @@ from dmcvb_gen.storage.store import NotThere, Store
 CARD = tuple(f"{CARD_FOLDER}{name}" for name in ("returns.png", "contact_sheet.png", "states.json", "episodes.parquet"))
 ATTACHMENTS = (*ATTACHMENT_FILES, *CARD)
 """Files that are copied with a release as they are; no digest covers them."""
-ATTACHMENT_BYTES = 2**30
-"""The largest of them."""
+ATTACHMENT_BYTES, NOTES = 2**30, 100
+"""The largest of them, and the number of notes of provenance that go with a release."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,13 @@ def manifest_text(release: Release) -> bytes:
 
 
 def attachments(store: Store) -> dict[str, bytes]:
-    """Path -> bytes of the attachments that are there."""
+    """Path -> bytes of the attachments that are there, and of the notes of who made the release."""
     found = {}
-    for path in ATTACHMENTS:
+    try:
+        notes = [path for path, size in store.list(PROVENANCE).items() if size <= PROVENANCE_BYTES][:NOTES]
+    except StoreError:  # a web server gives no lists
+        notes = []
+    for path in (*ATTACHMENTS, *notes):
         try:
             found[path] = store.read(path, ATTACHMENT_BYTES)
         except NotThere:

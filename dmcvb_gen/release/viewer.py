@@ -12,17 +12,17 @@ import io
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.pictures import shown
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
@@ -30,9 +30,13 @@ from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
 from dmcvb_gen.loaders.stream import check_count
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
-from dmcvb_gen.spec import select
-from dmcvb_gen.storage.remote import is_url, local_path, public, storage_errors
+from dmcvb_gen.storage.places import is_url
+from dmcvb_gen.storage.places import shown as shown_place
+from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.store import open_store
 
+VIEWER = "preview/viewer.html"
+"""Default place in the release."""
 EPISODES = 12
 """Episodes in a file by default, shared out among the subsets."""
 MAX_BYTES = 20_000_000
@@ -91,20 +95,19 @@ def view(
       UnknownNameError: no such subset.
     """
     if not out and is_url(path):
-        raise StoreError(f"{public(path)} is a URL: say with --out where to write the file")
+        raise StoreError(f"{shown_place(path)} is a URL: say with --out where to write the file")
     for name, value in {"episodes": episodes, "max_bytes": max_bytes}.items():
         if value is not None:
             check_count(name, value)
     target = local_path(out) if out else None
     release = open_for_reading(path, storage_options)
-    names = select(list(release.subsets), list(only)) if release.subsets else []
+    names = [name for name in release.select(list(only)) if name in release]
     if not names:
-        raise StoreError(f"{public(path)} has no finished episodes; run the rollout first")
+        raise StoreError(f"{shown_place(path)} has no finished episodes; run the rollout first")
     imported = [name for name in names if release[name].record.imported]
     if size and imported:
         raise StoreError(f"{imported[0]} was imported and has no physics states to paint from; remove --size")
     release = _with_pictures(release, size)
-    target = target or release.path / "preview" / "viewer.html"
     each = episodes or max(1, EPISODES // len(names))
     chosen = [(release[name], int(index)) for name in names for index in release[name].episodes[:each]]
     expect(progress, len(chosen))
@@ -113,14 +116,18 @@ def view(
         parts.append(_episode(subset, index, _command(release, path, subset, index)))
         progress(1)
     page, stride = _fitted(release, parts, max_bytes)
-    with storage_errors(target, "write to"):
-        write_bytes(target, page)
+    if target is None:
+        target = release.path / VIEWER
+        open_store(release.path).replace(VIEWER, page)  # which writes through no link
+    else:
+        with storage_errors(target, "write to"):
+            write_bytes(target, page)
     return Written(target, len(page), len(parts), len(names), stride)
 
 
 def _with_pictures(release: ReleaseReader, size: int | None) -> ReleaseReader:
     """The release with all pictures readable: stored, or painted on reading."""
-    whole = all(subset.record.pixels and not subset.unpainted.any() for subset in release.subsets.values())
+    whole = not any(subset.unpainted.any() for subset in release.subsets.values())
     return release if whole and not size else painted_release(release, Painting(size=size), missing=not size)
 
 
@@ -144,7 +151,7 @@ def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
     from jinja2 import Environment
 
     manifest = release.manifest
-    facts = dict(name=manifest.name, version=manifest.version, digest=manifest.digest or "", episodes=parts)
+    facts = dict(name=manifest.name, version=manifest.version, digest=release.digest or "", episodes=parts)
     # In a script, "<" could end it, so the data have none.
     data = json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     template = files("dmcvb_gen.release").joinpath("data/viewer.html").read_text("utf-8")
@@ -152,13 +159,13 @@ def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
 
 
 def _command(release: Release, path: str, subset: SubsetReader, index: int) -> str:
-    """The command that makes an episode again, or fetches one of a URL; "" if nothing can make it."""
-    what = f"--only {shlex.quote(subset.name)} --episodes {index}:{index + 1}"
+    """The command that makes an episode's shard again, or fetches it from a URL; "" if nothing can make it."""
+    what = f"--only {shlex.quote(subset.name)} --range {index}:{index + 1} --out again"
     if is_url(path):
-        return f"dmcvb-gen fetch {shlex.quote(public(path))} {what} --out again"
-    if release.manifest.imported or subset.record.imported or release.manifest.labels_of(subset.name):
+        return f"dmcvb-gen fetch {shlex.quote(shown_place(path))} {what}"
+    if subset.record.imported:
         return ""
-    return f"dmcvb-gen regenerate {shlex.quote(Path(path).resolve().name)} {what} --out again"
+    return f"dmcvb-gen regenerate {shlex.quote(str(Path(path).resolve()))} {what}"
 
 
 # -- one episode ----------------------------------------------------------------------------------
@@ -166,8 +173,10 @@ def _command(release: Release, path: str, subset: SubsetReader, index: int) -> s
 
 def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     """Collect what the page shows of an episode: facts, views with their raw frames, and groups of curves."""
-    pictures = shown(subset)
-    labels = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in subset.arrays]
+    pictures, layer = shown(subset), subset.trajectories
+    span = layer.episodes_of(index // layer.episodes_per_shard)
+    shows = subset.record.goal_mode or subset.record.distractor.kind != "none"
+    labels = [name for name in DISTRACTOR_STATE_NAMES if shows and f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]
     values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])
     return {
@@ -177,13 +186,14 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
         "return": float(values["reward"].astype(np.float64).sum()),
         "seed": str(int(values["seed"])),
         "terminated": bool(values["terminated"]),
-        "seconds": float(subset.attrs.get("seconds_per_step") or 0.05),
+        "seconds": subset.record.seconds_per_step,
         "trajectory": hashlib.sha256(values["state"].tobytes() + values["action"].tobytes()).hexdigest()[:16],
         "command": command,
+        "shard": [span.start, min(span.stop, subset.record.episodes)],
         "frames": {view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
         "curves": {
             "reward": [_curve("reward", values["reward"]), _curve("return so far", np.cumsum(values["reward"]))],
-            "action": [_curve(f"action {i}", column) for i, column in enumerate(values["action"].T)],
+            "action": [_curve(name, column) for name, column in _action_columns(subset, values["action"])],
             "state": [_curve(name, column) for name, column in _state_columns(subset, values["state"])],
             "distractor": [
                 _curve(name, column)
@@ -194,9 +204,14 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     }
 
 
+def _action_columns(subset: SubsetReader, action: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    names = subset.record.actuators or [""] * action.shape[1]
+    for number, (name, column) in enumerate(zip(names, action.T, strict=True)):
+        yield name or f"action {number}", column
+
+
 def _state_columns(subset: SubsetReader, state: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    whole = {"state": (0, state.shape[1])}
-    fields = cast(Mapping[str, Any], subset.group[subset.paths["state"]].attrs.get("fields") or whole)
+    fields = subset.spec("state").attributes.get("fields") or {"state": (0, state.shape[1])}
     for name, (first, last) in fields.items():
         for column in range(first, last):
             yield (name if last - first == 1 else f"{name} {column - first}"), state[:, column]

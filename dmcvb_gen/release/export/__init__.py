@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, write_json
-from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
+from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
+from dmcvb_gen.loaders.release import open_for_reading
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import all_formats, get_format
-from dmcvb_gen.spec import select
-from dmcvb_gen.storage.remote import is_url, local_path, storage_errors
+from dmcvb_gen.storage.places import is_url
+from dmcvb_gen.storage.remote import local_path, storage_errors
 
 STAMP = ".dmcvb-gen.json"
 """File in each export that says what it was made from, so that the same command can resume."""
@@ -93,7 +93,7 @@ def export(
     release = open_for_reading(path, storage_options)
     if not is_url(str(path)) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
         raise StoreError(f"--out {out} lies in the release itself; give another folder")
-    names = select([record.name for record in release.manifest.subsets], list(only))
+    names = release.select(list(only))
     chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
     folders = [out] if merge else [out / kind.folder_name(release, name) for name in names]
     works = [
@@ -110,28 +110,21 @@ def export(
     return folders
 
 
-def _stamp(release: ReleaseReader, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
-    """Return what an export was made from: release (its root digest, if it is finished), format, options, episodes."""
-    manifest = release.manifest
-    digests = {record.name: record.digest for record in manifest.subsets}
-    content = [
-        [name, digests[name] or _digest_of(release[name], episodes), list(episodes)] for name, episodes in subsets
-    ]
-    return dict(release=manifest.name, digest=manifest.digest, format=to, options=options, subsets=content)
-
-
-def _digest_of(subset: Subset, episodes: Sequence[int]) -> str:
-    """The digest of the shards that hold some episodes, of a subset that has none of its own yet."""
-    return subset_digest(
-        {shard: commit for shard, commit in subset.commits.items() if set(range(*commit.episodes)) & set(episodes)}
-    )
+def _stamp(release: Release, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
+    """What an export was made from: release, format, options, and the records of the shards that it reads."""
+    content = []
+    for name, episodes in subsets:
+        shards = release.shards([name], (episodes[0], episodes[-1] + 1))
+        digest = sha256_bytes(b"".join(canonical_json(shard.record) for shard in shards))
+        content.append([name, digest, list(episodes)])
+    return dict(release=release.manifest.name, format=to, options=options, subsets=content)
 
 
 def _formats_with(option: str) -> list[str]:
     return [name for name, kind in all_formats().items() if option in kind.options]
 
 
-def _episodes(release: ReleaseReader, name: str, asked: tuple[int, int] | None) -> tuple[int, ...]:
+def _episodes(release: Release, name: str, asked: tuple[int, int] | None) -> tuple[int, ...]:
     """The episodes of a subset that are exported; all that are asked for must be there."""
     record = next(record for record in release.manifest.subsets if record.name == name)
     here = set(release.subsets[name].episodes.tolist()) if name in release.subsets else set()

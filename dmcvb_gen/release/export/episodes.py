@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dmcvb_gen.dataset import Manifest
-from dmcvb_gen.dataset.pictures import Pictures, shown
+from dmcvb_gen.dataset3.manifest import Manifest, Resolved
+from dmcvb_gen.dataset3.pictures import Pictures, shown
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 
@@ -73,17 +73,12 @@ class Source:
     tick: Callable[[int], None]
 
     @property
-    def manifest(self) -> Manifest:
+    def manifest(self) -> Manifest | Resolved:
         return self.release.manifest
 
     @property
     def steps_per_second(self) -> float:
-        said = self.subset.attrs.get("seconds_per_step")
-        if said is None:  # imported; only this needs the tasks, and what they are made of
-            from dmcvb_gen.tasks import ACTION_REPEAT, get_task
-
-            said = ACTION_REPEAT * get_task(self.subset.task).control_timestep
-        return 1 / float(said)
+        return 1 / self.subset.record.seconds_per_step
 
     @property
     def pictures(self) -> Pictures:
@@ -103,7 +98,7 @@ class Source:
     @property
     def description(self) -> str:
         manifest = self.manifest
-        return f"{self.subset.name} of {manifest.name} {manifest.version} ({manifest.license}), {manifest.generator}"
+        return f"{self.subset.name} of {manifest.name} {manifest.version} ({manifest.license}), by dmcvb-gen"
 
     def __iter__(self) -> Iterator[ExportEpisode]:
         pictures = self.pictures

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import SubsetRecord
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.loaders.release import ReleaseReader
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import read_header
@@ -16,7 +16,7 @@ RANDOM_EPISODES, SEED, NAMES = 10, 0, ("reference",)
 """Episodes of uniform actions that are simulated if the release has none of its own."""
 
 
-def reference_returns(release: ReleaseReader, record: SubsetRecord) -> dict[str, float]:
+def reference_returns(release: Release, record: SubsetRecord) -> dict[str, float]:
     """`ref_min_score` and `ref_max_score`: mean returns of random actions and of the expert; nothing if one is unknown.
 
     Both of episodes that are cut where the subset's are. Those of the release's own subsets of the same task and
@@ -31,7 +31,7 @@ def reference_returns(release: ReleaseReader, record: SubsetRecord) -> dict[str,
     return {} if low is None or high is None else {"ref_min_score": low, "ref_max_score": high}
 
 
-def _own(release: ReleaseReader, record: SubsetRecord, level: str) -> float | None:
+def _own(release: Release, record: SubsetRecord, level: str) -> float | None:
     for subset in release.subsets.values():
         like = (subset.task, subset.level, subset.setting) == (record.task, level, record.setting)
         if like and subset.record.max_steps == record.max_steps and len(subset.returns):

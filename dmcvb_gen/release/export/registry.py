@@ -17,13 +17,13 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
-from dmcvb_gen.loaders.release import ReleaseReader
 from dmcvb_gen.registry import Registry
 
 
-def subset_folder(release: ReleaseReader, subset: str) -> str:
+def subset_folder(release: Release, subset: str) -> str:
     """Default folder of a subset's export below `--out`: its name."""
     return subset
 
@@ -51,7 +51,7 @@ class Format:
     mark: str
     modules: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
-    folder_name: Callable[[ReleaseReader, str], str] = subset_folder
+    folder_name: Callable[[Release, str], str] = subset_folder
 
     def check_installed(self) -> None:
         """Raises DmcvbError if a package that the format needs is not installed."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dmcvb_gen import files
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
-from dmcvb_gen.loaders.release import ReleaseReader
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.registry import register_exporter
 from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 
-def folder_name(release: ReleaseReader, subset: str) -> str:
+def folder_name(release: Release, subset: str) -> str:
     """Return the id of a subset's data set, which is also its folder below the root of minari's data sets."""
     task, level, setting = subset.replace("_", "-").replace(".", "-").split("/")
     return f"{NAMESPACE}/{task}/{level}-{setting}-v0"
@@ -67,7 +67,7 @@ def write(source: Source, folder: Path) -> None:
         "minari_version": minari.__version__,
         "algorithm_name": ", ".join(algorithms) or subset.level,
         "author": set(source.manifest.authors),
-        "code_permalink": source.manifest.generator,
+        "code_permalink": f"dmcvb-gen {__version__}",
         "description": source.description + _about_videos(source),
         "requirements": [f"dmcvb-gen>={__version__}"],
         "eval_env_spec": _environment(source, "val").to_json(),
@@ -76,7 +76,7 @@ def write(source: Source, folder: Path) -> None:
     storage.update_metadata(facts)
     storage.update_episodes(_buffer(number, episode) for number, episode in enumerate(source))
     storage.update_metadata({"dataset_size": storage.get_size()})
-    about = {"description": f"{source.manifest.name} {source.manifest.version} ({source.manifest.generator})"}
+    about = {"description": f"{source.manifest.name} {source.manifest.version} (dmcvb-gen {__version__})"}
     # The namespaces are above the folder that is moved into its place when it is whole.
     files.write_json(folder.parents[2] / "namespace_metadata.json", about)
     files.write_json(folder.parents[1] / "namespace_metadata.json", {"description": subset.task})
@@ -114,7 +114,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
     if record.setting == FIXED:
         options |= {
             "fixed_goals": record.fixed_goals,
-            "goal_seed": int(source.manifest.recipe_of(record.name).get("seed", 0)),
+            "goal_seed": int(source.subset.trajectories.makes.get("seed", 0)),
         }
     name = environment_id(record.name.split("/")[0], setting)
     registered = gymnasium.registry.get(name)
