@@ -45,7 +45,7 @@ def verify(
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> "Verification":
-    """Check a release: all of a folder; at a URL the manifest, index, commit records and a sample of files.
+    """Check a release: all of a folder; at a URL the manifest, its lists and a sample of files.
 
     Args:
       release (RELEASE|URL): Folder or URL of the release.
@@ -57,14 +57,14 @@ def verify(
     Raises:
       DmcvbError: there is no release, nothing is committed, or an option has no effect there.
     """
+    from dmcvb_gen.release.verify import THREADS, verify_url
     from dmcvb_gen.release.verify import verify as run
-    from dmcvb_gen.release.verify_url import WORKERS, verify_url
-    from dmcvb_gen.storage.remote import is_url
+    from dmcvb_gen.storage.places import is_url
 
     if is_url(str(release)):
         _refuse("at a URL nothing is painted or simulated", backgrounds=backgrounds, executor=not _is_count(workers))
         with progress_bar(progress, " files", scaled=False) as bar:
-            return verify_url(str(release), storage_options, everything, bar, workers or WORKERS)  # type: ignore[arg-type]
+            return verify_url(str(release), storage_options, everything, bar, workers or THREADS)  # type: ignore[arg-type]
     _refuse(f"{release} is a folder, which is always read whole", all=everything, option=storage_options)
     with progress_bar(progress, " checks", scaled=False) as bar:
         return run(release, None if backgrounds is None else str(backgrounds), bar, workers or 1)
@@ -76,7 +76,6 @@ def publish(
     url: str,
     *,
     storage_options: dict[str, Any] | None = None,
-    take_over: bool = False,
     repair: bool = False,
     workers: Count = 8,
     pixels: bool = True,
@@ -86,9 +85,8 @@ def publish(
 
     Args:
       release (RELEASE): Folder of the release, or of an export.
-      url (URL): Where to put it: s3://, gs://, hf:// or any fsspec URL.
+      url (URL): Where to put it: s3://, gs://, az://, hf:// or file:.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-      take_over: Publish even if another upload has claimed the URL.
       repair: Compare published files by their digests, and replace those that differ.
       workers: Parallel transfers.
       pixels: False: Publish without images; `paint` renders them again.
@@ -98,9 +96,7 @@ def publish(
     """
     from dmcvb_gen.release.publish import publish_folder
 
-    given: dict[str, Any] = dict(
-        pixels=pixels, take_over=take_over, repair=repair, options=storage_options, workers=workers
-    )
+    given: dict[str, Any] = dict(pixels=pixels, repair=repair, options=storage_options, workers=workers)
     with progress_bar(progress, " files", scaled=False) as bar:
         return publish_folder(release, url, tick=bar, **given)
 

@@ -11,11 +11,10 @@ from dmcvb_gen import commands
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
-from dmcvb_gen.dataset.index import is_card, is_video
-from dmcvb_gen.dataset.manifest import MANIFEST
+from dmcvb_gen.dataset3.manifest import VIDEOS
 from dmcvb_gen.generate import public
 from dmcvb_gen.release.issue import NOT_PART
-from dmcvb_gen.storage.remote import is_url
+from dmcvb_gen.storage.places import is_url, shown
 from dmcvb_gen.text import pluralize, quoted
 
 
@@ -23,7 +22,7 @@ from dmcvb_gen.text import pluralize, quoted
 def verify(release, as_json, **options):
     """Check a release: digests, shapes, values, physics, pixels, returns.
 
-    At a URL nothing is downloaded: manifest, index and commit records are checked, and a sample of files by digest.
+    At a URL nothing is downloaded: the manifest and its lists are checked, and a sample of files by digest.
 
     Exit codes: 0: sound and complete. 1: a check failed. 2: bad usage. 3: sound, but a part is missing (a rollout that
     is not finished, or a part that was fetched) or could not be checked here.
@@ -32,7 +31,7 @@ def verify(release, as_json, **options):
     dmcvb-gen verify releases/demo
     """
     result = commands.verify(release, **options)
-    facts = {"sound": result.sound, "complete": result.complete, "digest": result.digest, "checked": result.checked}
+    facts = {name: getattr(result, name) for name in ("sound", "complete", "digest", "compared", "checked")}
     facts |= {"findings": [dataclasses.asdict(finding) for finding in result.findings], "incomplete": result.incomplete}
     facts |= {"unchecked": [dataclasses.asdict(issue) for issue in result.unchecked]}
     code = 1 if not result.sound else 0 if result.complete else 3
@@ -48,32 +47,31 @@ def _verified(path, result):
     named = {name: counts for name, counts in result.incomplete.items() if counts[0] or len(result.incomplete) <= 10}
     yield from (f"{name}: {here:,} of {planned:,} episodes" for name, (here, planned) in named.items())
     if absent := len(result.incomplete) - len(named):
-        yield f"Of {pluralize(absent, 'subsets')} no episode is here."
+        yield f"{absent:,} of {pluralize(len(result.incomplete), 'incomplete subsets')} have no local episodes."
     checked = ", ".join(pluralize(count, name) for name, count in result.checked.items())
-    verdict = "sound" if result.sound else pluralize(len(result.findings), "findings")
+    verdict = "All checks passed" if result.sound else pluralize(len(result.findings), "findings")
     if result.incomplete:
         here = result.checked["episodes"]
         planned = here + sum(planned - count for count, planned in result.incomplete.values())
-        verdict = ("" if result.sound else f"{verdict}, ") + f"incomplete: {here:,} of {planned:,} episodes"
+        verdict += f", incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
-        verdict = f"sound, not finished: dmcvb-gen cluster finish {path}"
-    yield f"{path}: {verdict} ({checked})" if result.sound else f"{path}: {verdict}; values were checked of {checked}"
+        verdict += f", not finished: dmcvb-gen cluster finish {path}"
+    yield f"{path}: {verdict} ({checked})"
     if result.digest:
-        yield f"digest {'of what is here ' if result.incomplete else ''}{result.digest}"
+        known = "" if result.compared else " (not compared: give the one that you expect, RELEASE@sha256:DIGEST)"
+        yield f"digest {result.digest}{known}"
     damaged = [found for found in result.findings if found.check == "files" and NOT_PART not in found.message]
-    yield from _cures(path, {found.subset for found in damaged if found.subset != MANIFEST})
+    yield from _cures(path, {found.subset for found in damaged})
 
 
 def _cures(path, places):
-    """Yield the commands that repair damaged places: subsets, or files of none."""
-    cards, videos = ({place for place in places if test(place)} for test in (is_card, is_video))
+    """Yield the commands that repair damaged places: layers, or files of none."""
     if places and is_url(str(path)):
         yield f"`dmcvb-gen publish FOLDER {quoted(path)} --repair` replaces damaged and missing files."
         return
-    if places - cards - videos:
+    videos = {place for place in places if place.startswith(VIDEOS)}
+    if places - videos:
         yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
-    if cards:
-        yield f"`dmcvb-gen card {quoted(path)}` writes the card again."
     if videos:
         yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` copies the videos from FOLDER again."
 
@@ -143,10 +141,8 @@ def publish(release, url, as_json, **options):
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
-    from dmcvb_gen.storage.remote import public
-
     moved = commands.publish(release, url, **options)
-    answer(as_json, dataclasses.asdict(moved), f"{public(url)}: {moved_files(moved)}")
+    answer(as_json, dataclasses.asdict(moved), f"{shown(url)}: {moved_files(moved)}")
 
 
 @click.command()
@@ -156,7 +152,7 @@ def publish(release, url, as_json, **options):
 @click.option("--url", help="URL of the published release.  [default: the card's]")
 @json_option
 def card(path, check, out, url, as_json):
-    """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, CHANGELOG.md, a table.
+    """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, a table.
 
     The table, card/episodes.parquet, has one row for each episode, with its first frame. `datasets.load_dataset` reads
     it.
@@ -212,7 +208,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
 
     with commands.progress_bar(not as_json, " episodes", scaled=False) as bar:
         given = dict(task=task, level=level, setting=setting, name=name, partial=partial, progress=bar)
-        manifest = import_tfds(folder, out, **given)
+        manifest = import_tfds(folder, out, **given).manifest
     made = (f"{subset.name}: {pluralize(subset.episodes, 'episodes')}" for subset in manifest.subsets)
     answer(as_json, {"out": out, "subsets": [subset.name for subset in manifest.subsets]}, *made)
 
@@ -223,7 +219,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
 @remote_option
 @json_option
 def diff_command(one, other, options, as_json):
-    """Compare two releases by their manifests and commit records: subsets, episodes and digests.
+    """Compare two releases by their manifests and records: subsets, episodes and digests.
 
     Exit code 0 when nothing differs, 1 when something does.
 

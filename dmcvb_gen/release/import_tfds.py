@@ -6,7 +6,6 @@ imported release can be read, checked and trained on, but not repainted or regen
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import re
 from collections.abc import Iterator
@@ -17,26 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.dataset.manifest import (
-    IMPORTED,
-    MANIFEST,
-    MAX_STEPS,
-    Manifest,
-    SubsetRecord,
-    environment,
-    local_manifest,
-)
-from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
-from dmcvb_gen.dataset.schema import ArraySpec, EpisodeShape, array_specs
-from dmcvb_gen.dataset.writer import (
-    create_subset,
-    finish_release,
-    read_commits,
-    shard_count,
-    shard_episodes,
-    start_release,
-    write_shard,
-)
+from dmcvb_gen.dataset3.gate import Release, recorded_shards
+from dmcvb_gen.dataset3.manifest import IMPORTED, MAX_STEPS, Layer, Resolved, SubsetRecord, shard_size
+from dmcvb_gen.dataset3.pictures import picture_arrays
+from dmcvb_gen.dataset3.schema import EpisodeShape, image_array, trajectory_arrays
+from dmcvb_gen.dataset3.writer import begin, finish, put_shard, write_provenance
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD
@@ -46,21 +30,13 @@ from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec, subset_name
 from dmcvb_gen.storage.remote import local_path
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.storage.store import Store, open_store
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
+ORIGIN = "DMC-VB (Ortiz et al., NeurIPS 2024), TFDS folders"
 MAX_GOAL_PAIRS = 2**15
 """Pairs of start and goal that the stored numbers (int16) can tell apart."""
-MISSING = ("physics", "exogenous/")
-"""Arrays (by the beginnings of their names) that an imported subset has not."""
-
-
-def imported_specs(record: SubsetRecord) -> tuple[ArraySpec, ...]:
-    """Arrays of an imported subset: its views show the goal or hide it, and are not there in both kinds."""
-    shape = dataclasses.replace(EpisodeShape.of(get_task(record.task)), views=record.views)
-    shown = picture_arrays(record.views, record.hidden_goal)
-    specs = [spec for spec in array_specs(shape, record.size) if not spec.name.startswith(MISSING)]
-    return tuple(spec for spec in specs if picture_of(spec.name) is None or spec.name in shown)
 
 
 class Place(NamedTuple):
@@ -85,9 +61,13 @@ class _Source:
     episodes: tuple[Place, ...]
 
     @property
-    def files(self) -> list[str]:
-        """Names of its files in the order of their episodes, after the number of their folder."""
-        return [f"{goal}/{file.name}" for goal, folder in enumerate(self.folders) for file in _files(folder)]
+    def facts(self) -> dict[str, Any]:
+        """What its data come from: names and sizes of files in the order of their episodes, and their features."""
+        files = [
+            f"{n}/{file.name} {file.stat().st_size}" for n, path in enumerate(self.folders) for file in _files(path)
+        ]
+        features = sha256_file(self.folders[0] / "features.json")
+        return {"files": len(files), "names": sha256_bytes("\n".join(files).encode()), "features": features}
 
 
 def import_tfds(
@@ -100,11 +80,10 @@ def import_tfds(
     name: str = "dmc-vb-original",
     partial: bool = False,
     progress: ProgressCallback = ignore,
-) -> Manifest:
+) -> Release:
     """Import subsets of locomotion and of mazes. Run again, it resumes.
 
-    Episodes are numbered by the order of their files. Where files that were missing come between those that were
-    imported, the numbers would be others, and `out` is refused; where they come after, the subset grows.
+    Episodes are numbered by the order of their files, so a release of other files is another one.
 
     Args:
       folder: a TFDS folder (with features.json), or a tree of DMC-VB's folders that hold such (see `parse_folder`).
@@ -129,31 +108,50 @@ def import_tfds(
         for path in found:
             _refuse_missing(path)
     sources = _sources(found, task, level, setting)
-    _refuse_other_files(sources, out)
-    manifest = Manifest(
+    store, layers = open_store(out), [_layers(source) for source in sources]
+    records = [
+        source.record.model_copy(update={"layers": tuple(layer.name for layer in own)})
+        for source, own in zip(sources, layers, strict=True)
+    ]
+    resolved = Resolved(
         name=name,
         version="1.0.0",
         license="CC-BY-4.0",
-        recipe={
-            "name": name,
-            "imported": sorted(source.record.name for source in sources),
-            "files": {source.record.name: _fingerprint(source.files) for source in sources},
-        },
-        subsets=tuple(source.record for source in sources),
-        environments=(environment(),),
-        lineage=(
-            {
-                "kind": "import",
-                "from": "DMC-VB (Ortiz et al., NeurIPS 2024), TFDS folders",
-                "features_sha256": {s.record.name: sha256_file(s.folders[0] / "features.json") for s in sources},
-            },
-        ),
+        recipe={"name": name, "imported": sorted(record.name for record in records)},
+        layers=tuple(layer for own in layers for layer in own),
+        subsets=tuple(records),
+        derived={"kind": "import", "name": ORIGIN},
     )
-    manifest = start_release(out, manifest)
-    expect(progress, sum(_episodes_to_come(source.record, out) for source in sources))
-    for source in sources:
-        _import_subset(source, out, progress)
-    return finish_release(out, manifest)
+    begin(store, resolved, {})
+    write_provenance(store, "import")
+    expect(progress, sum(record.episodes for record in records))
+    for source, own in zip(sources, layers, strict=True):
+        _import_subset(source, own, store, progress)
+    return finish(store)
+
+
+def _layers(source: _Source) -> list[Layer]:
+    """The layers of an imported subset: trajectories, then the images of each view, with the goal or without it."""
+    record, facts = source.record, source.facts
+    shape = EpisodeShape.of(get_task(record.task))
+    rows, per_shard = record.max_steps + 1, shard_size(record.episodes, DEFAULT_EPISODES_PER_SHARD[record.family])
+    given: dict[str, Any] = dict(rows=rows, episodes_per_shard=per_shard, makes=facts, source=ORIGIN)
+    arrays = tuple(spec for spec in trajectory_arrays(shape) if spec.name != "physics")
+    group = f"{record.name}.zarr"
+    layers = [
+        Layer(
+            name=f"{record.name}/trajectories",
+            group=f"{group}/trajectories",
+            kind="trajectories",
+            arrays=arrays,
+            **given,
+        )
+    ]
+    for name in picture_arrays(record.views, record.hidden_goal):
+        spec = image_array(name, record.size, record.spec.camera_moves, rows)
+        place = f"{record.name}/{spec.stored_name}"
+        layers.append(Layer(name=place, group=f"{group}/{record.setting}", kind="images", arrays=(spec,), **given))
+    return layers
 
 
 def _sources(found: list[Path], task, level, setting) -> list[_Source]:
@@ -211,7 +209,7 @@ def _record(
     for number, path in enumerate(folders):
         if not any(place.folder == number for place in places):
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
-    family = get_task(task).family
+    of = get_task(task)
     pairs = [_goal_pair(place, place.read(), len(folders)) for place in places] if setting == FIXED else []
     goals = max(pairs, default=0) + 1
     in_order = pairs == [pair for pair in range(goals) for _ in range(len(pairs) // goals)]
@@ -229,13 +227,16 @@ def _record(
         level=level,
         setting=setting,
         episodes=len(places),
-        episodes_per_shard=min(DEFAULT_EPISODES_PER_SHARD[family], len(places)),
+        layers=("none-yet",),
         size=size,
         renderer={"name": IMPORTED},
-        family=family,
+        family=of.family,
         views=views,
         hidden_goal=hidden,
-        max_steps=_time_limit(places, get_task(task)),
+        max_steps=_time_limit(places, of),
+        seconds_per_step=ACTION_REPEAT * of.control_timestep,
+        joints=tuple(of.model.joint(number).name for number in range(of.model.njnt)),
+        actuators=tuple(of.model.actuator(number).name for number in range(of.model.nu)),
         fixed_goals=goals if pairs else None,
         episodes_per_goal=len(pairs) // goals if pairs and in_order else None,  # else the episodes' labels say it
     )
@@ -303,59 +304,32 @@ def _refuse_missing(path: Path) -> None:
             )
 
 
-def _fingerprint(files: list[str]) -> dict[str, Any]:
-    """Which files a subset was made from."""
-    return {"count": len(files), "sha256": sha256_bytes("\n".join(files).encode())}
+def _import_subset(source: _Source, layers: list[Layer], store: Store, progress: ProgressCallback) -> None:
+    """Write the shards that some layer lacks. The last shard is filled up with empty episodes."""
+    first = layers[0]
+    count = first.episodes_per_shard
+    done = [recorded_shards(store, layer.name) for layer in layers]
+    for shard in range(first.shards_for(source.record.episodes)):
+        span = first.episodes_of(shard)
+        places = source.episodes[span.start : span.stop]
+        if not all(shard in there for there in done):
+            arrays = {
+                spec.name: np.zeros((count, *([first.rows] if spec.steps else []), *spec.shape), spec.dtype)
+                for layer in layers
+                for spec in layer.arrays
+            }
+            for row, place in enumerate(places):
+                _import_episode(source, place, {name: array[row : row + 1] for name, array in arrays.items()})
+            for layer in layers:
+                put_shard(store, layer, shard, [(spec.name, arrays[spec.name]) for spec in layer.arrays])
+        progress(len(places))
 
 
-def _refuse_other_files(sources: list[_Source], out: Path) -> None:
-    """Raises StoreError if subsets of `out` were made from files that are not the first ones of those here."""
-    if not (out / MANIFEST).exists():
-        return
-    old = local_manifest(out)
-    for source in sources:
-        name = source.record.name
-        recipes = (old.recipe, *(addition.recipe for addition in old.additions))
-        known = [facts for recipe in recipes if (facts := (recipe.get("files") or {}).get(name))]
-        if any(_fingerprint(source.files[: facts["count"]]) != facts for facts in known):
-            raise StoreError(
-                f"{out} holds {name} from {known[-1]['count']} other files than the first of these "
-                f"{len(source.files)}, and its episodes would be numbered anew; choose another --out"
-            )
-
-
-def _episodes_to_come(record: SubsetRecord, out: Path) -> int:
-    return record.episodes - sum(commit.episode_count for commit in read_commits(out, record).values())
-
-
-def _import_subset(source: _Source, out: Path, progress: ProgressCallback) -> None:
-    record = source.record
-    task = get_task(record.task)
-    rows = record.max_steps + 1
-    specs = imported_specs(record)
-    attributes: dict[str, Any] = {
-        "task": record.task,
-        "level": record.level,
-        "setting": record.setting,
-        "imported": "DMC-VB",
-    }
-    attributes["state_fields"] = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
-    attributes["views"] = list(record.views)
-    create_subset(out, record, specs, rows, attributes)
-    done = read_commits(out, record)
-    for shard in sorted(set(range(shard_count(record))) - set(done)):
-        places = source.episodes[slice(*shard_episodes(record, shard))]
-        arrays = {
-            spec.name: np.zeros((len(places), *([rows] if spec.steps else []), *spec.shape), spec.dtype)
-            for spec in specs
-        }
-        for row, place in enumerate(places):
-            one = {name: array[row : row + 1] for name, array in arrays.items()}
-            values, fixed = place.read(), record.setting == FIXED
-            _fill(one, values, record, place.file)
-            arrays["goal_pair"][row] = _goal_pair(place, values, len(source.folders)) if fixed else -1
-            progress(1)
-        write_shard(out, record, shard, arrays.items(), arrays["length"])
+def _import_episode(source: _Source, place: Place, arrays: dict[str, np.ndarray]) -> None:
+    values, fixed = place.read(), source.record.setting == FIXED
+    _fill(arrays, values, source.record, place.file)
+    arrays["behaviour"][0] = -1
+    arrays["goal_pair"][0] = _goal_pair(place, values, len(source.folders)) if fixed else -1
 
 
 def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], record: SubsetRecord, file: Path) -> None:
