@@ -12,6 +12,8 @@ from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from dmcvb_gen.benchmarks.evaluate import Score
     from dmcvb_gen.loaders.release import ReleaseReader
 __all__ = [
@@ -32,27 +34,37 @@ __all__ = [
 ]
 
 
-def open(path: str, storage_options: dict | None = None, *, paint: bool = False, **painting: Any) -> ReleaseReader:
+def open(
+    path: str | Path,
+    storage_options: dict | None = None,
+    *,
+    digest: str | None = None,
+    paint: bool = False,
+    **painting: Any,
+) -> ReleaseReader:
     """Open a release for reading: `dmcvb_gen.open("releases/demo")["walker-walk/expert/dynamic"]`.
 
     Args:
-      path: its folder, or any fsspec URL ("s3://bucket/name"), which is read in place.
-      storage_options: passed to fsspec for a URL.
+      path: its folder, or a URL ("s3://bucket/name", "https://...", "hf://datasets/OWNER/NAME"), which is read in
+        place; either may end in "@sha256:<digest>".
+      storage_options: options of the storage client, for a URL.
+      digest: SHA-256 of the manifest, from a source that you trust; compared before anything else is read.
       paint: paint pictures when they are read instead of reading them; needs the simulator installed.
       painting: how (`dmcvb_gen.loaders.painted.Painting`): distractors="stored" (those of the data) or "resample"
         (fresh ones for each `set_epoch`), size, backgrounds, cache_bytes (painted episodes kept a subset).
 
     Raises:
-      StoreError: there is no release, it cannot be read, or the URL needs a package that is not installed.
+      StoreError: there is no release, it cannot be read, it has another digest, or the URL needs a package that is
+        not installed.
       DmcvbError: `painting` has an unknown field or value.
     """
     if paint or painting:
         from dmcvb_gen.loaders.painted import open_painted
 
-        return open_painted(path, storage_options, **painting)
+        return open_painted(path, storage_options, digest, **painting)
     from dmcvb_gen.loaders.release import open_for_reading
 
-    return open_for_reading(path, storage_options)
+    return open_for_reading(path, storage_options, digest)
 
 
 def evaluate(policy: Any, where: str, **options: Any) -> Score:

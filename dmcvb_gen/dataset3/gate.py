@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from dmcvb_gen.dataset3.manifest import (
     COPY,
@@ -108,7 +108,7 @@ class Release:
     @classmethod
     def open(
         cls, place: str | Path | Store, options: Mapping[str, Any] | None = None, digest: str | None = None
-    ) -> Release:
+    ) -> Self:
         """Open a release.
 
         Args:
@@ -146,7 +146,7 @@ class Release:
         return cls(store, manifest, found, digest is not None or copy is not None, copy)
 
     @classmethod
-    def in_making(cls, store: Store) -> Release:
+    def in_making(cls, store: Store) -> Self:
         """Open what recipes ask for, as far as it is made; for whoever goes on with it.
 
         Raises:
@@ -298,10 +298,14 @@ class Release:
     @functools.cached_property
     def subsets(self) -> dict[str, Any]:
         """The subsets that have episodes here, by name."""
+        made = {record.name: self._subset(record) for record in self.manifest.subsets}
+        return {name: subset for name, subset in made.items() if len(subset.episodes)}
+
+    def _subset(self, record: SubsetRecord) -> Any:
+        """A subset in the form that this class of releases gives."""
         from dmcvb_gen.dataset3.reader import Subset
 
-        made = {record.name: Subset(self, record) for record in self.manifest.subsets}
-        return {name: subset for name, subset in made.items() if len(subset.episodes)}
+        return Subset(self, record)
 
     def select(self, patterns: Sequence[str] = ()) -> list[str]:
         """Names of the manifest's subsets that fit any pattern such as "walker-walk/*/static", all by default."""

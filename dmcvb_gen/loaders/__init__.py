@@ -12,7 +12,7 @@ _HOMES = {
     "ReleaseReader": "release",
     "SubsetReader": "release",
     "open_for_reading": "release",
-    "StepSource": "source",
+    "StepSource": "sampler",
     "EpisodeDataset": "torch_data",
     "StepDataset": "torch_data",
     "StreamDataset": "torch_data",

@@ -19,13 +19,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from dmcvb_gen.dataset.pictures import Pictures
+from dmcvb_gen.dataset3.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import DistractorSampler, DistractorSetting, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, UnknownNameError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look
-from dmcvb_gen.loaders.stream import check_count
+from dmcvb_gen.loaders.sampler import check_count
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream

@@ -1,6 +1,6 @@
 """Environments that show what the data show: stacks of frames, channels first.
 
-A policy trained on `stream.stream` or a `StepSource` sees the same layout here: the last `stack` frames, oldest first,
+A policy trained on `sampler.stream` or a `StepSource` sees the same layout here: the last `stack` frames, oldest first,
 each with its views in their order, and the first frame of an episode repeated before it.
 """
 

@@ -10,26 +10,25 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset import Release, open_release
-from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
-from dmcvb_gen.dataset.pictures import picture_arrays, picture_of
-from dmcvb_gen.dataset.reader import StoredArray, without_ellipsis
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import SubsetRecord
+from dmcvb_gen.dataset3.pictures import picture_of
+from dmcvb_gen.dataset3.reader import StoredArray, without_ellipsis
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.generate.inputs import background_source
-from dmcvb_gen.generate.jobs import stream_names
+from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
+from dmcvb_gen.generate.resolve import all_pictures, stream_names
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
-from dmcvb_gen.storage.remote import is_url
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import quoted
 
@@ -108,22 +107,11 @@ class PaintedSubset(SubsetReader):
       epoch: epoch of the distractors; 0 at the start.
     """
 
-    def __init__(
-        self,
-        root: str,
-        record: SubsetRecord,
-        commits: Mapping[int, CommitRecord],
-        storage_options: dict,
-        manifest: Manifest,
-        painting: Painting,
-    ):
+    def __init__(self, release: Release, record: SubsetRecord, painting: Painting):
         # What is stored may be of another size, or without pictures; this subset says what can be read of it.
-        shown = {"size": painting.size or record.size, "pixels": True}
-        super().__init__(root, record.model_copy(update=shown), commits, storage_options)
+        super().__init__(release, record.model_copy(update={"size": painting.size or record.size}))
         self.painting, self.epoch = painting, 0
         self._other_frames = self.fresh or self.record.size != record.size
-        self._seed = int(manifest.recipe_of(record.name).get("seed", 0))
-        self._names = stream_names(manifest, record)
         self._start()
 
     def _start(self) -> None:
@@ -133,8 +121,8 @@ class PaintedSubset(SubsetReader):
         self._bytes, self._lock = 0, threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:  # painters and what they painted stay where they are
-        left = ("_kept", "_drawn", "_bytes", "_painter", "_lock")
-        return {name: value for name, value in super().__getstate__().items() if name not in left}
+        names = ("painting", "epoch", "_other_frames")
+        return super().__getstate__() | {name: getattr(self, name) for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -148,7 +136,7 @@ class PaintedSubset(SubsetReader):
         """
         raise StoreError(
             f"xarray shows what is stored of {self.name}, and paints nothing; open the release without paint=True, or "
-            f"paint it first: dmcvb-gen paint {quoted(self.root)}"
+            f"paint it first: dmcvb-gen paint {quoted(self.release.place)}"
         )
 
     def set_epoch(self, epoch: int) -> None:
@@ -168,8 +156,12 @@ class PaintedSubset(SubsetReader):
     @property
     def picture_names(self) -> tuple[str, ...]:
         """All arrays that can be painted."""
-        task, views = get_task(self.task), self.record.views
-        return picture_arrays(views) + (picture_arrays(views, hide_goal=True) if task.goal_geoms else ())
+        return all_pictures(self.record)
+
+    @property
+    def unpainted(self) -> np.ndarray:
+        """(episode of the whole subset,) bool: none is without images."""
+        return np.zeros(self.record.episodes, bool)
 
     @property
     def arrays(self) -> tuple[str, ...]:
@@ -286,8 +278,8 @@ class PaintedSubset(SubsetReader):
     def _draw_labels(self, episodes: list[int]) -> None:
         new = [episode for episode in episodes if (episode, self.epoch) not in self._drawn]
         if new:
-            names, (_, videos) = (*self._names, f"epoch {self.epoch}"), self._open_painter()
-            streams = (self.record, self._seed, names, np.array(new))
+            names, (_, videos) = (*stream_names(self.trajectories), f"epoch {self.epoch}"), self._open_painter()
+            streams = (self.record, int(self.trajectories.makes["seed"]), names, np.array(new))
             physics, length, action = (self.read(name, new) for name in ("physics", "length", "action"))
             labels = distractor_state_of(*streams, physics, length, videos, action)
             self._drawn |= {(episode, self.epoch): labels[place] for place, episode in enumerate(new)}
@@ -300,12 +292,30 @@ class PaintedSubset(SubsetReader):
         given = self.painting.backgrounds
         if given and self.painting.distractors == RESAMPLED:
             return given  # fresh distractors may show other videos
-        if is_url(self.root) and not given and (self.record.backgrounds or {}).get("source", "builtin") != "builtin":
-            raise StoreError(f"{self.name} shows videos of its own; fetch the release, or give backgrounds=FOLDER")
-        return background_source(Path(self.root), self.record, given)
+        root = given or local_inputs(self.release.store, self.release.inputs_of([self.name]))
+        return background_source(root, self.record, given)
 
 
-def open_painted(path: str, storage_options: dict | None = None, **painting: Any) -> ReleaseReader:
+class PaintedRelease(ReleaseReader):
+    """A release whose subsets are painted when they are read.
+
+    Attributes:
+      painting: how.
+      missing: only subsets that lack some images are painted; the others are read as they are stored.
+    """
+
+    painting: Painting
+    missing: bool = False
+
+    def _subset(self, record: SubsetRecord) -> SubsetReader:
+        stored = SubsetReader(self, record)
+        whole = self.missing and not stored.unpainted.any()
+        return stored if record.imported or whole else PaintedSubset(self, record, self.painting)
+
+
+def open_painted(
+    path: str | Path, storage_options: dict | None = None, digest: str | None = None, **painting: Any
+) -> ReleaseReader:
     """A release whose pictures are painted when they are read; see `dmcvb_gen.open` and `Painting`.
 
     Raises:
@@ -316,7 +326,7 @@ def open_painted(path: str, storage_options: dict | None = None, **painting: Any
     for name in painting:
         if name not in known:
             raise UnknownNameError("option of painting", name, known)
-    return painted_release(open_release(path, storage_options), Painting(**painting))
+    return painted_release(Release.open(path, storage_options, digest), Painting(**painting))
 
 
 def painted_release(release: Release, painting: Painting, missing: bool = False) -> ReleaseReader:
@@ -329,11 +339,7 @@ def painted_release(release: Release, painting: Painting, missing: bool = False)
       StoreError: the release was imported, and not only missing pictures are to be painted.
     """
     if all(record.imported for record in release.manifest.subsets) and not missing:
-        raise StoreError(f"{release.root} was imported and has no physics states to paint from; open it without paint")
-    subsets = {
-        name: subset.read_as(SubsetReader)
-        if subset.record.imported or (missing and subset.record.pixels and not subset.unpainted.any())
-        else subset.read_as(PaintedSubset, release.manifest, painting)
-        for name, subset in release.subsets.items()
-    }
-    return ReleaseReader(release.root, release.manifest, subsets)
+        raise StoreError(f"{release.place} was imported and has no physics states to paint from; open it without paint")
+    painted = PaintedRelease(release.store, release.manifest, release.digest, release.compared, release.copy)
+    painted.painting, painted.missing = painting, missing
+    return painted

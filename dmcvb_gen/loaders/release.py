@@ -2,42 +2,46 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.dataset import Release, Subset, open_release
-from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.loaders.source import StepSource
-from dmcvb_gen.loaders.stream import Steps, stream
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset3.manifest import SubsetRecord
+from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.errors import UnknownNameError
+from dmcvb_gen.loaders.sampler import Steps, StepSource, stream
 
 if TYPE_CHECKING:
     import xarray
 
 
 class SubsetReader(Subset):
-    """A subset with the forms that training code wants; see `Subset` for the rest."""
+    """A subset with the forms that training code wants; see `Subset` for the rest.
+
+    `len(subset)` counts the episodes that are here, `subset[0]` is the first of them.
+    """
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """The arrays of the `index`-th episode that is here, see `episode`; negative ones count from the end."""
+        return self.episode(int(self._episodes[index]))
 
     def xarray(self, episodes: Iterable[int] | None = None) -> xarray.Dataset:
         """All arrays as one lazy xarray data set.
 
         Args:
-          episodes: indices of committed episodes, all by default.
+          episodes: indices of episodes that are here, all by default.
 
         Returns:
           Dimensions episode and step (and height, width, ...), coordinates `episode` and `step`, variables by the
-          store's names with "/" as "_" ("exogenous_camera_position"); read when used.
+          readers' names with "/" as "_" ("exogenous_camera_position"); read when used.
 
         Raises:
-          StoreError: an episode is not there, or has not been painted although others have; also if values are used
-            that are damaged or cannot be read.
+          StoreError: an episode is not here; also if values are used that are not here, damaged or cannot be read.
         """
-        from dmcvb_gen.loaders.lazy import lazy_dataset
+        from dmcvb_gen.loaders.xarray_data import lazy_dataset
 
-        chosen = self.choose(episodes)
-        if any(name in self.paths for name in self.pixel_arrays) and self.unpainted[chosen].any():
-            raise StoreError(self._without_pictures)  # they would read as black
-        return lazy_dataset(self, chosen)
+        return lazy_dataset(self, self.choose(episodes))
 
     def torch(self, kind: str = "steps", **options: Any) -> Any:
         """A torch data set.
@@ -52,14 +56,16 @@ class SubsetReader(Subset):
         """
         from dmcvb_gen.loaders import torch_data
 
-        kinds: dict[str, Callable[..., Any]] = {
+        kinds = {
             "steps": torch_data.StepDataset,
-            "transitions": functools.partial(torch_data.StepDataset, next_step=True),
+            "transitions": torch_data.StepDataset,
             "episodes": torch_data.EpisodeDataset,
             "stream": torch_data.StreamDataset,
         }
         if kind not in kinds:
             raise UnknownNameError("kind of data set", kind, kinds)
+        if kind == "transitions":
+            options["next_step"] = True
         return kinds[kind](self, **options)
 
     def source(self, **options: Any) -> StepSource:
@@ -67,21 +73,20 @@ class SubsetReader(Subset):
         return StepSource(self, **options)
 
     def batches(self, batch_size: int, **options: Any) -> Iterator[Steps]:
-        """One pass over the steps in shuffled numpy batches; `options` as for `StreamDataset`."""
+        """One pass over the steps in shuffled numpy batches; `options` as for `sampler.stream`."""
         return stream(self, batch_size=batch_size, **options)
 
 
 class ReleaseReader(Release):
     """A release whose subsets are `SubsetReader`s."""
 
-    subsets: Mapping[str, SubsetReader]
+    def _subset(self, record: SubsetRecord) -> SubsetReader:
+        return SubsetReader(self, record)
 
     def __getitem__(self, name: str) -> SubsetReader:
-        return cast(SubsetReader, super().__getitem__(name))
+        return super().__getitem__(name)
 
 
-def open_for_reading(path: str, storage_options: dict | None = None) -> ReleaseReader:
+def open_for_reading(path: str | Path, storage_options: dict | None = None, digest: str | None = None) -> ReleaseReader:
     """See `dmcvb_gen.open`."""
-    release = open_release(path, storage_options)
-    subsets = {name: subset.read_as(SubsetReader) for name, subset in release.subsets.items()}
-    return ReleaseReader(release.root, release.manifest, subsets)
+    return ReleaseReader.open(path, storage_options, digest)

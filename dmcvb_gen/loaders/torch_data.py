@@ -6,16 +6,15 @@ They hold no open files, so they may be sent to the workers of a `DataLoader`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.pictures import shown
-from dmcvb_gen.dataset.steps import Selection, StepTable
-from dmcvb_gen.loaders.source import StepSource
-from dmcvb_gen.loaders.stream import Steps, stream
+from dmcvb_gen.dataset3.pictures import shown
+from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset3.steps import Selection, StepTable
+from dmcvb_gen.loaders.sampler import Steps, StepSource, Views, stream
 
 
 def _tensors(values: Steps) -> dict[str, torch.Tensor]:
@@ -55,7 +54,7 @@ class _OfEpoch:
 
 
 class StepDataset(_OfEpoch, Dataset):
-    """Any step at random: frame stack, state, action, reward, discount (see `source.StepSource`), as tensors.
+    """Any step at random: frame stack, state, action, reward, discount (see `StepSource`), as tensors.
 
     A `DataLoader` takes whole batches from it at once. Held in memory, as by default if it fits, it is as fast as
     a `StreamDataset`; larger subsets are better streamed.
@@ -90,12 +89,7 @@ class EpisodeDataset(_OfEpoch, Dataset):
       episodes, pictures: see `StepSource`.
     """
 
-    def __init__(
-        self,
-        subset: Subset,
-        episodes: Sequence[int] | None = None,
-        pictures: Sequence[str] | Literal["agents"] | None = None,
-    ):
+    def __init__(self, subset: Subset, episodes: Sequence[int] | None = None, pictures: Views = None):
         super().__init__(subset)
         self.pictures, self.episodes = shown(subset, pictures).arrays, subset.choose(episodes)
 
@@ -118,7 +112,7 @@ class StreamDataset(_OfEpoch, IterableDataset):
     `set_epoch` before each epoch for another order.
 
     Args:
-      batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `stream.stream`.
+      batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `sampler.stream`.
       rank, world: this process's share; those of torch.distributed by default, if it runs.
     """
 

@@ -28,7 +28,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
-from dmcvb_gen.loaders.stream import check_count
+from dmcvb_gen.loaders.sampler import check_count
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.storage.places import is_url
 from dmcvb_gen.storage.places import shown as shown_place

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
 import threading
 
@@ -16,9 +15,8 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.index import write_release
 from dmcvb_gen.dataset.manifest import commit_path
-from dmcvb_gen.dataset.pictures import picture_arrays
 from dmcvb_gen.dataset.writer import finish_release
-from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.generate import executors, paint
 from dmcvb_gen.generate.paint import paint_release, without_pictures
@@ -200,189 +198,6 @@ def test_without_pictures_commands_say_how_to_get_them(made, tmp_path):
     ):
         result = run(*command)
         assert result.exit_code == 2 and "dmcvb-gen paint" in result.output, result.output
-
-
-@pytest.mark.parametrize("which", ["light", "painted"])
-def test_pictures_painted_on_reading_are_the_stored_ones(made, which):
-    stored = dmcvb_gen.open(str(made / "painted"))
-    fresh = dmcvb_gen.open(str(made / which), paint=True, cache_bytes=1)
-    for name, subset in stored.subsets.items():
-        for array in subset.pixel_arrays:
-            assert np.array_equal(fresh[name].read(array), subset.read(array)), (name, array)
-            for index in np.s_[..., 0], np.s_[..., 0:1], np.s_[0, ..., 1], np.s_[:1, 2], np.s_[...]:
-                assert np.array_equal(fresh[name].array(array)[index], subset.array(array)[index]), (array, index)
-        one, other = (next(iter(s.batches(4, seed=1))) for s in (subset, fresh[name]))
-        assert all(np.array_equal(one[key], other[key]) for key in one)
-
-
-def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
-    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
-    array = subset.picture_names[0]
-    before, state = subset.read(array, [0]), subset.read("state", [0])
-    subset.set_epoch(1)
-    after = subset.read(array, [0])
-    assert (before != after).any() and np.array_equal(state, subset.read("state", [0]))
-    subset.set_epoch(0)
-    assert np.array_equal(before, subset.read(array, [0]))
-
-
-def test_labels_of_fresh_distractors_are_those_of_their_pictures(made):
-    """The labels of an epoch are the ones that its pictures are painted from."""
-    for name in dmcvb_gen.open(str(made / "light")):
-        subset = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")[name]
-        stored, episode = dmcvb_gen.open(str(made / "light"))[name], int(subset.episodes[-1])
-        labels = [array for array in subset.arrays if array.startswith("exogenous/")]
-        shapes = {array: stored.read(array, [episode]).shape for array in labels}
-        rows, seen = int(stored.read("length", [episode])[0]) + 1, []
-        for epoch in (0, 1):
-            subset.set_epoch(epoch)
-            alone = subset.episode(episode)
-            for array in labels:
-                read = subset.read(array, [episode])
-                assert read.shape == shapes[array] and read.dtype == stored.array(array).dtype
-                assert not read[:, rows:].any()
-                np.testing.assert_array_equal(read[0, :rows], alone[array])
-            renderer, _ = subset._open_painter()
-            shown, views = subset.labels([episode])[:, :rows], subset.record.views
-            physics = stored.read("physics", [episode])[0, :rows]
-            pictures = renderer.render(physics, shown[0], views, False)
-            for place, array in enumerate(picture_arrays(views)):
-                np.testing.assert_array_equal(pictures[:, place], alone[array])
-            seen.append(np.concatenate([np.ravel(alone[array]) for array in labels] or [np.zeros(0)]))
-        assert stored.record.distractor.kind == "none" or (seen[0] != seen[1]).any()
-
-
-def test_stored_modalities_are_read_with_their_own_pictures_alone(made, tmp_path):
-    name = next(reversed(dmcvb_gen.open(str(made / "light")).subsets))
-    dmcvb_gen.repaint(made / "light", only=[name], labels=["depth"], out=tmp_path / "r", progress=False)
-    [same] = dmcvb_gen.open(str(tmp_path / "r"), paint=True).subsets.values()
-    depths = [array for array in same.arrays if array.startswith("depth")]
-    assert depths and set(depths) < set(same.episode(0))
-    for options in ({"size": 24}, {"distractors": "resample"}):
-        [subset] = dmcvb_gen.open(str(tmp_path / "r"), paint=True, **options).subsets.values()
-        assert set(same.arrays) - set(subset.arrays) == set(depths) and not set(depths) & set(subset.episode(0))
-        with pytest.raises(StoreError, match="depth.* of .* belongs to the images as they were made"):
-            subset.array(depths[0])
-
-
-def test_painted_pictures_of_no_episodes_are_an_empty_array(small_release):
-    subset = next(iter(dmcvb_gen.open(str(small_release), paint=True).subsets.values()))
-    assert subset.array("pixels")[0:0].shape == (0, *subset.array("pixels").shape[1:])
-    assert subset.read("pixels", []).shape == subset.array("pixels")[0:0].shape
-
-
-def test_fresh_distractors_are_the_same_alone_and_drawn_together(made, monkeypatch):
-    opened = [dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample") for _ in range(2)]
-    together, alone = (next(reversed(release.subsets.values())) for release in opened)
-    array, episodes = together.picture_names[0], together.episodes[::-1]
-    batch = together.rows([array], episodes)[array]
-    monkeypatch.setattr("dmcvb_gen.loaders.painted.DRAWN_TOGETHER", 1)
-    assert len(together._drawn) == len(episodes)
-    np.testing.assert_array_equal(batch, np.concatenate([alone.rows([array], [e])[array] for e in episodes]))
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-@pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
-def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made, kind, workers):
-    import torch
-
-    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
-    few = [int(subset.episodes[0])]
-    data = subset.torch(kind, episodes=few, **({"batch_size": 4, "shuffle": False} if kind == "stream" else {}))
-    loader = torch.utils.data.DataLoader(
-        data, batch_size=None if kind == "stream" else 1, num_workers=workers, persistent_workers=workers > 0
-    )
-    seen = []
-    for epoch in (0, 1, 0):
-        data.set_epoch(epoch)
-        seen.append([(batch["pixels"].numpy().copy(), batch["state"].numpy().copy()) for batch in loader])
-    assert len(seen[0]) == len(seen[1]) == len(seen[2]) > 0
-    first, second, third = ([np.concatenate([np.ravel(b[i]) for b in part]) for i in (0, 1)] for part in seen)
-    if kind != "stream":  # which takes another order besides
-        assert np.array_equal(first[1], second[1])
-    assert not np.array_equal(first[0], second[0]) and np.array_equal(first[0], third[0])
-
-
-def test_a_source_in_memory_shows_the_subsets_epoch(made):
-    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
-    source = subset.source(episodes=[int(subset.episodes[0])])
-    before = source[3]["pixels"]
-    assert source.in_memory and source.table is source.table
-    subset.set_epoch(1)
-    assert (source[3]["pixels"] != before).any()
-    subset.set_epoch(0)
-    assert np.array_equal(source[3]["pixels"], before)
-
-
-@pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
-def test_each_data_set_shows_the_epoch_that_it_was_given(made, kind):
-    opened = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")
-    subset = next(reversed(opened.subsets.values()))
-    options = {"episodes": [int(subset.episodes[0])]}
-    if kind == "stream":
-        options |= {"batch_size": 4, "shuffle": False}
-
-    def pictures(data):
-        items = data if kind == "stream" else [data[index] for index in range(len(data))]
-        return np.concatenate([np.ravel(item["pixels"].numpy()) for item in items])
-
-    sets, wanted = [subset.torch(kind, **options) for _ in range(2)], []
-    for epoch in (1, 2):
-        subset.set_epoch(epoch)
-        wanted.append(pictures(sets[0]))  # given none, it shows the subset's
-    for data, epoch in zip(sets, (1, 2), strict=True):
-        data.set_epoch(epoch)
-    assert [np.array_equal(pictures(data), want) for data, want in zip(sets, wanted, strict=True)] == [True, True]
-    assert np.array_equal(pictures(sets[0]), wanted[0]) and not np.array_equal(*wanted)
-    if kind == "stream":
-        subset.set_epoch(0)
-        assert np.array_equal(pictures(subset.torch(kind, epoch=2, **options)), wanted[1])
-
-
-def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
-    subset = next(reversed(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample").subsets.values()))
-    streams = [subset.torch("stream", batch_size=4, shuffle=False, buffer=1, epoch=epoch) for epoch in (1, 2)]
-    alone = [[batch["pixels"].numpy() for batch in stream] for stream in streams]
-    turns = [[pair[index]["pixels"].numpy() for pair in zip(*streams, strict=True)] for index in (0, 1)]
-    assert len(alone[0]) > 2 and not np.array_equal(alone[0][-1], alone[1][-1])
-    for one, other in zip(alone, turns, strict=True):
-        assert all(map(np.array_equal, one, other))
-
-
-@pytest.mark.parametrize("way", [{}, {"paint": True, "distractors": "resample"}])
-def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
-    subset = next(reversed(dmcvb_gen.open(str(made / "painted"), **way).subsets.values()))
-    from dmcvb_gen.dataset.steps import StepTable
-
-    tables, real = [], StepTable.read
-    monkeypatch.setattr(StepTable, "read", lambda *options: tables.append(1) or real(*options))
-    source = pickle.loads(pickle.dumps(subset.source()))
-    threads = [threading.Thread(target=lambda: source[0]) for _ in range(6)]
-    [thread.start() for thread in threads]
-    [thread.join() for thread in threads]
-    assert len(tables) == 1
-
-
-def test_painted_episodes_are_kept_while_there_is_room(made):
-    subset = next(iter(dmcvb_gen.open(str(made / "light"), paint=True).subsets.values()))
-    name = subset.picture_names[0]
-    assert subset.painted(0, [name])[name] is subset.painted(0)[name]
-    subset.painting.__dict__["cache_bytes"] = 1
-    first = subset.painted(1, [name])[name]
-    assert subset.painted(2) and subset.painted(1, [name])[name] is not first
-
-
-def test_a_torch_loader_with_workers_paints(made):
-    import torch
-
-    subset = next(iter(dmcvb_gen.open(str(made / "light"), paint=True).subsets.values()))
-    loader = torch.utils.data.DataLoader(subset.torch("stream", batch_size=4), batch_size=None, num_workers=1)
-    assert sum(len(batch["reward"]) for batch in loader) == subset.steps
-
-
-def test_a_way_of_painting_that_there_is_not_is_refused(made):
-    with pytest.raises(DmcvbError, match="resample"):
-        dmcvb_gen.open(str(made / "light"), paint=True, distractors="new")
 
 
 def test_a_release_travels_without_pictures_and_is_painted_where_it_arrives(made, tmp_path):

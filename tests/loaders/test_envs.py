@@ -15,7 +15,7 @@ from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
 
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.dm import DmEnv
@@ -127,7 +127,7 @@ def test_seeds_decide_everything_and_later_episodes_differ():
 def test_pictures_are_those_that_the_store_has_for_the_same_physics_and_labels(small_release):
     env = DistractedEnv("walker-walk", "none", **SMALL, renderer="native")  # as the release was painted
     env.reset(seed=0)
-    episode = open_release(small_release)["walker-walk/random/none"].episode(0)
+    episode = Release.open(small_release)["walker-walk/random/none"].episode(0)
     for step in (0, 250, 500):
         env._stage.state = env._stage.batch.set_physics(episode["physics"][step : step + 1])
         np.testing.assert_array_equal(env._stage.observe()["pixels"][0], episode["pixels"][step])

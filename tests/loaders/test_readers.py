@@ -10,11 +10,11 @@ import torch
 from torch.utils.data import DataLoader
 
 import dmcvb_gen
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.loaders import source as source_module
+from dmcvb_gen.loaders import sampler
 from dmcvb_gen.loaders.release import SubsetReader
-from dmcvb_gen.loaders.stream import stream
+from dmcvb_gen.loaders.sampler import stream
 
 NAME = "walker-walk/random/dynamic"
 
@@ -36,7 +36,7 @@ EVERY_STEP = {(episode, step) for episode in range(3) for step in range(500)}
 def test_open_gives_subsets_and_episodes(small_release):
     release = dmcvb_gen.open(small_release)
     assert len(release.subsets) == 3 and list(release[NAME].episodes) == [0, 1, 2]
-    plain = open_release(small_release)[NAME].episode(1)
+    plain = Release.open(small_release)[NAME].episode(1)
     np.testing.assert_array_equal(release[NAME].episode(1)["pixels"], plain["pixels"])
     with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
         release["walker-walk/expert/none"]
@@ -97,7 +97,7 @@ def test_a_loader_takes_whole_batches_from_steps_that_are_held_by_default(subset
     monkeypatch.setattr(data.source, "gather", lambda indices: asked.append(len(indices)) or gather(indices))
     assert data.source.in_memory and len(list(DataLoader(data, batch_size=64, shuffle=True))) == 24
     assert asked == [64] * 23 + [28]
-    monkeypatch.setattr(source_module, "free_memory", lambda: 1000)
+    monkeypatch.setattr(sampler, "free_memory", lambda: 1000)
     assert not subset.torch("steps").source.in_memory and subset.torch("steps", pictures=()).source.in_memory
 
 
@@ -228,7 +228,7 @@ def test_ranks_get_equally_many_batches_of_episodes_that_differ_in_length(subset
         def _read(self, array, episodes, rows=None):
             return self.lengths[episodes] if array == "length" else super()._read(array, np.minimum(episodes, 2), rows)
 
-    uneven = Uneven(subset.root, subset.record, subset.commits, {})
+    uneven = Uneven(subset.release, subset.record)
     counts, steps, by_worker = [], [], []
     for rank in range(2):
         parts = [
@@ -266,23 +266,27 @@ def test_wrong_names_are_answered_with_the_right_ones(subset, tmp_path):
         subset.torch("steps", pictures=["depth"])
     with pytest.raises(StoreError, match="holds no release"):
         dmcvb_gen.open(tmp_path)
-    with pytest.raises(StoreError, match="cannot use warez"):
-        dmcvb_gen.open("warez://me:secret@x/y")
 
 
-def test_a_missing_file_system_names_its_package(monkeypatch):
-    import fsspec
+def test_a_subset_counts_its_episodes_and_gives_them_in_their_order(subset):
+    assert len(subset) == 3
+    for place, episode in ((0, 0), (-1, 2), (np.int64(1), 1)):
+        one, other = subset[place], subset.episode(episode)
+        assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+    with pytest.raises(IndexError):
+        subset[3]
 
-    def missing(url, **options):
-        raise ImportError("Install s3fs to access S3")
 
-    monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
-    with pytest.raises(StoreError, match="pip install s3fs"):
-        dmcvb_gen.open("s3://bucket/name")
-    with pytest.raises(StoreError, match="pip install gcsfs"):
-        dmcvb_gen.open("gs://bucket/name")
-    with pytest.raises(StoreError, match="pip install huggingface_hub"):
-        dmcvb_gen.open("hf://datasets/me/name")
+def test_a_digest_from_outside_is_compared(small_release):
+    digest = dmcvb_gen.open(small_release).digest
+    for opened in (dmcvb_gen.open(small_release, digest=digest), dmcvb_gen.open(f"{small_release}@sha256:{digest}")):
+        assert opened.compared
+    for other in (
+        lambda: dmcvb_gen.open(small_release, digest="0" * 64),
+        lambda: dmcvb_gen.open(f"{small_release}@sha256:{'0' * 64}", paint=True),
+    ):
+        with pytest.raises(StoreError, match=f"is release {digest}"):
+            other()
 
 
 @pytest.mark.parametrize("in_memory", [True, False])

@@ -9,8 +9,7 @@ import xarray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.reader import StoredArray
+from dmcvb_gen.dataset3.reader import StoredArray, Subset
 
 
 class _Lazy(BackendArray):
@@ -20,10 +19,7 @@ class _Lazy(BackendArray):
         self._array, self.shape, self.dtype = array, array.shape, array.dtype
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
-        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
-
-    def _read(self, key: tuple) -> np.ndarray:
-        return self._array.outer(key)
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._array.outer)
 
 
 def lazy_dataset(subset: Subset, episodes: np.ndarray) -> xarray.Dataset:
@@ -31,9 +27,17 @@ def lazy_dataset(subset: Subset, episodes: np.ndarray) -> xarray.Dataset:
     variables = {}
     for name in subset.arrays:
         array = subset.array(name)
-        # In releases of version 1 a dimension had its array's name, which xarray takes for a coordinate.
-        dimensions = [f"{name}_dim" if name in subset.arrays else name for name in array.dimensions]
         held = indexing.MemoryCachedArray(indexing.LazilyIndexedArray(_Lazy(array)))
-        variables[name.replace("/", "_")] = xarray.Variable(dimensions, held, array.attributes, array.chunking)
-    data = xarray.Dataset(variables, attrs=subset.attrs).isel(episode=episodes)
+        named = xarray.Variable(array.dimensions, held, array.attributes, array.chunking)
+        variables[name.replace("/", "_")] = named
+    record, manifest = subset.record, subset.release.manifest
+    attributes = {
+        "release": f"{manifest.name} {manifest.version}",
+        "task": record.task,
+        "level": record.level,
+        "setting": record.setting,
+        "views": list(record.views),
+        "seconds_per_step": record.seconds_per_step,
+    }
+    data = xarray.Dataset(variables, attrs=attributes).isel(episode=episodes)
     return data.assign_coords(episode=episodes, step=np.arange(data.sizes["step"]))
