@@ -1,0 +1,129 @@
+"""Files that are there and cannot be read, or hold other bytes: one line that names them, wherever they are read."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.errors import DmcvbError, PolicyFileError, StoreError
+from dmcvb_gen.policies.bundled import resolve_policies
+from dmcvb_gen.training.runs import RunConfig
+from dmcvb_gen.training.training import open_run
+
+NAME = "walker-walk/random/dynamic"
+
+
+@pytest.fixture
+def root(small_release, tmp_path):
+    shutil.copytree(small_release, tmp_path / "r")
+    return tmp_path / "r"
+
+
+def one_line(error) -> str:
+    assert isinstance(error, DmcvbError) and "\n" not in str(error)
+    assert len(re.sub(r"\S*/\S*", "", str(error))) < 300  # whatever the place that it names is called
+    return str(error)
+
+
+READERS = {
+    "read": lambda subset: subset.read("pixels"),
+    "episode": lambda subset: subset.episode(0),
+    "each episode": lambda subset: list(subset.each_episode(["pixels"])),
+    "xarray": lambda subset: subset.xarray()["pixels"].values,
+    "xarray, a part": lambda subset: subset.xarray([1])["pixels"].isel(step=slice(1, 3), height=[0, 2]).values,
+    "xarray, load": lambda subset: subset.xarray().load(),
+    "torch, in memory": lambda subset: subset.torch("steps", in_memory=True)[0],
+    "torch, from the store": lambda subset: subset.torch("transitions", in_memory=False)[0],
+    "torch, episodes": lambda subset: subset.torch("episodes")[0],
+    "torch, stream": lambda subset: list(subset.torch("stream")),
+    "batches": lambda subset: list(subset.batches(2)),
+    "source": lambda subset: subset.source()[0],
+}
+
+
+def _file(root, array):
+    """Path of the file of an array in the first shard."""
+    shards = Release.open(root).shards([NAME])
+    return next(root / file.path for shard in shards for file in shard.files if f"/{array}/" in file.path)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_every_reader_names_a_damaged_chunk_in_one_line(root, kind):
+    path = _file(root, "pixels")
+    subset, data = dmcvb_gen.open(str(root))[NAME], path.read_bytes()
+    for spoiled in (b"\xff" * len(data), data[: len(data) // 2]):
+        path.write_bytes(spoiled)
+        with pytest.raises(StoreError, match="pixels.* is damaged") as caught:
+            READERS[kind](subset)
+        assert "regenerate" in one_line(caught.value)
+    path.write_bytes(data)
+    READERS[kind](subset)
+
+
+DAMAGES = {
+    "garbage": lambda path: path.write_bytes(b"\xff\xfe\x00" + path.read_bytes()[3:]),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+    "a link to itself": lambda path: (path.unlink(), path.symlink_to(path.name)),
+    "missing": lambda path: path.unlink(),
+}
+COMMANDS = {
+    "verify": ["verify", "{root}"],
+    "regenerate": ["regenerate", "{root}", "--check"],
+    "publish": ["publish", "{root}", "{there}"],
+    "fetch": ["fetch", "file://{root}", "--out", "{there}"],
+    "export": ["export", "{root}", "--to", "npz", "--out", "{there}"],
+}
+TARGETS = {
+    "manifest": lambda root: root / "manifest.json",
+    "list": lambda root: root / f"layers/{Release.open(root).manifest.layers[0].list}.json",
+    "shard": lambda root: _file(root, "state"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_names_what_it_cannot_read(root, tmp_path, command, target, damage):
+    path = TARGETS[target](root)
+    DAMAGES[damage](path)
+    words = [word.format(root=root, there=tmp_path / "there") for word in COMMANDS[command]]
+    result = CliRunner().invoke(main, words)
+    if (target, damage) == ("manifest", "missing"):
+        return  # it is a release in the making then
+    assert result.exit_code in (1, 2, 3), result.output
+    assert "Traceback" not in result.output and path.name in result.output.replace("\n", "")
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+
+
+def test_a_guarded_data_set_is_lazy_and_reads_what_the_store_holds(root):
+    subset = dmcvb_gen.open(str(root))[NAME]
+    data, whole = subset.xarray(), subset.read("pixels")
+    assert not data["pixels"].variable._in_memory and data["pixels"].encoding["shards"][0] == 2
+    for given, wanted in (
+        (dict(episode=1), whole[1]),
+        (dict(episode=[2, 0], step=slice(None, None, 2)), whole[[2, 0]][:, ::2]),
+        (dict(step=-1, channel=[2, 1]), whole[:, -1][..., [2, 1]]),
+    ):
+        np.testing.assert_array_equal(data["pixels"].isel(given).values, wanted)
+
+
+@pytest.mark.parametrize("place", ["file/x", "file/x/y", "file"])
+def test_a_file_in_the_way_of_a_run_is_said_in_one_line(tmp_path, place):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DmcvbError, match=r"choose (a place that you may write to|another --out)") as caught:
+        open_run(tmp_path / place, RunConfig("cheetah-run", "sac", 10**5, 0, {"compile": False}), resume=False)
+    assert str(tmp_path / place) in one_line(caught.value)
+
+
+@pytest.mark.parametrize("text", [b"\xff", b"[]", b'{"levels": []}', b'{"levels": {"expert": 3}}', b"["])
+def test_a_selection_that_is_damaged_is_as_none(tmp_path, text):
+    (tmp_path / "selection.json").write_bytes(text)
+    with pytest.raises(PolicyFileError, match="select-checkpoints"):
+        resolve_policies("walker-walk", "expert", tmp_path)
