@@ -80,10 +80,10 @@ def fetch(
     if not shards:
         raise StoreError(f"{source.place} has none of these episodes; it has others, see `dmcvb-gen info`")
     layers = {name: None for record in source.manifest.subsets if record.name in names for name in record.layers}
-    download = _Download(source, target, workers, tick)
+    download = _Download(source, target, folder, workers, tick)
     first, last = described_files(source, names), list_files(source, layers)
     files = [*first, *(file for shard in shards for file in shard_files(shard)), *last]
-    download.check_room(folder, files)
+    download.check_room(files)
     expect(tick, sum(file.bytes for file in files))
     text = manifest_text(source)
     download.bring(first)
@@ -147,20 +147,20 @@ class _Download:
       moved: how many files came.
     """
 
-    def __init__(self, source: Release, target: Store, workers: int, tick: ProgressCallback):
+    def __init__(self, source: Release, target: Store, folder: Path, workers: int, tick: ProgressCallback):
         self._source, self._target, self._workers, self._tick = source.store, target, workers, tick
-        self.moved = 0
+        self._folder, self.moved = folder, 0
 
-    def check_room(self, folder: Path, files: Sequence[FileRecord]) -> None:
+    def check_room(self, files: Sequence[FileRecord]) -> None:
         """Raises StoreError if the files that are not here do not fit."""
-        with storage_errors(folder, "write to"):
-            folder.mkdir(parents=True, exist_ok=True)
-            free = shutil.disk_usage(folder).free
-        needed = sum(file.bytes for file in files if not (folder / file.path).exists())
+        with storage_errors(self._folder, "write to"):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            free = shutil.disk_usage(self._folder).free
+        needed = sum(file.bytes for file in files if not (self._folder / file.path).exists())
         if needed > free:
             raise StoreError(
-                f"{format_bytes(needed)} are needed and {format_bytes(free)} are free at {folder}; make room, choose "
-                "another --out, or fetch less with --only and --episodes"
+                f"{format_bytes(needed)} are needed and {format_bytes(free)} are free at {self._folder}; make room, "
+                "choose another --out, or fetch less with --only and --episodes"
             )
 
     def bring_shards(self, shards: Sequence[Shard]) -> None:
@@ -191,6 +191,6 @@ class _Download:
         if wrong:
             if wrong != "is missing":
                 self._target.delete(file.path)
-            self._source.download(file.path, self._target.folder / file.path, file.bytes, file.sha256)
+            self._source.download(file.path, self._folder / file.path, file.bytes, file.sha256)
         self._tick(file.bytes)
         return wrong is not None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset3.gate import Release, Shard
-from dmcvb_gen.dataset3.manifest import COPY, MANIFEST, FileRecord, canonical_json, is_attachment
+from dmcvb_gen.dataset3.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json, is_attachment
 from dmcvb_gen.dataset3.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
@@ -20,9 +20,6 @@ from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.release.tree import attachments, described_files, grows_from, list_files, manifest_text, shard_files
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import quoted
-
-CHECKED = 8
-"""Files whose bytes are compared at a time."""
 
 
 def publish_folder(
@@ -89,9 +86,12 @@ def publish(
     store = open_store(url, options)
     store.begin()
     tag = store.version(MANIFEST)
-    same = tag is not None and _published(store, release)
-    if tag is None:
+    there = None if tag is None else _published(store, release)
+    same = there is not None and there.digest == release.digest
+    if there is None:
         _refuse_others(store, release, shards)
+    elif not same:
+        texts[f"{MANIFESTS}{there.digest}.json"] = manifest_text(there)  # what it replaces can still be cited
     names = [record.name for record in release.manifest.subsets]
     parts: list[Sequence[FileRecord]] = [
         [*described_files(release, names), *(file for shard in shards for file in shard.files)],
@@ -103,8 +103,15 @@ def publish(
     upload = _Upload(release, store, repair, workers, tick)
     for part in parts:
         upload.put(part)
+    plain = plain_metadata(light)
     if not same or upload.moved or _differ(store, texts):
-        _write_manifest(store, light, texts | {MANIFEST: manifest_text(release)}, tag)
+        if not store.writable:  # one commit
+            texts |= plain
+        if not store.finish(texts | {MANIFEST: manifest_text(release)}, expected=tag):
+            raise StoreError(f"{store.place} was published to by another process meanwhile; run the command again")
+    if store.writable:
+        with ThreadPoolExecutor(max(1, workers)) as pool:
+            list(pool.map(store.replace, plain.keys(), plain.values()))
     store.tag(f"v{release.manifest.version}", f"{release.manifest.name} {release.manifest.version}")
     return Moved(len(files), sum(file.bytes for file in files), upload.moved)
 
@@ -116,23 +123,21 @@ def _check_complete(release: Release, root: str | Path, pixels: bool) -> None:
             f"{root} is not complete; fetch or render the rest, or finish it with the same rollout, without --only or "
             "--part"
         )
-    if not pixels and release.manifest.imported:
+    if not pixels and any(record.imported for record in release.manifest.subsets):
         raise StoreError(
             f"{root} was imported, and its images cannot be rendered again; publish it with them, without --no-pixels"
         )
 
 
-def _published(store: Store, release: Release) -> bool:
-    """Return True if this release is at a place, False for one that it has grown from.
+def _published(store: Store, release: Release) -> Release:
+    """The release at a place: this one, or one that it has grown from.
 
     Raises:
       StoreError: another release is there.
     """
     there = Release.open(store)
-    if there.digest == release.digest:
-        return True
-    if grows_from(release, there):
-        return False
+    if there.digest == release.digest or grows_from(release, there):
+        return there
     mine, other = release.manifest, there.manifest
     raise StoreError(
         f"{store.place} already holds {other.name} {other.version} ({str(there.digest)[:12]}), and a published version "
@@ -157,18 +162,6 @@ def _refuse_others(store: Store, release: Release, shards: Sequence[Shard]) -> N
 def _differ(store: Store, texts: Mapping[str, bytes]) -> bool:
     """Return True if an attachment at a place is another one than here."""
     return any(store.size(path) != len(data) or store.read(path, len(data)) != data for path, data in texts.items())
-
-
-def _write_manifest(store: Store, light: Release, texts: Mapping[str, bytes], tag: str | None) -> None:
-    """Attachments, then the manifest, in one step where the place has such; then what plain readers read."""
-    plain = plain_metadata(light)
-    if not store.writable:  # one commit
-        texts = plain | texts
-    if not store.finish(texts, expected=tag):
-        raise StoreError(f"{store.place} was published to by another process meanwhile; run the command again")
-    if store.writable:
-        with ThreadPoolExecutor(CHECKED) as pool:
-            list(pool.map(store.replace, plain.keys(), plain.values()))
 
 
 class _Upload:

@@ -114,7 +114,9 @@ def attachments(store: Store) -> dict[str, bytes]:
 
 
 def grows_from(new: Release, old: Release) -> bool:
-    """Return True if every shard that an older release names is one of the newer, too."""
+    """Return True if every shard that an older release of that name has is one of the newer, too."""
+    if old.manifest.name != new.manifest.name:
+        return False
     for name, layer in old.layers.items():
         if name not in new.layers or new.layers[name].key != layer.key:
             return False
