@@ -7,8 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
-from dmcvb_gen.distractors import DistractorSetting, sample_distractors
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.distractors import Distractor, sample_distractors
 from dmcvb_gen.generate.engine import paint
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.policies.bundled import bundled_policies
@@ -45,7 +45,7 @@ def test_a_maze_release_is_sound_and_the_same_with_two_workers(maze_release, tmp
 
 
 def test_all_views_with_and_without_the_goal(maze_release):
-    subset = open_release(maze_release[0])["ant-maze-tiny/random/visible"]
+    subset = Release.open(maze_release[0])["ant-maze-tiny/random/visible"]
     task, episode = get_task(TINY), subset.episode(0)
     assert set(subset.pixel_arrays) == {
         f"{root}/{view}" for root in ("pixels", "pixels_hidden_goal") for view in task.views
@@ -62,7 +62,7 @@ def test_all_views_with_and_without_the_goal(maze_release):
 
 def test_an_episode_that_ends_early_costs_nothing_past_its_end(tmp_path):
     """Bytes follow the length: chunks past the end are not written."""
-    subset = open_release(_fixed_release(tmp_path, seed=2)).subsets["ant-maze-tiny/random/fixed"]
+    subset = Release.open(_fixed_release(tmp_path, seed=2)).subsets["ant-maze-tiny/random/fixed"]
     sizes = {
         shard: sum(file.bytes for file in commit.files if "pixels" in file.path)
         for shard, commit in subset.commits.items()
@@ -83,7 +83,7 @@ def _fixed_release(tmp_path, seed=0):
 
 
 def test_fixed_goals(tmp_path):
-    subset = open_release(_fixed_release(tmp_path))["ant-maze-tiny/random/fixed"]
+    subset = Release.open(_fixed_release(tmp_path))["ant-maze-tiny/random/fixed"]
     np.testing.assert_array_equal(subset.read("goal_pair"), [0, 0, 1, 1])
     task = get_task(TINY)
     first = [subset.episode(i, ["state", "length"])["state"][0] for i in range(4)]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.modalities.depth import SCALE
 from dmcvb_gen.generate.modalities.flow import STEP
@@ -37,7 +37,7 @@ def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_releas
         roll_out(small_recipe(subsets=[pattern]), source := tmp_path / "source")
     repaint(Repainting(source, tmp_path / "r", size=16, labels=MODALITIES))
     assert verify(tmp_path / "r").sound
-    [(name, subset)] = open_release(tmp_path / "r").subsets.items()
+    [(name, subset)] = Release.open(tmp_path / "r").subsets.items()
     views = get_task(subset.task).views
     assert len([array for array in subset.arrays if array.partition("/")[0] == "flow"]) == len(views)
     for index in range(2):

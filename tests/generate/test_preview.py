@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.generate.preview import LABEL_HEIGHT, VIDEO_SIDE, episode_strip, video_frames
 
 
 @pytest.mark.parametrize("release", ["small_release", "maze_release"])
 def test_the_video_has_512_pixels_on_its_shorter_side_and_shows_the_stored_frames(release, request):
-    subset = next(iter(open_release(request.getfixturevalue(release)).subsets.values()))
+    subset = next(iter(Release.open(request.getfixturevalue(release)).subsets.values()))
     video = video_frames([subset], frames=2)
     assert len(video) == 2 and VIDEO_SIDE <= min(video.shape[1:3]) < VIDEO_SIDE + 200
     array = subset.pixel_arrays[0] if release == "small_release" else "pixels/top"
@@ -23,8 +23,8 @@ def test_the_video_has_512_pixels_on_its_shorter_side_and_shows_the_stored_frame
 
 
 def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
-    maze = next(iter(open_release(maze_release).subsets.values()))
-    walker = next(iter(open_release(small_release).subsets.values()))
+    maze = next(iter(Release.open(maze_release).subsets.values()))
+    walker = next(iter(Release.open(small_release).subsets.values()))
     rows = len(maze.record.views) + 1  # and the map
     strip = episode_strip(maze, 0, columns=20, scale=2)
     assert strip.shape[0] == LABEL_HEIGHT + rows * (LABEL_HEIGHT + 32)

@@ -4,7 +4,6 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset.reader import open_release
 from dmcvb_gen.generate.recipe import expand, load_recipe
 from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import save_policy
@@ -58,7 +57,7 @@ def test_a_recipe_is_planned_and_a_tiny_cut_of_it_is_made_and_verified(name, tmp
     assert planned.exit_code == 0 and not (tmp_path / "r").exists(), planned.output
     made = run(*cut, "--workers", 1)
     assert made.exit_code == 0, made.output
-    release = open_release(tmp_path / "r")
+    release = Release.open(tmp_path / "r")
     assert {subset.record.size for subset in release.subsets.values()} == {16} and release.manifest.complete
     assert not verify(tmp_path / "r").findings
     write_card(tmp_path / "r")

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.rendering import default_renderer
 from dmcvb_gen.tasks import get_task
@@ -36,7 +36,7 @@ def test_a_suite_task_goes_the_whole_way(task_id, tmp_path):
     run("rollout", task_id, *short, "--distractor", "dynamic", "--out", folder)
     assert json.loads(run("verify", folder, "--json"))["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
-    [subset] = open_release(folder).subsets.values()
+    [subset] = Release.open(folder).subsets.values()
     values = subset.episode(1)
     assert values["state"].shape[1] == task.state_size and np.isfinite(values["state"]).all()
     assert len(np.unique(values["pixels"].reshape(-1, 3), axis=0)) > 20  # there is something to see
