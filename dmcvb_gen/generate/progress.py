@@ -80,8 +80,9 @@ def progress_of(store: Any) -> ReleaseProgress:
     rate = _rate(times)
     open_ = sum(total.values()) - sum(done.values())
     finished = Release.open(store)
-    complete = not open_ and not finished.in_the_making and finished.manifest.subsets == asked.manifest.subsets
-    silence = max(0.0, time.time() - times.max()) if len(times) else None
+    there = {} if finished.in_the_making else {record.name: record.episodes for record in finished.manifest.subsets}
+    complete = not open_ and there == {record.name: record.episodes for record in asked.manifest.subsets}
+    silence = max(0.0, time.time() - float(times.max())) if len(times) else None
     left = open_ / rate * 3600 if rate else None
     return ReleaseProgress(asked.manifest.name, subsets, rate, silence, left, complete)
 

@@ -131,11 +131,8 @@ def test_the_slurm_script_begins_does_parts_and_finishes(tmp_path, recipe_file):
         (tmp_path / "bin" / name).write_text(FAKE.format(log=tmp_path / "log"))
         (tmp_path / "bin" / name).chmod(0o755)
     for task in (1, 2):
-        environment = {
-            "PATH": f"{tmp_path}/bin:/usr/bin:/bin",
-            "SLURM_ARRAY_TASK_ID": str(task),
-            "SLURM_ARRAY_JOB_ID": "7",
-        }
+        environment = {"PATH": f"{tmp_path}/bin:/usr/bin:/bin", "SLURM_ARRAY_JOB_ID": "7"}
+        environment["SLURM_ARRAY_TASK_ID"] = str(task)
         subprocess.run(["bash", str(script)], env=environment, check=True)
     begin = f"dmcvb-gen cluster begin --recipe {recipe_file} --out {tmp_path / 'r'}"
     assert (tmp_path / "log").read_text().splitlines() == [
