@@ -68,7 +68,7 @@ def replacing(path: str | Path, new: bool = False) -> Iterator[Path]:
         else:
             os.replace(temporary, path)
             temporary.unlink(missing_ok=True)  # it stays if both names were one file already
-        _flush_folder(path.parent)
+        flush_folder(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -111,7 +111,7 @@ def _umask() -> int:
     return 0o022
 
 
-def _flush_folder(folder: Path) -> None:
+def flush_folder(folder: Path) -> None:
     """Make a rename last through a power cut, if the file system can."""
     try:
         handle = os.open(folder, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""The Hugging Face Hub in a folder: what we call of `huggingface_hub.HfApi`, and its file system."""
+"""The Hugging Face Hub in a folder: what we call of `huggingface_hub.HfApi`, and its web server."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import types
 from pathlib import Path
 
 import pytest
-from fsspec.implementations.dirfs import DirFileSystem
 
 from tests.web_server import give_files, serving
 
@@ -57,10 +56,9 @@ class FakeHub:
             if (self.at(revision) / path).is_file():
                 yield self._facts(path, (self.at(revision) / path).read_bytes())
 
-    def list_repo_tree(self, repo_id, path_in_repo, recursive, revision, repo_type):
-        assert recursive
+    def list_repo_tree(self, repo_id, path_in_repo, revision, repo_type, recursive=False):
         root = self.at(revision)
-        for path in sorted((root / (path_in_repo or "")).rglob("*")):
+        for path in sorted((root / (path_in_repo or "")).glob("**/*" if recursive else "*")):
             name = path.relative_to(root).as_posix()
             yield self._facts(name, path.read_bytes()) if path.is_file() else types.SimpleNamespace(path=name)
 
@@ -103,12 +101,7 @@ def fake_hub(root: Path, monkeypatch, repository: str = "me/tiny") -> FakeHub:
     pytest.importorskip("huggingface_hub")
     hub = FakeHub(root, repository)
 
-    def file_system(url, options):
-        return DirFileSystem(str(root)), re.sub(r"@[^/]*", "", url.removeprefix("hf://")).rstrip("/")
-
     hub.served = serving(give_files(hub.find))  # until the hub is forgotten
     hub.endpoint = hub.served.__enter__().url
     monkeypatch.setattr("dmcvb_gen.storage.hugging_face.new_api", lambda *_: hub)
-    monkeypatch.setattr("dmcvb_gen.storage.hub.new_api", lambda: hub)
-    monkeypatch.setattr("dmcvb_gen.storage.hub.file_system", file_system)
     return hub

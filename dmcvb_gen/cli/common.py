@@ -121,7 +121,7 @@ class OutPath(click.Path):
     """A folder or file of this machine to write to; refuses URLs."""
 
     def convert(self, value, param, ctx):
-        from dmcvb_gen.storage.remote import local_path
+        from dmcvb_gen.storage.places import local_path
 
         try:
             local_path(value)

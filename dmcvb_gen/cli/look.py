@@ -17,7 +17,7 @@ from dmcvb_gen.cli.common import (
     remote_option,
 )
 from dmcvb_gen.cli.unused_options import refuse
-from dmcvb_gen.storage.remote import is_url, public
+from dmcvb_gen.storage.places import is_url, shown
 from dmcvb_gen.text import format_bytes, pluralize, printable, quoted
 
 
@@ -68,10 +68,10 @@ def info(path, options, as_json):
     if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
         click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
-        paint = f"fetch {public(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(path)}"
+        paint = f"fetch {shown(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(path)}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
     if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
-        click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {quoted(public(path))}")
+        click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {quoted(shown(path))}")
     if facts["digest"]:
         compared = "" if facts["compared"] else " (not compared with one from elsewhere)"
         click.echo(f"digest {facts['digest']}{compared}")
@@ -150,16 +150,16 @@ def list_command(remote, options, as_json):
 
 
 def _list_remote(url, options, as_json) -> None:
-    from dmcvb_gen.dataset.catalog import releases_at
+    from dmcvb_gen.release.catalog import releases_at
 
     found = releases_at(url, options)
     if as_json:
         return print_json(found)
-    shown = ("url", "name", "version", "subsets", "episodes", "complete")
+    columns = ("url", "name", "version", "subsets", "episodes")
     print_table(
-        ("release", "<name", "<version", "subsets", "episodes", "complete", "<digest"),
-        [(*(str(facts[key]) for key in shown), (facts["digest"] or "-")[:12]) for facts in found],
-        title=public(url),
+        ("release", "<name", "<version", "subsets", "episodes", "<digest"),
+        [(*(str(facts[key]) for key in columns), facts["digest"][:12]) for facts in found],
+        title=shown(url),
         optional=(("subsets",), ("name",)),
     )
 

@@ -12,7 +12,7 @@ from dmcvb_gen.cli.options import command_of, parse_part
 from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.generate import public
 from dmcvb_gen.options import progress_bar
-from dmcvb_gen.storage.remote import is_url
+from dmcvb_gen.storage.places import is_url
 from dmcvb_gen.text import format_bytes, pluralize
 
 OPTION_GROUPS = {

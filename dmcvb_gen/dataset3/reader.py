@@ -15,7 +15,7 @@ from dmcvb_gen.dataset3.pictures import picture_of
 from dmcvb_gen.dataset3.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.text import quoted
 
 TRANSITIONS = "action", "reward", "discount"

@@ -15,7 +15,8 @@ from dmcvb_gen.dataset3.reader import Subset
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.extras import installed
 from dmcvb_gen.spec import select
-from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.text import quoted
 
 SHEET_COLUMNS = 10

@@ -174,10 +174,10 @@ def paint(
     """
     from dmcvb_gen.generate.paint import Wanted, paint_release
     from dmcvb_gen.generate.request import background_source
-    from dmcvb_gen.storage.remote import is_url, local_path, public
+    from dmcvb_gen.storage.places import is_url, local_path, shown
 
     if is_url(str(release)):
-        url = public(str(release))
+        url = shown(str(release))
         cure = f"fetch and render it: dmcvb-gen fetch {quoted(url)} --paint --out FOLDER"
         raise DmcvbError(f"{url} is a URL; give a local one, or {cure}")
     wanted = Wanted(size, None if views is None else as_names(views), goal)

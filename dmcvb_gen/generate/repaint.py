@@ -34,7 +34,7 @@ from dmcvb_gen.generate.works import works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import Distractor, is_maze
-from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
 
 

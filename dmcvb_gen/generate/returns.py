@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Between, Local, Location, Names, Seed, checked
 from dmcvb_gen.spec import Level, is_maze, task_folder
-from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.text import as_names
 
 

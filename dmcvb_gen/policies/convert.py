@@ -38,7 +38,7 @@ from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.policies.sb3_zip import Facts, facts_of, predict, read_members
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 

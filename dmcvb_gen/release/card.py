@@ -45,7 +45,7 @@ from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
 from dmcvb_gen.release.templates import fill
 from dmcvb_gen.spec import CUE, FIXED, LIGHT, SHAKE
-from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.text import pluralize
 

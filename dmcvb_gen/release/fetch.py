@@ -26,8 +26,8 @@ from dmcvb_gen.release.tree import (
     manifest_text,
     shard_files,
 )
-from dmcvb_gen.storage.places import shown
-from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.places import local_path, shown
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import format_bytes, quoted
 

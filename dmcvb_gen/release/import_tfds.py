@@ -29,7 +29,7 @@ from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_f
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec, subset_name
-from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task

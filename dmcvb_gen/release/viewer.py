@@ -30,9 +30,9 @@ from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
 from dmcvb_gen.loaders.sampler import check_count
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
-from dmcvb_gen.storage.places import is_url
+from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.places import is_url, local_path
 from dmcvb_gen.storage.places import shown as shown_place
-from dmcvb_gen.storage.remote import local_path, storage_errors
 from dmcvb_gen.storage.store import open_store
 
 VIEWER = "preview/viewer.html"

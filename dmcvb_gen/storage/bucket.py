@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,10 @@ class ObjectStore(Store):
         found = self._system.find(self._full(prefix), detail=True)
         start = len(self.base.lstrip("/")) + 1
         return {path.lstrip("/")[start:]: facts["size"] for path, facts in found.items()}
+
+    def _folders(self) -> Iterable[str]:
+        found = self._system.ls(self.base, detail=True)
+        return [facts["name"].rstrip("/").rpartition("/")[2] for facts in found if facts["type"] == "directory"]
 
     # -- writing ----------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -114,6 +114,11 @@ class HubStore(Store):
         given = {"path_in_repo": folder, "recursive": True, "revision": self._commit_read()}
         entries = self._api.list_repo_tree(**self._where, **given)
         return {entry.path.removeprefix(self.folder_there): entry.size for entry in entries if hasattr(entry, "size")}
+
+    def _folders(self) -> Iterable[str]:
+        given = {"path_in_repo": self.folder_there.strip("/") or None, "revision": self._commit_read()}
+        entries = self._api.list_repo_tree(**self._where, **given)
+        return [entry.path.rpartition("/")[2] for entry in entries if not hasattr(entry, "size")]
 
     # -- writing ----------------------------------------------------------------------------------
 

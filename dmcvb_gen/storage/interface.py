@@ -11,14 +11,14 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.storage.errors import storage_errors
 
 if TYPE_CHECKING:
     from zarr.abc.store import Store as ZarrStore
@@ -91,6 +91,10 @@ class Store(abc.ABC):
     def _list(self, prefix: str) -> Mapping[str, int]:
         """Every file below a folder ("" for all): path -> bytes. Raises FileNotFoundError."""
         raise StoreError(f"{self.place} gives no list of its files; fetch the release first")
+
+    def _folders(self) -> Iterable[str]:
+        """Names of the folders right below. Raises FileNotFoundError."""
+        raise StoreError(f"{self.place} gives no list of its folders; give the URL of one release")
 
     def _create(self, path: str, data: bytes | Path, move: bool) -> None:
         """Write a file as one atomic operation. Raises FileExistsError."""
@@ -184,6 +188,14 @@ class Store(abc.ABC):
         except NotThere:
             return {}
         return {path: size for path, size in sorted(found.items()) if "/." not in f"/{path}"}
+
+    def folders(self) -> Sequence[str]:
+        """Names of the folders right below, hidden ones apart; maybe none."""
+        try:
+            with self._errors(None, "read"):
+                return sorted(name for name in self._folders() if not name.startswith("."))
+        except NotThere:
+            return []
 
     def download(self, path: str, target: str | Path, size: int, sha256: str) -> None:
         """Copy a file to `target` on this machine, whole or not at all; what is there already stays.

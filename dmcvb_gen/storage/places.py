@@ -100,6 +100,21 @@ def shown(place: str | Path) -> str:
     return found[0] + (re.sub(r"[?#].*", "", rest) if found[1].lower() in WEB else rest)
 
 
+def local_path(path: str | Path) -> Path:
+    """A folder or file of this machine, to be written to.
+
+    Raises:
+      StoreError: it is a URL; a `Path` would silently make a folder "s3:".
+    """
+    text = str(path)
+    if is_url(text) or re.match(rf"({'|'.join((*BUCKETS, *WEB, 'hf'))}):/", text):  # `Path` makes s3:/x of s3://x
+        raise StoreError(
+            f"{shown(text)} is a URL; give a local one, a folder or file of this machine (`dmcvb-gen publish "
+            "FOLDER URL` puts a release at a URL)"
+        )
+    return Path(text).expanduser()
+
+
 def _without_login(rest: str) -> tuple[str, str]:
     """What follows "://" without "user:password@", and that; passwords may hold "@" and "/"."""
     first = rest.split("/")[0]

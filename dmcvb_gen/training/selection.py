@@ -30,7 +30,7 @@ from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze, task_folder
-from dmcvb_gen.storage.remote import storage_errors
+from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.text import pluralize

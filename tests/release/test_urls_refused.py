@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.storage.places import local_path
 
 URL = "s3://bucket/x"
 COMMANDS = {

@@ -195,6 +195,7 @@ class StoreTests(ReadTests):
             sorted([DEEP, "manifest.json", "walker-walk/b", "walker-walker/c", ODD]), 2
         )
         assert store.list("walker-walk") == {DEEP: 2, "walker-walk/b": 2}
+        assert store.folders() == sorted({"walker-walk", "walker-walker", "a", ODD.split("/")[0]})
         assert store.list("walker-walk/") == store.list("walker-walk") and store.list("nothing") == {}
 
     def test_what_is_deleted_can_be_created(self, store):
@@ -266,6 +267,9 @@ class TestFolder(StoreTests):
                 with pytest.raises(StoreError, match="is a link"):
                     write("a/new", b"1")
             assert [file.name for file in outside.iterdir()] == ["b"]
+        elif kind in ("link", "device"):
+            with pytest.raises(StoreError, match="is a link"):
+                store.create("a", b"1")
         else:
             assert kind == "folder" or not store.create("a", b"1")
 
@@ -469,6 +473,8 @@ class TestHub(ReadTests):
         assert store.upload(tmp_path, paths) == paths and len(hub.commits) == 2
         assert store.finish({"README.md": b"1", "manifest.json": b"2"}, None)
         assert store.list() == {**{path: len(path) for path in paths}, "README.md": 1, "manifest.json": 1}
+        assert store.folders() == []
+        assert open_store("hf://datasets/me/tiny").folders() == ["data"]
         store.tag("v1.0.0", "the first version")
         assert hub.tags == {"data-v1.0.0": "3"}
 

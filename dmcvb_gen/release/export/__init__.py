@@ -16,8 +16,8 @@ from dmcvb_gen.loaders.release import open_for_reading
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import all_formats, get_format
-from dmcvb_gen.storage.places import is_url
-from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.places import is_url, local_path
 
 STAMP = ".dmcvb-gen.json"
 """File in each export that says what it was made from, so that the same command can resume."""

@@ -1,0 +1,99 @@
+"""What disks, networks, clients and codecs raise becomes one line that names the cure, in this one place."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.storage.places import is_url, shown
+
+CLIENTS = frozenset(
+    "adlfs aiobotocore aiohttp asyncio azure botocore fsspec gcsfs google httpcore httpx huggingface_hub numcodecs "
+    "requests s3fs ssl urllib3 zarr".split()
+)
+"""Packages whose exceptions come from storage."""
+REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "Unauthorized")
+"""Words of errors that are about who is asking."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+LONGEST_REASON = 300
+_SECRETS = (
+    # Bounded, or a message that quotes 100,000 letters of somebody's file would take a minute.
+    (
+        re.compile(r"(?i)((?:secret|password|token|key|sig|signature|credential)[\w-]{0,40}[\"']?\s*[=:]\s*)\S+"),
+        r"\1...",
+    ),
+    (re.compile(r"([A-Za-z][\w+.-]{0,20}://)[^/\s@]*@"), r"\1"),
+)
+"""What of a message is struck out, and what stands for it."""
+
+
+@contextlib.contextmanager
+def storage_errors(place: str | Path, doing: str = "read", decoding: bool = False) -> Iterator[None]:
+    """Turn what storage raises inside into one line with a cure; other exceptions pass.
+
+    Args:
+      place: folder, file or URL that is read or written.
+      doing: "read", "write to", ...: the word of the message.
+      decoding: nothing but storage is at work inside, so that whatever is raised (codecs raise anything) comes from
+        damaged bytes.
+
+    Raises:
+      StoreError: for errors of disk, network, credentials, missing packages, or damaged bytes.
+    """
+    try:
+        yield
+    except (DmcvbError, MemoryError):
+        raise
+    except Exception as error:
+        client = type(error).__module__.split(".")[0] in CLIENTS
+        if not (decoding or client or isinstance(error, OSError | ImportError)):
+            raise
+        raise StoreError(_explained(error, str(place), doing, client)) from None
+
+
+def reason(error: BaseException) -> str:
+    """One line of an error for a person, with anything that looks like a secret struck out."""
+    text = "".join(char if char.isprintable() else " " for char in str(error))
+    text = " ".join(text.split()) or type(error).__name__
+    for pattern, instead in _SECRETS:
+        text = pattern.sub(instead, text)
+    return text[:LONGEST_REASON]
+
+
+def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
+    """Explain what went wrong at a place, and name the cure."""
+    url, why, where = is_url(place), reason(error), shown(place)
+    if isinstance(error, ImportError):
+        package = (error.name or why).split(".")[0]
+        return f"{package} is needed for {where} and not installed: pip install {package}"
+    if not isinstance(error, OSError):
+        if client or url:
+            return _at_url(error, where, doing) if url else f"cannot {doing} {where} ({why}); fetch or regenerate it"
+        return f"{where} is damaged ({why.split('. ')[0]}); repair it with `dmcvb-gen regenerate`, or fetch it again"
+    if not url and isinstance(error.filename, str) and os.path.isabs(error.filename):
+        where = error.filename  # the file that failed, e.g. of a scratch folder
+    if error.errno in NO_ROOM:
+        return f"no room to {doing} {where} ({error.strerror}); make room and rerun the same command"
+    if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError):
+        there = "create the bucket first" if url else "create the folder first, or choose another place"
+        cure = "check the path, or fetch or regenerate it" if doing == "read" else there
+        return f"cannot {doing} {where}: it is not there ({why}); {cure}"
+    if url:
+        return _at_url(error, where, doing)
+    cure = "change its rights" if doing == "read" else "choose a place that you may write to"
+    return f"cannot {doing} {where}: {error.strerror or why}; {cure}"
+
+
+def _at_url(error: Exception, where: str, doing: str) -> str:
+    why = reason(error)
+    if isinstance(error, PermissionError) or any(word in f"{type(error).__name__} {error}" for word in REFUSALS):
+        return (
+            f"{where} refuses access ({why}); set valid credentials in the environment or the provider's own "
+            "configuration (e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, gcloud, HF_TOKEN)"
+        )
+    return f"cannot {doing} {where} ({why}); check the URL and the network, and rerun the command"
