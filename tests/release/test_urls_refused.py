@@ -24,7 +24,6 @@ COMMANDS = {
     "repaint": ["repaint", "RELEASE", "--out", URL],
     "regenerate": ["regenerate", "RELEASE", "--out", URL],
     "paint": ["paint", URL],
-    "scratch": ["rollout", "walker-walk", "--out", URL, "--scratch", URL],
 }
 
 
@@ -43,23 +42,10 @@ def test_no_command_makes_a_folder_of_a_url(small_release, elsewhere, name):
     assert not list(elsewhere.iterdir())
 
 
-def _plan(root):
-    from dmcvb_gen.generate.plan import make_plan
-    from tests.conftest import small_recipe
-
-    make_plan(small_recipe(), URL)
-
-
 def _repaint(root):
     from dmcvb_gen.generate.repaint import Repainting, repaint
 
     repaint(Repainting(root, Path(URL), size=8))
-
-
-def _remake(root):
-    from dmcvb_gen.generate.regenerate import Regeneration
-
-    Regeneration(root).remake(URL)
 
 
 def _import(root):
@@ -86,12 +72,6 @@ def _export(root):
     export(root, "hdf5", Path(URL))
 
 
-def _light(root):
-    from dmcvb_gen.generate.paint import without_pictures
-
-    without_pictures(root, URL)
-
-
 def _report(root):
     from dmcvb_gen.benchmarks.plan import BUDGETS
     from dmcvb_gen.benchmarks.report import claim_folder
@@ -106,7 +86,7 @@ def _train(root):
     open_run(URL, RunConfig("walker-walk", "sac", 1, 0, {}), resume=False)
 
 
-CALLS = (_plan, _repaint, _remake, _import, _card, _preview, _export, _light, _report, _train)
+CALLS = (_repaint, _import, _card, _preview, _export, _report, _train)
 
 
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__.strip("_"))
