@@ -21,7 +21,7 @@ FAMILIES = {
     "locomotion": ("walker-walk", ["--distractor", "none", "--distractor", "dynamic"], ("none", "dynamic")),
     "mazes": (
         "ant-maze-easy7x7b",
-        ["--goal", "visible", "--goal", "hidden", "--fixed-goals", 2, "--episodes-per-goal", 1],
+        ["--goal", "visible", "--goal", "hidden", "--goal", "fixed2"],
         ("visible", "hidden", "fixed"),
     ),
 }

@@ -40,7 +40,7 @@ def register_distractor(distractor: type[Distractor]) -> type[Distractor]:
     if unknown := set(distractor.names) - set(DISTRACTOR_STATE_NAMES):
         raise ValueError(f"labels {sorted(unknown)} are not among {DISTRACTOR_STATE_NAMES}")
     if optional := set(distractor.names) & OPTIONAL_LABELS.keys():
-        raise ValueError(f"label {', '.join(optional)} is stored only if `light` varies: use --vary light")
+        raise ValueError(f"label {', '.join(optional)} is stored only if `light` varies: use dynamic_light")
     if distractor.stream not in seeding.STREAMS:
         raise ValueError(f"stream {distractor.stream!r} is not one of {seeding.STREAMS}")
     for kind in distractor.kinds:

@@ -120,8 +120,7 @@ def _check_complete(release: Release, root: str | Path, pixels: bool) -> None:
     """Raises StoreError if something that is to be published is not here, or cannot be left out."""
     if release.in_the_making or (release.copy and not all(s.here for s in release.shards(images=pixels))):
         raise StoreError(
-            f"{root} is not complete; fetch or render the rest, or finish it with the same rollout, without --only or "
-            "--part"
+            f"{root} is not complete; fetch or render the rest, or finish it with the same rollout, without --only"
         )
     if not pixels and any(record.imported for record in release.manifest.subsets):
         raise StoreError(

@@ -22,7 +22,7 @@ digest for every file. A manifest that is in the package too (`dmcvb-gen list` s
 is found by its name:
 
 ```text
-dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --episodes 0:3 --out data/part
+dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --range 0:3 --out data/part
 dmcvb-gen regenerate --manifest dataset_cards/NAME/files.tar.xz --only 'SUBSET' --out FOLDER
 ```
 

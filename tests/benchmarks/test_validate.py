@@ -310,7 +310,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--profile", "fast"), "paper, quick, smoke"),
         ((release, "--agents", "bcc"), "state-bc"),
         ((release, "--benchmark", "b9"), "ablations"),
-        ((release, "--benchmark", "b3"), "--fixed-goals"),
+        ((release, "--benchmark", "b3"), "--goal fixed5"),
         ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; remove it"),
         ((release, "--benchmark", "b2", "--agents", "td3-bc,bc"), "td3-bc has none; remove it"),
         ((release, "--agents", "bc:k=5"), "'k=5' is an option of id: remove it"),

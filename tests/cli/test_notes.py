@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 
 import imageio.v3 as imageio
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.files import folder_in_the_making
 
 TINY = ["--level", "random", "--max-steps", "4", "--size", "16"]
 
@@ -45,28 +42,12 @@ def test_a_release_that_gains_subsets_or_episodes_says_which(copy):
     assert "this adds pendulum-swingup/random/none (1 episode more)." in said
 
 
-def test_another_rollout_at_work_is_named(copy, tmp_path):
-    waiting = "import sys, time; from dmcvb_gen.files import folder_in_the_making\n"
-    waiting += "with folder_in_the_making(sys.argv[1], 'shards'): print('ready', flush=True); time.sleep(60)"
-    other = subprocess.Popen([sys.executable, "-c", waiting, str(copy)], stdout=subprocess.PIPE, text=True)
-    try:
-        assert other.stdout.readline() == "ready\n"
-        with folder_in_the_making(copy, "shards"):  # this process's own is no other's
-            said = run("rollout", "cheetah-run", *TINY, "--episodes", 1, "--out", copy)
-        assert f"Another rollout is writing to {copy} (process {other.pid})" in said and "--part 1/2" in said
-        part = run("rollout", "cheetah-run", *TINY, "--episodes", 1, "--part", "1/1", "--out", copy)
-        assert "Another rollout" not in part  # parts are meant to run at once
-    finally:
-        other.kill()
-        other.wait()
-
-
 def test_episodes_that_come_with_their_shard_are_counted(release, tmp_path):
     place = f"file:{tmp_path / 'published'}"
     run("publish", release, place)
-    said = run("fetch", place, "--episodes", "0:1", "--out", tmp_path / "part")
+    said = run("fetch", place, "--range", "0:1", "--out", tmp_path / "part")
     assert "Shards are fetched whole: walker-walk/random/none has the episodes 0:3; you asked for" in said
-    assert "fetched whole" not in run("fetch", place, "--episodes", "0:3", "--out", tmp_path / "all")
+    assert "fetched whole" not in run("fetch", place, "--range", "0:3", "--out", tmp_path / "all")
 
 
 @pytest.mark.parametrize("count", [1, 3])

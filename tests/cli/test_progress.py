@@ -12,12 +12,10 @@ from click.testing import CliRunner
 
 from dmcvb_gen import progress
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
-from dmcvb_gen.generate.executors import run_jobs
-from dmcvb_gen.generate.paint import without_pictures
-from dmcvb_gen.generate.plan import make_plan, prepare
-from dmcvb_gen.generate.recipe import single_recipe
-from dmcvb_gen.generate.repaint import Repainting, repaint
+from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.generate.executors import run_works
+from dmcvb_gen.generate.plan import make_plan, start
+from dmcvb_gen.generate.recipe import make_recipe
 
 LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
 TASKS = ("walker-walk", "ant-maze-empty7x7")
@@ -31,16 +29,14 @@ def commands(task, folder):
     yield "paint", folder / "bare"
     yield "verify", release
     yield "validate", release, "--checks-only", "--out", folder / "report"
-    narrow = open_release(release).manifest.subsets[0].name
+    narrow = Release.open(release).manifest.subsets[0].name
     yield "validate", release, "--checks-only", "--only", narrow, "--workers", "2", "--out", folder / "report"
     yield "regenerate", release, "--check"
     yield "repaint", release, "--size", "32", "--out", folder / "repainted"
     yield "publish", release, f"file:{folder / 'published'}"
     yield "verify", f"file:{folder / 'published'}"
     yield "fetch", f"file:{folder / 'published'}", "--out", folder / "fetched"
-    without_pictures(release, folder / "light")
-    yield "publish", folder / "light", f"file:{folder / 'published-light'}"
-    yield "fetch", f"file:{folder / 'published-light'}", "--out", folder / "painted", "--paint"
+    yield "publish", folder / "bare", f"file:{folder / 'published-bare'}"
     yield "export", release, "--to", "npz", "--out", folder / "exported"
     yield "publish", folder / "exported", f"file:{folder / 'published-export'}"
 
@@ -119,20 +115,17 @@ def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
             told.append(("expected", frames))
 
     fields = {"episodes": 3, "episodes_per_shard": 1}
-    recipe = single_recipe(["ant-maze-empty7x7"], ["expert"], ["visible"], name="early", subset_fields=fields, size=16)
-    plan = prepare(make_plan(recipe, tmp_path / "early"))
-    list(run_jobs(plan.jobs, 1, Told()))
-    subset = open_release(tmp_path / "early")["ant-maze-empty7x7/expert/visible"]
+    pattern = fields | {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "visible"}
+    plan = make_plan(make_recipe({"name": "early", "size": 16, "subsets": [pattern]}), tmp_path / "early")
+    start(plan)
+    list(run_works(plan.works, 1, Told()))
+    subset = Release.open(tmp_path / "early")["ant-maze-empty7x7/expert/visible"]
     expected = [frames for what, frames in told if what == "expected"]
     frames = sum(frames for what, frames in told if what == "frames")
     views = len(subset.record.views)
     assert frames == expected[-1] == views * (subset.steps + 3) < expected[0] == views * 3 * 601
     first = subset.read("length", [0])[0] + 1
     assert expected[1] == pytest.approx(3 * views * first, abs=3)
-    told.clear()  # a repaint knows how long they are
-    repaint(Repainting(tmp_path / "early", tmp_path / "again", size=24), 1, Told())
-    assert {count for what, count in told if what == "expected"} == {frames}
-    assert sum(count for what, count in told if what == "frames") == frames
 
 
 def test_a_terminal_gets_a_bar(small_release):

@@ -65,7 +65,8 @@ def test_the_options_of_rollout_have_headings():
     assert isinstance(command, GroupedCommand)
     named = [name for names in command.option_groups.values() for name in names]
     assert len(named) == len(set(named))
-    assert {p.name for p in command.params if isinstance(p, click.Option)} == {*named, "dry_run", "as_json"}
+    others = {"workers", "executor", "ray_address", "other_versions", "dry_run", "as_json"}
+    assert {p.name for p in command.params if isinstance(p, click.Option)} == {*named, *others}
     lines = screen(["rollout", "--help"])
     assert all(f"{heading}:" in lines for heading in command.option_groups)
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-
 import click
 import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.generate.plan import make_plan, prepare
+from dmcvb_gen.generate.plan import make_plan, start
 from dmcvb_gen.generate.recipe import expand
 from dmcvb_gen.spec import LEVELS
 from tests.conftest import small_recipe
@@ -26,12 +24,12 @@ def asked(monkeypatch):
     """Subsets that a command line asks for; nothing is planned."""
     recipes = []
 
-    def stop(recipe, *_):
+    def stop(recipe, *_, **__):
         recipes.append(recipe)
         raise click.Abort()
 
     def ask(*arguments):
-        monkeypatch.setattr("dmcvb_gen.generate.rollout.make_plan", stop)
+        monkeypatch.setattr("dmcvb_gen.generate.plan.make_plan", stop)
         result = rollout(*arguments)
         assert result.exit_code == 1, result.output
         return {request.name: request for request in expand(recipes[-1])}
@@ -48,38 +46,20 @@ def assert_refused(result, options, cure):
 @pytest.mark.parametrize(
     "arguments, cure",
     [
-        ([MAZE, "--difficulty", "hard"], "remove it"),
-        ([WALKER, "--difficulty", "hard"], "--distractor static or dynamic"),
-        ([WALKER, "--distractor", "none", "--difficulty", "hard"], "--distractor static or dynamic"),
-        ([WALKER, "--distractor", "static_easy", "--difficulty", "hard"], "static_easy names its strength itself"),
-        ([WALKER, "--distractor", "dynamic", "--video-count", "50"], "builtin has 8 videos: give 8 or less"),
-        ([WALKER, "--distractor", "static", "--split", "val", "--video-count", "50"], "give"),
-        ([WALKER, "--reward", "geodesic"], "outside mazes"),
-        ([f"{MAZE}@geodesic", "--reward", "saturated"], "@geodesic"),
-        ([MAZE, "--episodes-per-goal", "3"], "--fixed-goals"),
-        ([WALKER, "--episodes-per-goal", "3"], "outside mazes"),
-        ([MAZE, "--fixed-goals", "2", "--episodes", "3"], "--episodes-per-goal"),
+        ([WALKER, "--goal", "hidden"], "--goal is for mazes"),
+        ([MAZE, "--distractor", "dynamic"], "mazes vary in style; ask for --goal"),
+        ([MAZE, "--goal", "fixed0x"], "unknown goal"),
         ([WALKER, "--backgrounds", "builtin"], "--distractor static or dynamic"),
         ([MAZE, "--backgrounds", "builtin"], "no subset shows videos"),
         ([WALKER, "--split", "val"], "--distractor static or dynamic"),
-        ([WALKER, "--distractor", "dynamic", "--vary", "camera", "--backgrounds", "builtin"], "shows videos"),
-        (
-            [WALKER, "--distractor", "dynamic", "--vary", "background", "--video-count", "3", "--intensity", "0.9"],
-            "--intensity has no effect if only the background varies",
-        ),
-        ([WALKER, "--distractor", "dynamic", "--vary", "camera,light", "--split", "val"], "shows videos"),
-        ([WALKER, "--sample"], "level random is always drawn"),
+        ([WALKER, "--distractor", "dynamic_camera", "--backgrounds", "builtin"], "shows videos"),
+        ([WALKER, "--distractor", "dynamic_camera-light", "--split", "val"], "shows videos"),
+        ([WALKER, "--level", "random", "--sample"], "level random is always drawn"),
         ([MAZE, "--independent"], "always have their own episodes"),
-        ([WALKER, "--scratch", "x"], "--out is no URL"),
-        ([WALKER, "--scratch-size", "1GB"], "--out is no URL"),
-        ([WALKER, "--option", "a=b"], "--out is no URL"),
+        ([WALKER, "--option", "a=b"], "is a folder"),
         ([WALKER, "--workers", "2", "--executor", "ray"], "remove it"),
         ([WALKER, "--ray-address", "x:1"], "--executor ray"),
         ([WALKER, "--behaviour", ""], "is empty"),
-        (["--recipe", ""], "is empty"),
-        ([WALKER, "--finish", "--dry-run"], "--finish plans nothing"),
-        ([WALKER, "--slurm-script", "3", "--part", "1/2"], "only prints a script"),
-        ([WALKER, "--slurm-script", "3", "--json"], "only prints a script"),
     ],
 )
 def test_an_option_that_would_change_nothing_is_refused_with_the_cure(tmp_path, monkeypatch, arguments, cure):
@@ -131,41 +111,27 @@ def test_also_beside_a_recipe(options, cure):
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["--no-pixels"], "remove --no-pixels"),
         (["--seed", "5"], "TASKs or --recipe"),
         (["--independent"], "TASKs or --recipe"),
     ],
 )
 def test_a_release_that_goes_on_from_its_manifest_says_what_it_cannot_take(tmp_path, arguments, words):
-    prepare(make_plan(small_recipe(), tmp_path / "r"))
+    start(make_plan(small_recipe(), tmp_path / "r"))
     result = rollout("--out", tmp_path / "r", *arguments)
     assert result.exit_code == 2 and words in result.output + result.stderr
-
-
-def test_a_release_without_pictures_goes_on_without(tmp_path):
-    prepare(make_plan(small_recipe(), tmp_path / "r", pixels=False))
-    assert rollout("--out", tmp_path / "r", "--no-pixels", "--init").exit_code == 0
 
 
 def test_what_some_subsets_take_up_is_heard(asked):
     levels = [word for level in LEVELS for word in ("--level", level)]
     drawn = asked(WALKER, *levels, "--sample")
     assert len(drawn) == 4 and not any(request.deterministic for request in drawn.values())
-    settings = ["--distractor", "none", "--distractor", "static", "--difficulty", "hard", "--split", "val"]
-    assert set(asked(WALKER, *settings)) == {f"{WALKER}/random/none", f"{WALKER}/random/static_hard"}
-    assert asked(MAZE, "--goal", "fixed", "--episodes-per-goal", "3")[f"{MAZE}/random/fixed"].episodes == 5 * 3
-    both = ["--goal", "visible", "--goal", "fixed", "--fixed-goals", "2", "--episodes-per-goal", "3", "--episodes", "4"]
-    assert [request.episodes for request in asked(MAZE, *both).values()] == [4, 2 * 3]
-    assert set(asked(f"{MAZE}@geodesic", "--reward", "geodesic", "--split", "val")) == {
-        f"{MAZE}-geodesic/random/visible"
-    }
-
-
-def test_a_begun_release_is_told_to_programs_too(tmp_path):
-    result = rollout(
-        WALKER, "--episodes", "1", "--max-steps", "3", "--size", "8", "--init", "--json", "--out", tmp_path
-    )
-    assert json.loads(result.stdout) == {"out": str(tmp_path), "jobs": 1, "already_done": 0}
+    settings = ["--distractor", "none", "--distractor", "static_hard", "--split", "val"]
+    assert set(asked(WALKER, *settings)) == {f"{WALKER}/expert/none", f"{WALKER}/expert/static_hard"}
+    assert asked(MAZE, "--goal", "fixed", "--episodes", "12")[f"{MAZE}/expert/fixed"].episodes == 5 * 3
+    assert asked(MAZE, "--goal", "fixed")[f"{MAZE}/expert/fixed"].episodes == 5 * 10
+    both = ["--goal", "visible", "--goal", "fixed2", "--episodes", "4"]
+    assert [request.episodes for request in asked(MAZE, *both).values()] == [4, 2 * 2]
+    assert set(asked(f"{MAZE}@geodesic", "--split", "val")) == {f"{MAZE}-geodesic/expert/visible"}
 
 
 @pytest.mark.parametrize(

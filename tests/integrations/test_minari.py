@@ -97,7 +97,7 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
 @pytest.mark.parametrize("goal", ["visible", "hidden"])
 def test_the_environment_shows_the_goal_as_the_data_were_painted(goal, tmp_path, monkeypatch):
     asked = [f"--goal={setting}" for setting in ("visible", "hidden")]
-    asked += ["--level=random", "--episodes=1", "--max-steps=3", "--size=16", "--no-pixels", "--fixed-goals=1"]
+    asked += ["--level=random", "--episodes=1", "--max-steps=3", "--size=16", "--no-pixels", "--goal=fixed1"]
     for command in (
         ["rollout", "ant-maze-empty7x7", *asked, f"--out={tmp_path / 'r'}"],
         ["paint", str(tmp_path / "r"), f"--goal={goal}"],

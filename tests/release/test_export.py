@@ -312,7 +312,7 @@ def test_damaged_or_foreign_folders_are_not_imported(exported, tmp_path):
 
 
 def test_the_command_exports_goes_on_and_never_writes_over(small_release, tmp_path):
-    command = ["export", str(small_release), "--to", "npz", "--episodes", "2:3", "--out", str(tmp_path)]
+    command = ["export", str(small_release), "--to", "npz", "--range", "2:3", "--out", str(tmp_path)]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 0 and len(list((tmp_path / NAME).glob("*.npz"))) == 1
     shutil.rmtree(tmp_path / NAME)
@@ -393,7 +393,7 @@ def test_nothing_that_is_damaged_or_missing_is_left_out_silently(release, reques
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 2 and f"{name} has" in result.output and "--episodes" in result.output
     assert not list((tmp_path / "out").rglob("*.npz"))
-    result = CliRunner().invoke(main, [*command, "--only", name, "--episodes", "0:1"])
+    result = CliRunner().invoke(main, [*command, "--only", name, "--range", "0:1"])
     assert result.exit_code == 0, result.output
 
     shutil.rmtree(folder / "commits" / name)

@@ -200,7 +200,7 @@ def test_a_format_of_another_package_is_found_by_its_entry_point(small_release, 
 
 def test_the_command_names_folders_as_out_names_them(small_release, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    command = ["export", str(small_release), "--to", "npz", "--only", "*/none", "--episodes", "0:1", "--out"]
+    command = ["export", str(small_release), "--to", "npz", "--only", "*/none", "--range", "0:1", "--out"]
     assert CliRunner().invoke(main, [*command, "here"]).output.splitlines()[-1] == "here/walker-walk/random/none"
     there = str(tmp_path / "there")
     assert CliRunner().invoke(main, [*command, there]).output.splitlines()[-1] == f"{there}/walker-walk/random/none"

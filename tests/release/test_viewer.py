@@ -113,7 +113,7 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
     assert tuple(seen["views"]) == first.record.views
     assert seen["charts"] == ["Reward", "Action", "State", "Distractor"]
     name = folder.name
-    assert seen["command"] == f"dmcvb-gen regenerate {name} --only {names[0]} --episodes 0:1 --out again"
+    assert seen["command"] == f"dmcvb-gen regenerate {name} --only {names[0]} --range 0:1 --out again"
     length = int(first.lengths[0])
     assert (seen["right"], seen["ten"], seen["left"]) == (1, min(11, length), min(11, length) - 1)
     assert seen["end"] == length and seen["home"] == 0

@@ -171,7 +171,7 @@ def fixed_pairs(layout: Layout, count: int, seed: int) -> list[tuple[tuple[int, 
     if count > cells * (cells - 1):
         raise LayoutError(
             f"layout {layout.name!r} has {cells * (cells - 1)} (start, goal) pairs, {count} are asked for; "
-            "give fewer --fixed-goals"
+            "give fewer fixed goals"
         )
     rng = np.random.default_rng([seed, 0xF1ED])
     chosen = rng.permutation(cells * (cells - 1))[:count]
