@@ -62,9 +62,7 @@ def info(path, options, as_json):
         optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
     )
     size = format_bytes(facts["bytes"])
-    if facts["disk_bytes"] not in (None, facts["bytes"]):
-        size += f" ({format_bytes(facts['disk_bytes'])} on disk)"
-    click.echo(printable(f"{facts['steps']:,} steps, {size}; made by {facts['generator']}"))
+    click.echo(f"{facts['steps']:,} steps, {size}")
     if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
         click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):

@@ -36,11 +36,20 @@ class Wanted:
       size: pixels a side.
       views: of mazes, only these.
       goal: of mazes, only the images with the goal ("visible") or without it ("hidden").
+
+    Raises:
+      DmcvbError: a size that no renderer takes, or no view at all.
     """
 
     size: int | None = None
     views: tuple[str, ...] | None = None
     goal: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.size is not None:
+            check_size(self.size)
+        if self.views is not None and not self.views:
+            raise DmcvbError("views names no view; leave it out to have them all")
 
     def pictures(self, record: SubsetRecord) -> tuple[str, ...]:
         """Names of the RGB images of a subset that are asked for.
@@ -129,10 +138,6 @@ def paint_release(
 
 def _paintable(release: Release, only: Sequence[str], wanted: Wanted) -> list[SubsetRecord]:
     """The subsets to paint, once all that can be wrong with the request was looked at."""
-    if wanted.size is not None:
-        check_size(wanted.size)
-    if wanted.views is not None and not wanted.views:
-        raise DmcvbError("views names no view; leave it out to have them all")
     names = set(release.select(only))
     records = [record for record in release.manifest.subsets if record.name in names and not record.imported]
     if not records:

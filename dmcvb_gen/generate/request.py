@@ -100,7 +100,7 @@ def behaviour_source(given: str | Path | None) -> str | None:
     if given is None:
         return None
     if not str(given):
-        raise RecipeError("behaviour is empty; leave it out to use the bundled policies")
+        raise RecipeError("--behaviour is empty; leave it out to use the bundled policies")
     module, _, function = str(given).partition(":")
     if module.endswith(".py"):
         name = f"{Path(module).stem}:{function or 'FUNCTION'}"
@@ -156,7 +156,7 @@ def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[s
         raise RecipeError("mazes and locomotion tasks take different settings; roll them out by a --recipe")
     if strange := [name for name in settings if (name in GOAL_MODES) != (True in mazes)]:
         if True in mazes:
-            raise RecipeError(f"{tasks[0]} has no distractor {strange[0]}: mazes vary in style; ask for --goal visible")
+            raise RecipeError("--distractor has no effect in mazes, which vary in style; ask for --goal visible")
         raise RecipeError(f"{tasks[0]} has no goal {strange[0]}; --goal is for mazes, ask for --distractor")
     name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))[:80].rstrip("-.")
     pattern: dict[str, Any] = {"tasks": list(tasks), "levels": list(levels)}

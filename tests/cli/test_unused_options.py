@@ -48,7 +48,6 @@ def assert_refused(result, options, cure):
     [
         ([WALKER, "--goal", "hidden"], "--goal is for mazes"),
         ([MAZE, "--distractor", "dynamic"], "mazes vary in style; ask for --goal"),
-        ([MAZE, "--goal", "fixed0x"], "unknown goal"),
         ([WALKER, "--backgrounds", "builtin"], "--distractor static or dynamic"),
         ([MAZE, "--backgrounds", "builtin"], "no subset shows videos"),
         ([WALKER, "--split", "val"], "--distractor static or dynamic"),
