@@ -264,9 +264,9 @@ def validation_budget(options: Mapping[str, Any]) -> "Budget":
     from dmcvb_gen.agents.catalog import parse_agent
     from dmcvb_gen.benchmarks.cell import default_workers
     from dmcvb_gen.benchmarks.report import make_budget, plan_validation
-    from dmcvb_gen.dataset import open_release
+    from dmcvb_gen.dataset3 import Release
 
-    release, agents = open_release(options["release"]), as_names(options["agents"])
+    release, agents = Release.open(options["release"]), as_names(options["agents"])
     chosen = [parse_agent(agent) for agent in agents]
     if options["dino_weights"] is not None and not any(agent.ready_encoder for agent in chosen):
         raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")

@@ -43,8 +43,8 @@ from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
 from dmcvb_gen.benchmarks.evaluate import Act, Evaluator, Score, TrainedAgent, protocol, renderer_choice
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
-from dmcvb_gen.dataset import Release, Subset, open_release
-from dmcvb_gen.dataset.writer import subset_digest
+from dmcvb_gen.dataset3 import Release, Subset
+from dmcvb_gen.dataset3.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
@@ -180,12 +180,23 @@ def open_data(root: str | Path, budget: Budget) -> Release:
       StoreError: there is no release, or it is damaged.
     """
     room = DEFAULT_CACHE if budget.memory is None else min(budget.memory, DEFAULT_CACHE)
-    return painted_release(open_release(root), Painting(backgrounds=budget.backgrounds, cache_bytes=room), True)
+    return painted_release(Release.open(root), Painting(backgrounds=budget.backgrounds, cache_bytes=room), True)
+
+
+def data_digest(subset: Subset) -> str:
+    """SHA-256 of the records of all shards of a subset that are here."""
+    release, digest = subset.release, hashlib.sha256()
+    for layer in subset.layers:
+        here = release.here(layer.name)
+        for shard, record in release.records(layer.name).items():
+            if shard in here:
+                digest.update(f"{layer.name} {shard} ".encode() + canonical_json(record))
+    return digest.hexdigest()
 
 
 def data_digests(release: Release, cell: Cell) -> dict[str, str]:
     """Subset -> digest of its data, of all that a cell learns from."""
-    return {name: subset_digest(release[name].commits) for name in sorted(cell.subsets)}
+    return {name: data_digest(release[name]) for name in sorted(cell.subsets)}
 
 
 def evaluation_of(release: Release, budget: Budget, cell: Cell) -> dict[str, Any]:
@@ -215,7 +226,7 @@ def fingerprint(release: Release, budget: Budget, cell: Cell) -> str:
         facts["evaluation"] = evaluation_of(release, budget, cell)
         if budget.readout_steps and learns_pictures:  # `state_units` are of them
             alike = [subset for subset in release.subsets.values() if subset.task == cell.task]
-            facts["units"] = sorted(subset_digest(subset.commits) for subset in alike)
+            facts["units"] = sorted(data_digest(subset) for subset in alike)
         if agent.own:
             facts["own"] = OwnAgent.load(agent.own).digests
         if agent.ready_encoder:

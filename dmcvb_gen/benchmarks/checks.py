@@ -19,7 +19,7 @@ import numpy as np
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell
-from dmcvb_gen.dataset import Release, Subset, open_release
+from dmcvb_gen.dataset3 import Release, Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.inputs import background_source, video_source
@@ -196,7 +196,7 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
     """List the versions that differ from those for which the pictures rendered on reading are promised."""
     painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
     sources = {record.name: background_source(release.path, record, backgrounds) for record in painted}
-    return render_differences(release.manifest, painted, sources)
+    return render_differences(release, painted, sources)
 
 
 class _Longer:
@@ -231,7 +231,7 @@ def check_structure(
     """
     started = time.perf_counter()
     wanted = {record.name for record in release.manifest.subsets}
-    others = {record.name for record in open_release(release.path).manifest.subsets} - wanted
+    others = {record.name for record in Release.open(release.path).manifest.subsets} - wanted
     again = len(release.subsets)  # for labels; and of the others only the bytes are looked at
     tick = _Longer(tick, again - (len(wanted | others) - again))
     with open_pool(workers, tick=tick) as pool:

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dmcvb_gen.dataset import Subset
-from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
+from dmcvb_gen.dataset3 import Subset
+from dmcvb_gen.dataset3.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.files import replacing
@@ -114,7 +114,7 @@ def protocol(
     if pictures:
         facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
         if subset.record.distractor.kind != "none":
-            facts["backgrounds"] = load_backgrounds(video_source(subset.root, subset.record, backgrounds), SPLIT).digest
+            facts["backgrounds"] = load_backgrounds(video_source(subset.release.path, subset.record, backgrounds), SPLIT).digest
     return facts
 
 
@@ -151,7 +151,7 @@ class EvaluationScene:
     @classmethod
     def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
         """Return the scene of a subset; `backgrounds`: the videos' folder, if it is not where the manifest says."""
-        choice, source = renderer_choice(subset), video_source(subset.root, subset.record, backgrounds)
+        choice, source = renderer_choice(subset), video_source(subset.release.path, subset.record, backgrounds)
         pictures, size = training_pictures(subset), subset.record.size
         return cls(subset.task, subset.setting, pictures, size, choice["name"], choice["samples"], source)
 

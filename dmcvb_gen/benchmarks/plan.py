@@ -7,6 +7,7 @@ paper's sections 5.1 to 5.3 and its appendix.
 from __future__ import annotations
 
 import abc
+import copy
 import csv
 import functools
 import itertools
@@ -23,7 +24,7 @@ from dmcvb_gen.agents.catalog import Agent, parse_agent
 from dmcvb_gen.agents.data import Slice, part_count
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset3 import Release, Subset
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.inputs import BUILTIN, video_source
 from dmcvb_gen.policies.bundled import bundled_levels
@@ -239,8 +240,9 @@ def only(release: Release, patterns: Sequence[str]) -> Release:
     """
     names = select([record.name for record in release.manifest.subsets], list(patterns))
     records = tuple(record for record in release.manifest.subsets if record.name in names)
-    manifest = release.manifest.model_copy(update={"subsets": records})
-    return Release(release.root, manifest, {name: subset for name, subset in release.subsets.items() if name in names})
+    chosen = copy.copy(release)
+    chosen.manifest = release.manifest.model_copy(update={"subsets": records})
+    return chosen
 
 
 class SubsetFinder:
@@ -321,7 +323,7 @@ class SubsetFinder:
 
     def _sources(self, task: str, levels: Iterable[str]) -> str:
         """Options for policies and videos that the package does not bring, with names to be filled in."""
-        sources = {video_source(self.release.root, r) for r in self._records.values() if r.task == task}
+        sources = {video_source(self.release.path, r) for r in self._records.values() if r.task == task}
         brought = {"random", *bundled_levels(task)}
         return " --behaviour RUN" * (not set(levels) <= brought) + " --backgrounds FOLDER" * bool(sources - {BUILTIN})
 

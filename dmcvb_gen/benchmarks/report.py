@@ -41,8 +41,8 @@ from dmcvb_gen.benchmarks.checks import (
     training_warnings,
 )
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, get_budget, only, paper_score, plan_benchmark
-from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.manifest import environment
+from dmcvb_gen.dataset3 import Release
+from dmcvb_gen.dataset3.environment import environment
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
@@ -242,7 +242,7 @@ def plan_validation(
     """
     chosen = only(release, patterns)
     if not chosen.subsets:
-        raise DmcvbError(f"{release.root} has no committed episodes yet; run the rollout first")
+        raise DmcvbError(f"{release.place} has no committed episodes yet; run the rollout first")
     cells: list[Cell] = []
     missing: list[Missing] = []
     for name in dict.fromkeys(benchmarks):
@@ -251,7 +251,7 @@ def plan_validation(
             needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
             needs += [f"let --only take {', '.join(m.left_out[:4])}" for m in lacking if m.left_out]
             cure = "; ".join(needs) or "roll out a locomotion task"
-            raise DmcvbError(f"benchmark {name} has no data in {chosen.root}; {cure}")
+            raise DmcvbError(f"benchmark {name} has no data in {chosen.place}; {cure}")
         cells += found
         missing += lacking
     used = {cell.agent for cell in cells}
@@ -328,8 +328,8 @@ def report_facts(
         "release": {
             "name": release.manifest.name,
             "version": release.manifest.version,
-            "digest": release.manifest.digest,
-            "path": release.root,
+            "digest": release.digest,
+            "path": release.place,
         },
         "sound": structure.sound and not failed,
         "complete": there == asked,
