@@ -48,7 +48,7 @@ from dmcvb_gen.dataset3.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
-from dmcvb_gen.loaders.source import StepSource
+from dmcvb_gen.loaders.sampler import StepSource
 from dmcvb_gen.own_code import source_digest
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
 from dmcvb_gen.parallel.cores import usable_cores

@@ -114,7 +114,8 @@ def protocol(
     if pictures:
         facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
         if subset.record.distractor.kind != "none":
-            facts["backgrounds"] = load_backgrounds(video_source(subset.release.path, subset.record, backgrounds), SPLIT).digest
+            source = video_source(subset.release.path, subset.record, backgrounds)
+            facts["backgrounds"] = load_backgrounds(source, SPLIT).digest
     return facts
 
 

@@ -51,7 +51,7 @@ from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import is_maze, matches, task_folder
-from dmcvb_gen.storage.remote import local_path
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import pluralize
 from dmcvb_gen.version import __version__
