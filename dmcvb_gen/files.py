@@ -1,25 +1,19 @@
 """Write files atomically: bytes, text or JSON become a whole file, flushed to the disk, or none.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
-disturb each other. The name says who makes it (machine, its start, process namespace, process and its start), so that
-files of a killed process can be told from those of a running one, even if the machine was started again since::
-
-    .NAME.<machine>-<start and namespace>[+<host>]@<process>-<its start>.<random>.partial
-
-Containers have process namespaces of their own and no host: their files are left alone, even if they share the
-machine's name.
+disturb each other. Its writer holds a lock on it, which the system frees when the process ends: what nobody locks was
+left by a killed process.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import json
 import os
-import re
 import shutil
-import socket
 import tempfile
 from collections.abc import Iterator
 from importlib.resources.abc import Traversable
@@ -30,97 +24,64 @@ PARTIAL = ".partial"
 """Ending of files in the making."""
 LARGEST_YAML = 100_000
 """Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
-BOOT, HOST = Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id")
-"""Files of Linux: an id of the system's start, and one that stays the machine's."""
-HOST_NAMESPACE = "pid:[4026531836]"
-"""Process namespace of a Linux system itself; containers have others."""
-_OWNED = re.compile(
-    r"\..+\.(?P<machine>[^.@+]+)(?:\+(?P<host>[0-9a-f]+))?@(?P<process>\d+)(?:-(?P<started>\d+))?\.[^.]+"
-    + re.escape(PARTIAL)
-)
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path, new: bool = False) -> Iterator[Path]:
+def replacing(path: str | Path) -> Iterator[Path]:
     """Give a fresh path to write to; when the block ends well, that file takes the place of `path`, else it goes.
 
     For writers that want a path; what they write is flushed to the disk before it is put in place.
 
-    Args:
-      new: `path` must not be there yet.
-
     Raises:
-      OSError: the folder cannot be made or written; FileExistsError: `path` should be new and is there.
+      OSError: the folder cannot be made or written.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.{_owner()}.", suffix=PARTIAL)
-    os.close(handle)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=PARTIAL)
     temporary = Path(name)
     try:
+        _lock(handle)
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp's files are their owner's alone
-        if new:
-            os.link(temporary, path)
-            temporary.unlink()
-        else:
-            os.replace(temporary, path)
-            temporary.unlink(missing_ok=True)  # it stays if both names were one file already
+        os.replace(temporary, path)
         flush_folder(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+    finally:
+        os.close(handle)
 
 
-def _owner() -> str:
-    started, host = _start_of(os.getpid()), _host()
-    owner = _machine() + (f"+{host}" if host else "")
-    return f"{owner}@{os.getpid()}" + ("" if started is None else f"-{started}")
-
-
-@functools.cache
-def _machine() -> str:
-    """Return the scope of process ids: the machine's name, its last start and the process namespace."""
-    name = re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()) or "unknown"
-    facts = ""
-    with contextlib.suppress(OSError):  # of Linux alone
-        facts = BOOT.read_text() + os.readlink("/proc/self/ns/pid")
-    return f"{name}-{sha256_bytes(facts.encode())[:8]}"
-
-
-@functools.cache
-def _host() -> str | None:
-    """Return what stays the same when this machine is started again; None if that is not known, and in containers."""
-    with contextlib.suppress(OSError):
-        host = HOST.read_text().strip()
-        if len(host) == 32 and os.readlink("/proc/self/ns/pid") == HOST_NAMESPACE:
-            return sha256_bytes(f"{socket.gethostname()} {host}".encode())[:8]
-    return None
-
-
-def _umask() -> int:
-    """The process's mask of new files' rights, which can only be read by setting it (or from /proc, without)."""
+def _lock(handle: int) -> bool:
+    """Lock an open file or folder for this process; False if another one has locked it, or the disk knows no locks."""
     try:
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("Umask:"):
-                return int(line.split()[1], 8)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        pass
-    return 0o022
+        return False
+    return True
+
+
+@functools.cache
+def _umask() -> int:
+    """The process's mask of new files' rights, which can only be read by setting it."""
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
 
 
 def flush_folder(folder: Path) -> None:
     """Make a rename last through a power cut, if the file system can."""
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return  # not every system opens folders
-    try:
+    with contextlib.suppress(OSError), _opened(folder) as handle:
         os.fsync(handle)
-    except OSError:
-        pass
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        yield handle
     finally:
         os.close(handle)
 
@@ -138,13 +99,6 @@ def write_bytes(path: str | Path, data: bytes | bytearray | memoryview) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Put `text` (UTF-8) in place of the file at `path`, see `write_bytes`."""
     write_bytes(path, text.encode())
-
-
-def json_bytes(value: Any) -> bytes:
-    """A value (plain, or a pydantic model) as the JSON that the files of a release hold."""
-    if hasattr(value, "model_dump"):
-        value = value.model_dump(mode="json")
-    return (json.dumps(value, indent=1) + "\n").encode()
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -209,7 +163,9 @@ def _repeated_key(root: Any) -> Any:
 
 def write_json(path: str | Path, value: Any) -> None:
     """Put `value` (plain, or a pydantic model) as JSON in place of the file at `path`, see `write_bytes`."""
-    write_bytes(path, json_bytes(value))
+    if hasattr(value, "model_dump"):
+        value = value.model_dump(mode="json")
+    write_text(path, json.dumps(value, indent=1) + "\n")
 
 
 def copy_file(source: str | Path, target: str | Path) -> None:
@@ -219,15 +175,6 @@ def copy_file(source: str | Path, target: str | Path) -> None:
             file.write(piece)
 
 
-def link_or_copy(source: str | Path, target: str | Path) -> None:
-    """Make `target`, which is not there yet, a hard link to a file, or a copy if the file systems cannot link."""
-    Path(target).parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:  # another disk, or none that links
-        copy_file(source, target)
-
-
 @contextlib.contextmanager
 def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
     """A fresh folder in `parent` for files that will be moved to where they belong; it is gone when the block ends.
@@ -235,83 +182,25 @@ def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
     Raises:
       OSError: it cannot be made.
     """
-    made = Path(tempfile.mkdtemp(dir=parent, prefix=f".{name}.{_owner()}.", suffix=PARTIAL))
+    made = Path(tempfile.mkdtemp(dir=parent, prefix=f".{name}.", suffix=PARTIAL))
     try:
-        yield made
+        with _opened(made) as handle:
+            _lock(handle)
+            yield made
     finally:
         shutil.rmtree(made, ignore_errors=True)
 
 
-def remove_partial(folder: str | Path, *, foreign: bool = False, below: bool = True) -> None:
-    """Delete what killed processes of this machine left in the making in a folder; files of others stay.
-
-    Args:
-      foreign: delete also what does not say whose it is (other libraries' partial files), for folders where no writer
-        can be at work.
-      below: look in the folders below, too.
-    """
-    for path in _partial_files(Path(folder), below):
-        owner = _OWNED.fullmatch(path.name)
-        if not (_is_dead(owner) if owner else foreign):
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
-
-
-def others_at_work(folder: str | Path) -> list[str]:
-    """Other running processes that are making something in a folder: "process 12", or "a process of machine NAME"."""
-    found = set()
-    for path in _partial_files(Path(folder), below=False):
-        owner = _OWNED.fullmatch(path.name)
-        if owner is None or _is_dead(owner):
-            continue
-        machine, process = owner["machine"], int(owner["process"])
-        if machine != _machine():
-            found.add(f"a process of machine {machine.rpartition('-')[0]}")
-        elif process != os.getpid():
-            found.add(f"process {process}")
-    return sorted(found)
-
-
-def _is_dead(owner: re.Match[str]) -> bool:
-    """Return True if a process of this machine has ended, at the latest when the machine was started again."""
-    if owner["machine"] == _machine():
-        return not _alive(int(owner["process"]), owner["started"])
-    return owner["host"] is not None and owner["host"] == _host()
-
-
-def _partial_files(folder: Path, below: bool) -> list[Path]:
-    """Files and folders in the making; what is inside such a folder belongs to its owner and is not listed."""
-    if not below:
-        return list(folder.glob(f"*{PARTIAL}"))
-    found = []
-    for parent, folders, names in os.walk(folder):
-        found += [Path(parent, name) for name in (*folders, *names) if name.endswith(PARTIAL)]
-        folders[:] = [name for name in folders if not name.endswith(PARTIAL)]
-    return found
-
-
-def _start_of(process: int) -> str | None:
-    """When a process started, in ticks since the system's start; None if the system does not tell (Linux does)."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
-    except (OSError, IndexError):
-        return None
-
-
-def _alive(process: int, started: str | None) -> bool:
-    """Return True if a process is running, and did not take over the number of one that started at another time."""
-    if os.name == "nt":
-        return True  # os.kill would end it
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return started in (None, _start_of(process) or started)
+def remove_partial(folder: str | Path) -> None:
+    """Delete what killed processes left in the making right in a folder; what somebody is making stays."""
+    for path in Path(folder).glob(f".*{PARTIAL}"):
+        with contextlib.suppress(OSError), _opened(path) as handle:  # a link, or gone by now
+            if not _lock(handle):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def free_bytes(folder: str | Path) -> int:

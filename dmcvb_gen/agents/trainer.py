@@ -272,7 +272,7 @@ def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: 
     optimizers = {name: optimizer.state_dict()["state"] for name, optimizer in learner.optimizers.items()}
     state = {"step": step, "seconds": seconds, "curve": curve, "means": means.state()}
     content = pack_state(state | {"weights": learner.state_dict(), "optimizers": optimizers})
-    remove_partial(path.parent, below=False)  # of a process that was killed
+    remove_partial(path.parent)  # of a process that was killed
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 

@@ -53,7 +53,7 @@ class RunLog:
         self._path = folder / "progress.csv"
         rows = [row for row in read_rows(folder) if int(row["step"]) <= step]
         self.curve = {int(row["step"]): float(row["return_mean"]) for row in rows}
-        remove_partial(folder, below=False)  # of a process that was killed
+        remove_partial(folder)  # of a process that was killed
         with replacing(self._path) as temporary, temporary.open("w", newline="") as file:
             csv.DictWriter(file, COLUMNS, lineterminator="\n").writeheader()
             _write(file, rows)

@@ -148,7 +148,7 @@ def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
     kind, parent = get_format(work.to), work.folder.parent
     with storage_errors(work.folder, "write to"):
         parent.mkdir(parents=True, exist_ok=True)
-        remove_partial(parent, below=False)
+        remove_partial(parent)
         with folder_in_the_making(parent, work.folder.name) as made:
             inside = made / work.folder.name
             inside.mkdir()
