@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, SupportsFloat
+from dataclasses import fields
+from typing import Annotated, Any, Literal, SupportsFloat
 
 import gymnasium
 import numpy as np
+import pydantic
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -21,16 +22,14 @@ from numpy.typing import ArrayLike
 
 from dmcvb_gen.dataset3.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.distractors import DistractorSampler, DistractorSetting, floor_alpha_for, load_backgrounds
+from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, UnknownNameError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look
-from dmcvb_gen.loaders.sampler import check_count
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
-    GOAL_PICTURES,
     HIDDEN,
     SPLITS,
     VISIBLE,
@@ -48,7 +47,11 @@ FIXED_GOALS = 5
 """Pairs of start and goal that "fixed" episodes go round by default (benchmark B3)."""
 
 
-@dataclass(frozen=True)
+Count = Annotated[int, pydantic.Field(gt=0)]
+Index = Annotated[int, pydantic.Field(ge=0)]
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=pydantic.ConfigDict(extra="forbid"))
 class Scene:
     """Settings of an environment; `DistractedEnv`, `gymnasium.make` and `make_vec` take every field.
 
@@ -56,7 +59,6 @@ class Scene:
       task: e.g. "walker-walk".
       distractor: "none", "static", "dynamic", or with a difficulty ("dynamic_hard"); for mazes whether the goal is
         "visible", "hidden", or hidden and "fixed" with the start.
-      difficulty: easy, medium or hard; of locomotion.
       size: pixels a side. renderer: its name; samples: a pixel.
       split: "val" shows videos and styles that no released data show, "train" those of the data.
       backgrounds: "builtin" or a folder of videos.
@@ -73,102 +75,88 @@ class Scene:
 
     task: str
     distractor: str = "none"
-    difficulty: str | None = None
     size: int = 64
     renderer: str = "native"
-    samples: int | None = None
-    split: str = "val"
+    samples: Count | None = None
+    split: Literal["val", "train"] = "val"
     backgrounds: str = "builtin"
     own_videos: str | None = None
-    views: Sequence[str] | None = None
-    modalities: Sequence[str] = ()
-    max_steps: int | None = None
-    goal: str | None = None
-    fixed_goals: int = FIXED_GOALS
-    goal_pair: int | None = None
-    goal_seed: int = 0
-    threads: int = 1
+    views: str | Sequence[str] | None = None
+    modalities: str | Sequence[str] = ()
+    max_steps: Count | None = None
+    goal: Literal["visible", "hidden"] | None = None
+    fixed_goals: Count = FIXED_GOALS
+    goal_pair: Index | None = None
+    goal_seed: Index = 0
+    threads: Count = 1
 
     def spec(self) -> SubsetSpec:
         """The task with its distractor and goal mode; the level is of no account.
 
         Raises:
-          UnknownNameError: the task has no such setting, or there is no such difficulty.
+          UnknownNameError: the task has no such setting.
         """
-        maze = is_maze(get_task(self.task).id)
         # Mazes always differ in style, and in whether the goal is seen.
-        spec = SubsetSpec.parse(self.task, "random", VISIBLE if maze and self.distractor == "none" else self.distractor)
-        if self.difficulty and not maze:
-            return replace(spec, distractor=DistractorSetting(spec.distractor.kind, self.difficulty))
-        return spec
+        unnamed = self.distractor == "none" and is_maze(get_task(self.task).id)
+        return SubsetSpec.parse(self.task, "random", VISIBLE if unnamed else self.distractor)
 
     def check(self) -> None:
-        """Raises DmcvbError for a field that has no such value, or none for this task."""
-        maze = is_maze(get_task(self.task).id)
-        for field, value, known in (("split", self.split, SPLITS), ("goal", self.goal, (None, *GOAL_PICTURES))):
-            if value not in known:
-                raise UnknownNameError(field, str(value), [name for name in known if name])
-        if maze and self.difficulty:
-            raise DmcvbError(f"{self.task} has no difficulty: mazes only differ in style; remove difficulty")
-        if self.own_videos and self.backgrounds == "builtin":
-            raise DmcvbError(
-                f"the data show videos of their own (digest {self.own_videos[:12]}), not the built-in ones: give their "
-                "folder with backgrounds=FOLDER"
-            )
+        """Raises DmcvbError for a field that has no effect, or none for this task."""
+        spec, given = self.spec(), {name for name in _FIELDS if getattr(self, name) != getattr(Scene, name)}
+        unused = []
+        if not is_maze(get_task(self.task).id):
+            unused.append("goal")
+        if spec.goal is not GoalMode.FIXED:
+            unused += ["fixed_goals", "goal_pair", "goal_seed"]
+        elif self.goal_pair is not None and self.goal_pair >= self.fixed_goals != FIXED_GOALS:
+            raise DmcvbError(f"goal_pair is {self.goal_pair}; give 0 to {self.fixed_goals - 1}, as fixed_goals says")
+        if spec.distractor.kind == "none":
+            unused.append("backgrounds")
+        for name in unused:
+            if name in given:
+                raise DmcvbError(f"{name} has no effect on {self.task} {self.distractor}; remove {name}")
+        if self.views is not None and not len(self.views):
+            raise DmcvbError("views is empty; leave it out for all of them")
         for modality in as_names(self.modalities):
             if get_modality(modality).needs_next:
                 raise DmcvbError(
                     f"an environment has no {modality}: the next frame is not known yet; remove {modality}"
                 )
-        if self.views is not None and not len(self.views):
-            raise DmcvbError("views is empty; leave it out for all of them")
-        if self.difficulty and not maze:
-            named = SubsetSpec.parse(self.task, "random", self.distractor).distractor
-            if self.distractor != named.kind and self.spec().distractor != named:
-                raise DmcvbError(f"{self.distractor} has its difficulty; remove difficulty={self.difficulty!r}")
-        if self.goal and not maze:
-            raise DmcvbError(f"{self.task} has no goal in its images; remove goal")
-        counts = {"max_steps": self.max_steps, "threads": self.threads, "fixed_goals": self.fixed_goals}
-        for name, number in counts.items():
-            if number is not None:
-                check_count(name, number)
-        for name, number in {"goal_pair": self.goal_pair, "goal_seed": self.goal_seed}.items():
-            if number is not None:
-                check_count(name, number, least=0)
-        spec = self.spec()
-        if spec.goal is not GoalMode.FIXED:
-            for name in ("fixed_goals", "goal_pair", "goal_seed"):
-                if getattr(self, name) != getattr(Scene, name):
-                    raise DmcvbError(f"{name} has no effect without distractor 'fixed' (mazes); remove {name}")
-        elif self.goal_pair is not None and self.goal_pair >= self.fixed_goals != FIXED_GOALS:
-            raise DmcvbError(f"goal_pair is {self.goal_pair}; give 0 to {self.fixed_goals - 1}, as fixed_goals says")
-        if spec.distractor.kind == "none":
-            # An exported data set names the difficulty that every setting has by default.
-            unused = {"difficulty": (None, DistractorSetting("none").difficulty), "backgrounds": (Scene.backgrounds,)}
-            for name, unchanged in unused.items():
-                if getattr(self, name) not in unchanged:
-                    shown = f"{self.task} {self.distractor}"
-                    raise DmcvbError(f"{name} has no effect: {shown} shows no distractors; remove {name}")
+        if self.own_videos:
+            self._check_videos(self.own_videos)
 
-    def check_videos(self) -> None:
-        """Raises DmcvbError for other videos than those of the data, if these are named and can be compared."""
+    def _check_videos(self, wanted: str) -> None:
+        """Raises DmcvbError for other videos than those of the data, if they can be compared."""
+        if self.backgrounds == "builtin":
+            raise DmcvbError(
+                f"the data show videos of their own (digest {wanted[:12]}), not the built-in ones: give their folder "
+                "with backgrounds=FOLDER"
+            )
         found = {}
-        for split in SPLITS if self.own_videos else ():
+        for split in SPLITS:
             with contextlib.suppress(BackgroundError):  # a folder may hold the videos of evaluation alone
                 found[split] = load_backgrounds(self.backgrounds, split).digest
-        if "train" in found and self.own_videos not in found.values():
+        if "train" in found and wanted not in found.values():
             raise DmcvbError(
-                f"{self.backgrounds} does not hold the videos of the data (digest {str(self.own_videos)[:12]}); give "
-                "their folder with backgrounds=FOLDER"
+                f"{self.backgrounds} does not hold the videos of the data (digest {wanted[:12]}); give their folder "
+                "with backgrounds=FOLDER"
             )
 
 
+_FIELDS = [field.name for field in fields(Scene) if field.name not in ("task", "distractor")]
+
+
 def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
-    known = [field.name for field in fields(Scene) if field.name not in ("task", "distractor")]
     for name in options:
-        if name not in known:
-            raise UnknownNameError("option of environments", name, known)
-    return Scene(task, distractor, **options)
+        if name not in _FIELDS:
+            raise UnknownNameError("option of environments", name, _FIELDS)
+    try:
+        scene = Scene(task, distractor, **options)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise DmcvbError(f"{first['loc'][0]} is {first['input']!r}: {first['msg']}") from None
+    scene.check()
+    return scene
 
 
 class _Stage:
@@ -177,7 +165,6 @@ class _Stage:
     def __init__(self, count: int, scene: Scene):
         if count < 1:
             raise DmcvbError(f"num_envs is {count}; give at least 1")
-        scene.check()
         spec = scene.spec()
         self.task, self.count, self.size, self.split = get_task(scene.task), count, scene.size, scene.split
         self.setting = spec.distractor
@@ -190,7 +177,6 @@ class _Stage:
         check_size(scene.size)
         check_renderer(scene.renderer)
         self.backgrounds = None if self.setting.kind == "none" else load_backgrounds(scene.backgrounds, scene.split)
-        scene.check_videos()
         self.renderer = make_renderer(
             scene.renderer,
             self.task,
@@ -199,8 +185,6 @@ class _Stage:
             floor_alpha=floor_alpha_for(self.task, self.setting),
             samples=scene.samples,
         )
-        if hasattr(self.renderer, "worlds"):
-            self.renderer.worlds = count  # a launch paints all episodes, and not 256 frames for one
         self.batch = self.task.batch(count, scene.threads)
         self._episodes = [(0, 0)] * count  # (seed, number) of each place
         self.frame, self.started = np.zeros(count, int), np.zeros(count, int)

@@ -95,15 +95,13 @@ def _environment(source: Source, split: str) -> EnvSpec:
     setting = record.setting if maze else record.distractor.kind
     options = {
         "task": record.task,
-        "distractor": setting,
+        "distractor": record.setting if maze else record.distractor.name,
         "size": record.size,
         "samples": record.renderer.get("samples"),
         "split": split,
     }
     if record.renderer.get("name") and not record.imported:
         options["renderer"] = record.renderer["name"]
-    if not maze:
-        options["difficulty"] = record.distractor.difficulty
     if maze:
         options["views"] = list(source.views)
         if record.hidden_goal != record.spec.hides_goal:  # `paint --goal` decides it, too
