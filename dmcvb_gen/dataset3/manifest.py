@@ -24,7 +24,7 @@ import pydantic
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes
-from dmcvb_gen.spec import LOCOMOTION, Distractor, GoalMode, SubsetSpec
+from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec
 
 MANIFEST, COPY = "manifest.json", "copy.json"
 RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE = "recipes/", "records/", "layers/", "manifests/", "provenance/"
@@ -289,7 +289,7 @@ class SubsetRecord(_Model):
         return SubsetSpec.parse(self.task, self.level, self.setting)
 
     @property
-    def distractor(self) -> Distractor:
+    def distractor(self) -> DistractorSetting:
         """The distractor of its images; "none" for mazes."""
         return self.spec.distractor
 

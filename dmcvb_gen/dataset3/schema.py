@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,7 @@ class EpisodeShape:
       state_size, physics_size: entries of one step.
       materials: materials whose colors are labels.
       max_steps: transitions at which the time limit ends an episode.
+      attributes: what else is stored with the arrays of these names.
     """
 
     views: tuple[str, ...]
@@ -74,22 +75,22 @@ class EpisodeShape:
     physics_size: int
     materials: int
     max_steps: int
+    attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, task: Any) -> EpisodeShape:
         """The shape of a `dmcvb_gen.tasks` task (which this package does not import)."""
-        low = getattr(task, "action_low", None)
-        high = getattr(task, "action_high", None)
         return cls(
             views=tuple(task.views),
             goal=bool(task.goal_geoms),
             state_fields={name: (part.start, part.stop) for name, part in task.state_slices.items()},
-            action_low=tuple(map(float, low if low is not None else [-1.0] * task.action_size)),
-            action_high=tuple(map(float, high if high is not None else [1.0] * task.action_size)),
+            action_low=tuple(map(float, task.action_low)),
+            action_high=tuple(map(float, task.action_high)),
             state_size=task.state_size,
             physics_size=task.physics_size,
             materials=len(task.material_colors),
             max_steps=task.max_steps,
+            attributes=task.array_attributes,
         )
 
     @property
@@ -102,6 +103,7 @@ def trajectory_arrays(shape: EpisodeShape) -> tuple[ArraySpec, ...]:
     """The arrays of a set of trajectories."""
     fields = {name: list(part) for name, part in shape.state_fields.items()}
     bounds = {"low": list(shape.action_low), "high": list(shape.action_high)}
+    physics = dict(shape.attributes.get("physics", {}))
     action = len(shape.action_low)
     return (
         ArraySpec(
@@ -110,7 +112,9 @@ def trajectory_arrays(shape: EpisodeShape) -> tuple[ArraySpec, ...]:
         ArraySpec(name="action", dtype="float32", shape=(action,), dims=("action_dim",), attributes=bounds),
         ArraySpec(name="reward", dtype="float32"),
         ArraySpec(name="discount", dtype="float32"),
-        ArraySpec(name="physics", dtype="float64", shape=(shape.physics_size,), dims=("physics_dim",)),
+        ArraySpec(
+            name="physics", dtype="float64", shape=(shape.physics_size,), dims=("physics_dim",), attributes=physics
+        ),
         ArraySpec(name="length", dtype="int32", steps=False),
         ArraySpec(name="terminated", dtype="bool", steps=False),
         ArraySpec(name="return", dtype="float64", steps=False),

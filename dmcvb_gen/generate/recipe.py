@@ -31,7 +31,7 @@ from dmcvb_gen.spec import (
     FIXED,
     GOAL_MODES,
     LOCOMOTION,
-    Distractor,
+    DistractorSetting,
     SubsetSpec,
     distractor_kinds,
     is_maze,

@@ -33,7 +33,7 @@ from dmcvb_gen.generate.resolve import (
 from dmcvb_gen.generate.works import works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
-from dmcvb_gen.spec import Distractor, is_maze
+from dmcvb_gen.spec import DistractorSetting, is_maze
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
 
@@ -160,7 +160,7 @@ def _new_setting(old: SubsetRecord, distractor: str | None) -> str:
         return old.setting
     if is_maze(old.task):
         raise RecipeError(f"{old.name} varies in style, not by distractor; remove --distractor or use --only")
-    return Distractor.parse(distractor).name
+    return DistractorSetting.parse(distractor).name
 
 
 def _check_options_used(request: Repainting, records: Iterable[SubsetRecord]) -> None:

@@ -15,7 +15,7 @@ from dmcvb_gen.spec import (
     GOAL_MODES,
     REWARDS,
     VISIBLE,
-    Distractor,
+    DistractorSetting,
     Level,
     is_maze,
     task_folder,
@@ -120,7 +120,10 @@ def _settings(given: Mapping[str, Any]) -> tuple[list[str], int | None]:
         if goal not in GOAL_MODES:
             raise UnknownNameError("goal", goal, (*GOAL_MODES, f"{FIXED}N"))
         goals.append(goal)
-    return [*(Distractor.parse(name).name for name in given.get("distractors", ())), *dict.fromkeys(goals)], count
+    return [
+        *(DistractorSetting.parse(name).name for name in given.get("distractors", ())),
+        *dict.fromkeys(goals),
+    ], count
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:

@@ -18,6 +18,7 @@ from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.inputs import local_inputs, video_source
 from dmcvb_gen.generate.modalities import modality_of, stored_in
 from dmcvb_gen.generate.render import modality_of_frames, renderer_for
+from dmcvb_gen.policies.simulate import replay
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks import get_task
@@ -34,13 +35,10 @@ LABEL_TOLERANCE, LABEL_SHARE = 1e-3, 0.02
 """Difference from which on a value of a depth or another modality counts, and the share of such that is too much."""
 
 
-def check_contents(
-    subset: Subset, streams: tuple[int, tuple[str, ...]], backgrounds: str | None = None
-) -> Iterator[Issue]:
+def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
     """All that can be checked of a subset.
 
     Args:
-      streams: seed and names of its episodes' random streams, see `generate.jobs.streams_of`.
       backgrounds: present place of the manifest's videos, if they moved.
 
     Raises:
@@ -50,7 +48,7 @@ def check_contents(
     yield from found
     if any(finding.check in ("shapes", "lengths") for finding in found) or subset.record.imported:
         return  # no values to go by, or nothing to simulate or paint from
-    yield from check_replays(subset, *streams) if get_task(subset.task).replayed else check_physics(subset)
+    yield from check_replays(subset) if get_task(subset.task).replayed else check_physics(subset)
     if subset.pixel_arrays:
         yield from check_pixels(subset, backgrounds)
 
@@ -141,17 +139,17 @@ def check_physics(subset: Subset) -> Iterator[Issue]:
                     yield Issue("physics", subset.name, f"the action leads {gap:.3g} away", episode, int(step))
 
 
-def check_replays(subset: Subset, seed: int, names: tuple[str, ...]) -> Iterator[Issue]:
+def check_replays(subset: Subset) -> Iterator[Issue]:
     """Sampled episodes simulated again from their streams and stored actions: every row is the stored one.
 
     On another processor a last bit may differ, and grow from step to step: what follows is not compared. A difference
     that comes at once is a finding.
     """
-    task = get_task(subset.task)
+    task, makes = get_task(subset.task), subset.trajectories.makes
     for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
         episode, length = int(subset.episodes[index]), int(subset.lengths[index])
         values = subset.episode(episode, ["state", "action", "reward", "physics"])
-        made = replay(task, values["action"][:length], episode, seed, names)
+        made = replay(task, values["action"][:length], episode, makes["seed"], tuple(makes["streams"]))
         if made.length[0] != length:
             message = f"ends after {length} steps, the same actions end it after {made.length[0]}"
             yield Issue("lengths", subset.name, message, episode)

@@ -56,6 +56,7 @@ class Verification:
       incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
       digest: the release's digest; None while it is made.
       compared: whether the digest was compared with one from outside.
+      unchecked: what could not be looked at on this machine, and why; nothing is known to be damaged there.
     """
 
     checked: dict[str, int]
@@ -63,6 +64,7 @@ class Verification:
     incomplete: dict[str, tuple[int, int]] = field(default_factory=dict)
     digest: str | None = None
     compared: bool = False
+    unchecked: tuple[Issue, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -165,7 +167,9 @@ def _verification(
         for name, subset in sound.items()
         if len(subset) < subset.record.episodes
     }
-    return Verification(counts, tuple(findings), incomplete, release.digest, release.compared)
+    unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
+    faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
+    return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked)
 
 
 # -- bytes ----------------------------------------------------------------------------------------
@@ -242,12 +246,10 @@ def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
 # -- values ---------------------------------------------------------------------------------------
 
 
-def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallback) -> list[Issue]:
-    subset, manifest, backgrounds = work
+def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> list[Issue]:
+    subset, backgrounds = work
     tick(subset.name)
     try:
-        from dmcvb_gen.distractors.registry import distractors_of
-        from dmcvb_gen.generate.jobs import streams_of
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
     except ModuleNotFoundError as error:
@@ -260,7 +262,7 @@ def _check_subset(work: tuple[Subset, Manifest, str | None], tick: ProgressCallb
     except DmcvbError as error:  # code of somebody else, which is not here or does not run here
         return [Issue(UNCHECKED, subset.name, f"values, physics and images cannot be checked here: {error}")]
     try:
-        return list(contents.check_contents(subset, streams_of(manifest, subset.record), backgrounds))
+        return list(contents.check_contents(subset, backgrounds))
     except (RenderingError, BackgroundError, UnknownNameError, ImportError) as error:  # what this machine lacks
         return [Issue(UNCHECKED, subset.name, f"values, physics or images cannot be checked here: {error}")]
     except DmcvbError as error:

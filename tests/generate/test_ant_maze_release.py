@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.distractors import Distractor, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.generate.engine import paint
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.policies.bundled import bundled_policies
