@@ -264,7 +264,7 @@ def validation_budget(options: Mapping[str, Any]) -> "Budget":
     from dmcvb_gen.agents.catalog import parse_agent
     from dmcvb_gen.benchmarks.cell import default_workers
     from dmcvb_gen.benchmarks.report import make_budget, plan_validation
-    from dmcvb_gen.dataset3 import Release
+    from dmcvb_gen.dataset import Release
 
     release, agents = Release.open(options["release"]), as_names(options["agents"])
     chosen = [parse_agent(agent) for agent in agents]

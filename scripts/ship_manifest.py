@@ -10,8 +10,8 @@ import argparse
 import tarfile
 from pathlib import Path
 
-from dmcvb_gen.dataset3 import Release
-from dmcvb_gen.dataset3.manifest import MANIFEST, RECIPES
+from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.manifest import MANIFEST, RECIPES
 from dmcvb_gen.generate.shipped import ENDING, pack
 
 ROOT = Path(__file__).parents[1]

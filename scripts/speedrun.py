@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from dmcvb_gen.dataset.manifest import environment
+from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.policies.evaluation import FRESH, evaluate
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import load_policy

@@ -10,10 +10,10 @@ os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linu
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-from dmcvb_gen.dataset3.gate import Release  # noqa: E402
-from dmcvb_gen.dataset3.manifest import record_path  # noqa: E402
-from dmcvb_gen.dataset3.schema import decode  # noqa: E402
-from dmcvb_gen.dataset3.writer import finish, put_shard  # noqa: E402
+from dmcvb_gen.dataset.gate import Release  # noqa: E402
+from dmcvb_gen.dataset.manifest import record_path  # noqa: E402
+from dmcvb_gen.dataset.schema import decode  # noqa: E402
+from dmcvb_gen.dataset.writer import finish, put_shard  # noqa: E402
 from dmcvb_gen.generate.executors import run_works  # noqa: E402
 from dmcvb_gen.generate.plan import make_plan, start  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402

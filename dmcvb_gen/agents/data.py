@@ -20,9 +20,9 @@ import torch
 from torch import nn
 
 from dmcvb_gen.agents.learners import Batch
-from dmcvb_gen.dataset3 import Release, Subset
-from dmcvb_gen.dataset3.pictures import training_pictures
-from dmcvb_gen.dataset3.steps import FIELDS, Selection, StepTable
+from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory

@@ -43,8 +43,8 @@ from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
 from dmcvb_gen.benchmarks.evaluate import Act, Evaluator, Score, TrainedAgent, protocol, renderer_choice
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
-from dmcvb_gen.dataset3 import Release, Subset
-from dmcvb_gen.dataset3.manifest import canonical_json
+from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release

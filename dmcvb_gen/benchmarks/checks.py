@@ -19,7 +19,7 @@ import numpy as np
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell
-from dmcvb_gen.dataset3 import Release, Subset
+from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.inputs import background_source, video_source

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dmcvb_gen.dataset3 import Subset
-from dmcvb_gen.dataset3.pictures import NOT_TRAINED_ON, Pictures, training_pictures
+from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.files import replacing

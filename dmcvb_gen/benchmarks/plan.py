@@ -24,7 +24,7 @@ from dmcvb_gen.agents.catalog import Agent, parse_agent
 from dmcvb_gen.agents.data import Slice, part_count
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.dataset3 import Release, Subset
+from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.inputs import BUILTIN, video_source
 from dmcvb_gen.policies.bundled import bundled_levels

@@ -41,8 +41,8 @@ from dmcvb_gen.benchmarks.checks import (
     training_warnings,
 )
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, get_budget, only, paper_score, plan_benchmark
-from dmcvb_gen.dataset3 import Release
-from dmcvb_gen.dataset3.environment import environment
+from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics

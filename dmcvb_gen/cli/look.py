@@ -18,7 +18,7 @@ from dmcvb_gen.cli.common import (
 )
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.storage.places import is_url, shown
-from dmcvb_gen.text import format_bytes, pluralize, printable, quoted
+from dmcvb_gen.text import format_bytes, pluralize, quoted
 
 
 @click.command()

@@ -50,7 +50,7 @@ def fetch(as_json, **options):
 
 def _whole_shards(out, episodes):
     """A line if shards brought more episodes than were asked for."""
-    from dmcvb_gen.dataset3.gate import Release
+    from dmcvb_gen.dataset.gate import Release
 
     first, last = episodes
     for name, subset in Release.open(out).subsets.items():

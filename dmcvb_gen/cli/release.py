@@ -11,7 +11,7 @@ from dmcvb_gen import commands
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
-from dmcvb_gen.dataset3.manifest import VIDEOS
+from dmcvb_gen.dataset.manifest import VIDEOS
 from dmcvb_gen.generate import public
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.places import is_url, shown

@@ -112,8 +112,8 @@ def part(release, part, as_json, workers, other_versions, only, episode_range, s
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
 def finish(release, options, as_json):
     """Write the manifest of all that is there. Exit code 1 while shards are missing."""
-    from dmcvb_gen.dataset3.gate import Release
-    from dmcvb_gen.dataset3.writer import finish as write
+    from dmcvb_gen.dataset.gate import Release
+    from dmcvb_gen.dataset.writer import finish as write
     from dmcvb_gen.storage.store import open_store
 
     store = open_store(release, options)

@@ -1,4 +1,4 @@
-"""The store: releases of Zarr subsets, written shard by shard, readable with plain zarr."""
+"""The store: releases of Zarr subsets, written shard by shard, never changed, readable with plain zarr."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
-    from dmcvb_gen.dataset.reader import Release, Subset, open_release
+    from dmcvb_gen.dataset.gate import Release
+    from dmcvb_gen.dataset.manifest import Manifest, SubsetRecord
+    from dmcvb_gen.dataset.reader import Subset
 
 # Known and meant: both are read by zarr-python and xarray, which is what the layout promises.
 warnings.filterwarnings("ignore", message="Numcodecs codecs are not in the Zarr version 3 specification")
 warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
 
-__all__ = ["CommitRecord", "Manifest", "Release", "Subset", "SubsetRecord", "open_release"]
-_MODULES = {"Release": "reader", "Subset": "reader", "open_release": "reader"}
+__all__ = ["Manifest", "Release", "Subset", "SubsetRecord"]
+_MODULES = {"Release": "gate", "Subset": "reader"}
 
 
 def __getattr__(name: str) -> Any:

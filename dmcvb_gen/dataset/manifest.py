@@ -1,54 +1,75 @@
-"""The manifest of a release: recipe, versions, policies, backgrounds and digests, read and written as checked JSON."""
+"""Describe a release as data: layers, subsets, resolved recipes, shard records and the manifest, as checked JSON.
+
+::
+
+    recipes/<sha>.json           Resolved     what was asked for, resolved: layers, subsets, inputs
+    records/<layer>/00003.json   ShardRecord  one shard of one layer: its job key, its files
+    layers/<sha>.json            LayerList    all records of a layer, in order
+    manifest.json                Manifest     subsets, and layers with the SHA-256 of their lists
+
+A digest of a release is the SHA-256 of its manifest's bytes; from there, every file has its SHA-256. The manifest is a
+function of recipes and records (`build_manifest`), so whoever finishes a release writes the same bytes.
+"""
 
 from __future__ import annotations
 
 import functools
-import platform
+import json
+import math
 import re
-from importlib import metadata
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from collections.abc import Collection, Iterable, Mapping
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import parse_json
-from dmcvb_gen.files import write_json as write_json_atomically
-from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec, is_maze
-from dmcvb_gen.storage.remote import storage_errors
-from dmcvb_gen.version import __version__
+from dmcvb_gen.files import parse_json, sha256_bytes
+from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec
 
-__all__ = ["write_json_atomically"]
-MANIFEST = "manifest.json"
+MANIFEST, COPY = "manifest.json", "copy.json"
+RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE = "recipes/", "records/", "layers/", "manifests/", "provenance/"
+POLICIES, VIDEOS = "policies/", "backgrounds/"
+ZARR_JSON = "zarr.json"
+ATTACHMENT_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
+CARD_FOLDER = "card/"
+"""Attachments: files of the card, copied as data and no part of the tree. Nothing else may lie in a release."""
 
-SCHEMA_VERSION = 2
-"""Version of the layout and the manifest; a reader refuses newer ones and reads all older ones."""
-
+SCHEMA_VERSION = 3
+MANIFEST_BYTES, RECIPE_BYTES, COPY_BYTES = 2**26, 2**26, 2**24
+"""Largest files of their kind that a reader takes."""
 MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
-"""More than any release has; what asks for more is damaged or hostile, and would keep a reader busy for hours."""
-
-IMPORTED = "imported"
-"""Name of the renderer of subsets that came from DMC-VB's published data."""
-
+MAX_CHUNK_BYTES, MAX_SHARD_BYTES = 2**31, 2**37
+"""More than any release has; a manifest that asks for more is damaged or hostile."""
 PLAIN_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$"
 """A part of a path that leads nowhere else; exports make folders and files of versions and views."""
-_NAME = re.compile(PLAIN_NAME.strip("^$"))
+_PART = re.compile(PLAIN_NAME.strip("^$"))
+IMPORTED = "imported"
+"""Name of the renderer of subsets that came from DMC-VB's published data."""
+Kind = Literal["trajectories", "labels", "images"]
+Codec = Literal["zstd", "channel-delta-zstd"]
 
 
 def check_relative_path(path: str) -> str:
-    """`path` if it is a plain relative path that stays inside its folder.
+    """Return `path` if it is a plain relative path that stays inside its folder.
 
     Raises:
       ValueError: it is absolute, climbs out, or holds an odd character.
     """
-    parts = path.split("/")
-    if not parts or not all(_NAME.fullmatch(part) for part in parts):
-        raise ValueError(f"{path!r} is not a plain relative path")
+    if len(path) > 1000 or not all(_PART.fullmatch(part) for part in path.split("/")):
+        raise ValueError(f"{path[:80]!r} is not a plain relative path")
     return path
+
+
+def _check_line(text: str) -> str:
+    if any(ord(char) < 32 or 127 <= ord(char) < 160 for char in text):
+        raise ValueError("it holds control characters")
+    return text
 
 
 RelativePath = Annotated[str, pydantic.AfterValidator(check_relative_path)]
 Digest = Annotated[str, pydantic.StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Line = Annotated[str, pydantic.StringConstraints(max_length=1000), pydantic.AfterValidator(_check_line)]
+PlainName = Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME, max_length=200)]
 
 
 class _Model(pydantic.BaseModel):
@@ -56,97 +77,207 @@ class _Model(pydantic.BaseModel):
 
 
 class FileRecord(_Model):
-    """One file: its path, bytes and SHA-256."""
+    """One file: its path in the release, its size in bytes, and its SHA-256."""
 
     path: RelativePath
     bytes: int = pydantic.Field(ge=0)
     sha256: Digest
 
 
-class CommitRecord(_Model):
-    """A shard that is whole: which episodes, which files. A shard without its record does not exist.
+# -- layers and their records ---------------------------------------------------------------------
+
+
+class ArraySpec(_Model):
+    """One array of a layer.
 
     Attributes:
-      environment: environment that made it, see `environment`; empty in releases of version 1.
-      painted: True if its pictures are among the files.
-      pictures: files that its pictures had where they were painted, for whoever paints them again; empty if they
-        are stored, or never were painted.
+      name: the reader's name, e.g. "pixels", "pixels/top", "at84/pixels" or "exogenous/camera_position".
+      dtype: numpy name.
+      shape: shape of one step, or of one episode's entry if `steps` is false.
+      dims: names of the axes of `shape`.
+      steps: True if the array has a step axis.
+      chunk_steps: steps of one chunk, the unit of reading; None: all steps of an episode.
+      codec: how a chunk becomes bytes, see `schema.codecs`.
+      attributes: stored with the array, e.g. the fields of a state or the bounds of an action.
     """
 
-    subset: RelativePath
-    shard: int = pydantic.Field(ge=0)
-    episodes: tuple[int, int]
-    steps: int = pydantic.Field(ge=0)
-    files: tuple[FileRecord, ...]
-    environment: dict[str, str] = {}
-    painted: bool = True
-    pictures: tuple[FileRecord, ...] = ()
+    name: RelativePath
+    dtype: Literal[
+        "bool", "uint8", "uint16", "uint64", "int8", "int16", "int32", "int64", "float32", "float64", "float16"
+    ]
+    shape: tuple[Annotated[int, pydantic.Field(gt=0, le=10**7)], ...] = ()
+    dims: tuple[PlainName, ...] = ()
+    steps: bool = True
+    chunk_steps: int | None = pydantic.Field(default=None, gt=0)
+    codec: Codec = "zstd"
+    attributes: dict[str, Any] = {}
 
     @property
-    def episode_count(self) -> int:
-        return self.episodes[1] - self.episodes[0]
+    def stored_name(self) -> str:
+        """Path below the layer's group: "pixels/top" lies at "pixels_top"; groups "exogenous" and "at84" stay."""
+        head, slash, rest = self.name.partition("/")
+        grouped = slash and (head == "exogenous" or re.fullmatch(r"at\d+", head))
+        return f"{head}/{rest.replace('/', '_')}" if grouped else self.name.replace("/", "_")
 
-    def same_data(self, other: CommitRecord) -> bool:
-        """Return True if both stand for the same bytes, even if they were made on different machines."""
-        return self.model_copy(update={"environment": {}}) == other.model_copy(update={"environment": {}})
+
+class Layer(_Model):
+    """Arrays that are made together, shard by shard: a set of trajectories, a setting's labels, or one image array.
+
+    Attributes:
+      name: e.g. "walker-walk/expert/trajectories", "walker-walk/expert/dynamic/labels", ".../dynamic/pixels".
+      group: folder of its Zarr group, e.g. "walker-walk/expert.zarr/dynamic".
+      kind: "trajectories", "labels" or "images".
+      rows: rows of the step axis, max_steps + 1.
+      episodes_per_shard: every shard has as many; arrays cut off what was not asked for.
+      makes: what else decides its bytes: policies, streams, seed, renderer, ... and "of", the key of the layer below.
+      source: where an imported layer comes from; it cannot be made again, and no copy leaves it out.
+    """
+
+    name: RelativePath
+    group: RelativePath
+    kind: Kind
+    rows: int = pydantic.Field(gt=0, le=MAX_STEPS + 1)
+    episodes_per_shard: int = pydantic.Field(gt=0, le=MAX_EPISODES)
+    arrays: tuple[ArraySpec, ...] = pydantic.Field(min_length=1, max_length=1000)
+    makes: dict[str, Any] = {}
+    source: Line | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _bounded(self) -> Layer:
+        for spec in self.arrays:
+            step = math.prod(spec.shape) * _ITEM_BYTES[spec.dtype]
+            rows = self.rows if spec.steps else 1
+            chunk = step * (min(spec.chunk_steps or rows, rows) if spec.steps else self.episodes_per_shard)
+            if chunk > MAX_CHUNK_BYTES or step * rows * self.episodes_per_shard > MAX_SHARD_BYTES:
+                raise ValueError(f"array {spec.name} of {self.name} has larger shards than any release has")
+        _check_unique([spec.stored_name for spec in self.arrays], f"arrays of {self.name}")
+        return self
+
+    @functools.cached_property
+    def key(self) -> str:
+        """SHA-256 of all that decides its bytes, and of nothing else (not its name)."""
+        facts = self.model_dump(mode="json", include={"kind", "rows", "episodes_per_shard", "makes", "source"})
+        facts["arrays"] = [spec.model_dump(mode="json") for spec in self.arrays]
+        return sha256_bytes(canonical_json(facts))
+
+    def job_key(self, shard: int) -> str:
+        """SHA-256 of all that decides the bytes of one shard."""
+        return sha256_bytes(f"{self.key} {shard}\n".encode())
+
+    def shards_for(self, episodes: int) -> int:
+        """How many shards hold that many episodes."""
+        return -(-episodes // self.episodes_per_shard)
+
+    def episodes_of(self, shard: int) -> range:
+        """The episodes of a shard, which is always full."""
+        return range(shard * self.episodes_per_shard, (shard + 1) * self.episodes_per_shard)
+
+    def array(self, name: str) -> ArraySpec:
+        """The spec of one of its arrays, by the reader's name."""
+        return next(spec for spec in self.arrays if spec.name == name)
+
+    def file_path(self, spec: ArraySpec, shard: int) -> str:
+        """Path in the release of an array's file of a shard."""
+        zeros = len(spec.shape) + spec.steps
+        return f"{self.group}/{spec.stored_name}/c/{'/'.join([str(shard), *['0'] * zeros])}"
+
+
+class ShardFile(_Model):
+    """The file of one array in a shard: its size in bytes and its SHA-256."""
+
+    bytes: int = pydantic.Field(gt=0, le=MAX_SHARD_BYTES)
+    sha256: Digest
+
+
+class ShardRecord(_Model):
+    """A shard exists if and only if its record does.
+
+    Attributes:
+      key: job key, see `Layer.job_key`.
+      files: array name -> file; an array that is left out has nothing but fill values in this shard.
+    """
+
+    key: Digest
+    files: dict[RelativePath, ShardFile]
+
+
+class LayerList(_Model):
+    """All records of a layer, in the order of its shards."""
+
+    shards: tuple[ShardRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+
+class ListedLayer(Layer):
+    """A layer of a finished release.
+
+    Attributes:
+      shards: how many there are.
+      list: SHA-256 of the list of its records, `layers/<sha>.json`.
+    """
+
+    shards: int = pydantic.Field(gt=0, le=MAX_SHARDS)
+    list: Digest
+
+
+_ITEM_BYTES = {"bool": 1, "uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "int32": 4, "float32": 4}
+_ITEM_BYTES |= {"uint64": 8, "int64": 8, "float64": 8}
+
+
+# -- subsets, recipes, manifest -------------------------------------------------------------------
 
 
 class PolicyRecord(_Model):
     """A behaviour policy of a subset: where the release keeps a copy, and what it is."""
 
-    name: str
-    digest: str
+    name: Line
+    digest: Line
     path: RelativePath | None = None
     header: dict[str, Any] = {}
 
 
 class SubsetRecord(_Model):
-    """One subset: what it was asked to be.
+    """One subset: the episodes of a task and level under one setting.
 
     Attributes:
+      layers: names of its layers: trajectories, labels (none of imported subsets), then images.
+      size: pixels a side of its own images.
       family: family of its task, "locomotion" or "ant-maze".
-      views: names of the pictures of a frame, in the order in which policies see them.
-      hidden_goal: True if the pictures that the subset is about have no goal in them (both kinds may be stored).
+      views: names of the images of a frame, in the order in which policies see them.
+      hidden_goal: True if the images that the subset is about have no goal in them (both kinds may be stored).
       max_steps: transitions at which the time limit ends an episode.
-      fixed_goals, episodes_per_goal: how many pairs of start and goal there are, and how many episodes each has; what
-        is at hand may be fewer. None if both are drawn for each episode.
-      split: the videos and styles that it was painted with, "train" or "val".
-      pixels: True if pictures are stored; without them, they can be painted from physics states and labels.
-      only_shown: whether only the pictures that the subset is about are stored; else, if the task has a goal, those
-        with it and those without it. Left out of the JSON if it is false, as it is in older releases.
+      action_repeat: control steps that an action is held.
+      seconds_per_step: simulated time of one transition.
+      fixed_goals, episodes_per_goal: pairs of start and goal, and the episodes of each; None if drawn an episode.
+      split: the videos and styles that it was rendered with, "train" or "val".
+      only_shown: whether only the images that the subset is about are stored.
+      joints, actuators: names in the model, in the order of the physics state's positions and of the actions.
+      return_range: (random, expert): returns that normalize scores to 0 and 100; None if unknown.
     """
 
     name: RelativePath
-    task: str
-    level: str
-    setting: str
+    task: Line
+    level: PlainName
+    setting: PlainName
     episodes: int = pydantic.Field(gt=0, le=MAX_EPISODES)
-    episodes_per_shard: int = pydantic.Field(gt=0, le=MAX_EPISODES)
+    layers: tuple[RelativePath, ...] = pydantic.Field(min_length=1, max_length=1000)
     size: int = pydantic.Field(gt=0, le=MAX_SIZE)
     deterministic: bool = False
     policies: tuple[PolicyRecord, ...] = ()
     renderer: dict[str, Any] = {}
     backgrounds: dict[str, Any] | None = None
-    family: str = LOCOMOTION
-    views: tuple[Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME)], ...] = pydantic.Field(
-        default=("pixels",), min_length=1, max_length=100
-    )
+    family: PlainName = LOCOMOTION
+    views: tuple[PlainName, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
     hidden_goal: bool = False
     max_steps: int = pydantic.Field(default=500, gt=0, le=MAX_STEPS)
+    action_repeat: int = pydantic.Field(default=2, gt=0, le=1000)
+    seconds_per_step: float = pydantic.Field(default=0.05, gt=0)
     fixed_goals: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
     episodes_per_goal: int | None = pydantic.Field(default=None, gt=0, le=MAX_EPISODES)
-    split: str = "train"
-    pixels: bool = True
-    digest: Digest | None = None
+    split: Literal["train", "val"] = "train"
     only_shown: bool = False
-
-    @pydantic.field_validator("backgrounds")
-    @classmethod
-    def _stays_inside(cls, backgrounds: dict[str, Any] | None) -> dict[str, Any] | None:
-        source = (backgrounds or {}).get("source")
-        if source is not None and not Path(str(source)).is_absolute():  # absolute: in releases of version 1, only read
-            check_relative_path(str(source))
-        return backgrounds
+    joints: tuple[Line, ...] = ()
+    actuators: tuple[Line, ...] = ()
+    return_range: tuple[float, float] | None = None
 
     @property
     def spec(self) -> SubsetSpec:
@@ -169,244 +300,322 @@ class SubsetRecord(_Model):
 
     @property
     def imported(self) -> bool:
-        """Whether it came from DMC-VB's published data, which have no physics states and no labels: nothing of it can
-        be simulated or painted again."""
+        """Whether it came from DMC-VB's published data: nothing of it can be simulated or rendered again."""
         return self.renderer.get("name") == IMPORTED
 
-    @pydantic.model_serializer(mode="wrap")
-    def _bare(self, dump: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        data = dump(self)
-        if not self.only_shown:
-            data.pop("only_shown", None)
-        return data
+
+def _check_unique(names: Collection[str], what: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name.casefold() in seen:
+            raise ValueError(f"{what}: {name!r} is there twice (case is ignored)")
+        seen.add(name.casefold())
 
 
-class VersionEntry(_Model):
-    """One growth of a release.
+def _check_tree(subsets: tuple[SubsetRecord, ...], layers: Iterable[Layer]) -> None:
+    named = {layer.name: layer for layer in layers}
+    _check_unique([subset.name for subset in subsets], "subsets")
+    _check_unique(list(named), "layers")
+    places = [f"{layer.group}/{spec.stored_name}" for layer in named.values() for spec in layer.arrays]
+    _check_unique(places, "arrays")
+    for subset in subsets:
+        if lacking := [name for name in subset.layers if name not in named]:
+            raise ValueError(f"{subset.name} names layer {lacking[0]}, which is not described")
+        if named[subset.layers[0]].kind != "trajectories":
+            raise ValueError(f"the first layer of {subset.name} holds no trajectories")
+
+
+class _Described(_Model):
+    """What recipes and manifests share."""
+
+    schema_version: Literal[3] = 3
+    name: PlainName
+    version: PlainName
+    license: Line
+    authors: tuple[Line, ...] = pydantic.Field(default=(), max_length=1000)
+    description: str = pydantic.Field(default="", max_length=10_000)
+    inputs: tuple[FileRecord, ...] = pydantic.Field(default=(), max_length=10**6)
+    subsets: tuple[SubsetRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+
+class Resolved(_Described):
+    """A resolved recipe, `recipes/<sha>.json`: what a release was asked to be, on any machine.
 
     Attributes:
-      version: version of the release since then.
-      recipe: the resolved recipe that was added.
-      generator: program that added it.
-      subsets: name -> (first, last + 1) of the episodes that it added.
+      recipe: the recipe as it was given, without paths of the machine.
+      inputs: policies and videos that the release keeps copies of.
+      derived: for a release made from another one (repaint, import): its name, version and digest.
     """
 
-    version: str
-    recipe: dict[str, Any]
-    generator: str
-    subsets: dict[RelativePath, tuple[int, int]]
+    format: Literal["dmcvb-gen recipe"] = "dmcvb-gen recipe"
+    recipe: dict[str, Any] = {}
+    layers: tuple[Layer, ...] = pydantic.Field(max_length=MAX_SHARDS)
+    derived: dict[str, Any] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _whole(self) -> Resolved:
+        _check_tree(self.subsets, self.layers)
+        return self
+
+    @functools.cached_property
+    def sha256(self) -> str:
+        """SHA-256 of its canonical JSON, its name in `recipes/`."""
+        return sha256_bytes(canonical_json(self))
 
 
-def _check_shards(subsets: tuple[SubsetRecord, ...]) -> tuple[SubsetRecord, ...]:
-    if (count := sum(map(shard_count, subsets))) > MAX_SHARDS:
-        raise ValueError(f"{count:,} shards are more than the {MAX_SHARDS:,} that a release may have")
-    return subsets
-
-
-class Manifest(_Model):
+class Manifest(_Described):
     """The release's manifest.json.
 
     Attributes:
-      recipe: the resolved recipe that made it, in its first version.
-      additions: its growths since, in order.
-      environments: versions and platform of every process that added to it, in order.
-      lineage: for a release derived from another one (repaint, fetch, import): what from.
-      complete: True if every shard of every subset is committed; `digest`s are set then.
-      digest: digest of every file of the release, see `dmcvb_gen.dataset.index`; None while it is made.
+      recipes: SHA-256 of the recipes that its subsets come from, in order.
+      inputs: policies and videos that the release keeps copies of.
     """
 
-    schema_version: int = SCHEMA_VERSION
-    name: str
-    version: Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME)]
-    license: str
-    authors: tuple[str, ...] = ()
-    generator: str = f"dmcvb-gen {__version__}"
-    recipe: dict[str, Any]
-    additions: tuple[VersionEntry, ...] = ()
-    subsets: Annotated[tuple[SubsetRecord, ...], pydantic.AfterValidator(_check_shards)]
-    environments: tuple[dict[str, str], ...] = ()
-    lineage: tuple[dict[str, Any], ...] = ()
-    complete: bool = False
-    digest: Digest | None = None
     format: Literal["dmcvb-gen release"] = "dmcvb-gen release"
+    recipes: tuple[Digest, ...] = pydantic.Field(max_length=10_000)
+    layers: tuple[ListedLayer, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+    @pydantic.model_validator(mode="after")
+    def _whole(self) -> Manifest:
+        _check_tree(self.subsets, self.layers)
+        for subset in self.subsets:
+            for layer in map(self.layer, subset.layers):
+                if layer.kind != "images" and layer.shards * layer.episodes_per_shard < subset.episodes:
+                    raise ValueError(f"{layer.name} has fewer episodes than {subset.name}")
+        if sum(layer.shards for layer in self.layers) > 10 * MAX_SHARDS:
+            raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
+        return self
 
     @property
     def imported(self) -> bool:
         """True if any of its subsets was imported, see `SubsetRecord.imported`."""
         return any(record.imported for record in self.subsets)
 
-    def recipe_of(self, subset: str) -> dict[str, Any]:
-        """The recipe that a subset's first episode was made by; those added later agree with it."""
-        for addition in self.additions:
-            if addition.subsets.get(subset, (1, 1))[0] == 0:
-                return addition.recipe
-        return self.recipe
+    def layer(self, name: str) -> ListedLayer:
+        """One of its layers."""
+        return self._by_name[name]
 
-    def origin(self, subset: str) -> tuple[str, str]:
-        """The version of the release that a subset's last episodes came with, and what made its first."""
-        version, generator = str(self.recipe.get("version", self.version)), self.generator
-        for addition in self.additions:
-            if subset in addition.subsets:
-                version = addition.version
-                generator = addition.generator if addition.subsets[subset][0] == 0 else generator
-        return version, generator
-
-    def labels_of(self, subset: str) -> tuple[str, ...]:
-        """Modalities that the last repaint stored in a subset, which rollouts do not make."""
-        repaints = [entry for entry in self.lineage if entry["kind"] == "repaint" and subset in entry["subsets"]]
-        return tuple(repaints[-1].get("labels", ())) if repaints else ()
+    @functools.cached_property
+    def _by_name(self) -> dict[str, ListedLayer]:
+        return {layer.name: layer for layer in self.layers}
 
 
-def subset_path(name: str) -> str:
-    """Folder of a subset's Zarr group inside the release."""
-    return f"{name}.zarr"
+class Copy(_Model):
+    """copy.json of a release that holds a part of another one.
+
+    Attributes:
+      manifest: SHA-256 of the manifest that it was copied from, which is the manifest here.
+      source: where it was copied from, without passwords.
+      promised: layer -> runs (first, last + 1) of shards that were to be copied; a shard is here if its record is.
+    """
+
+    format: Literal["dmcvb-gen copy"] = "dmcvb-gen copy"
+    manifest: Digest
+    source: Line = ""
+    promised: dict[RelativePath, tuple[tuple[int, int], ...]] = {}
 
 
-def commit_path(name: str, shard: int) -> str:
-    """Commit record of a shard inside the release."""
-    return f"commits/{name}/{shard:05d}.json"
+# -- JSON -----------------------------------------------------------------------------------------
 
 
-def shard_count(subset: SubsetRecord) -> int:
-    return -(-subset.episodes // subset.episodes_per_shard)
+def canonical_json(value: Any) -> bytes:
+    """The bytes of a value (plain, or a model) of which its SHA-256 is taken: sorted keys, no spaces, a newline."""
+    if isinstance(value, pydantic.BaseModel):
+        value = value.model_dump(mode="json")
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return (text + "\n").encode()
 
 
-def shard_episodes(subset: SubsetRecord, shard: int) -> tuple[int, int]:
-    """First episode of a shard, and the one after its last."""
-    first = shard * subset.episodes_per_shard
-    return first, min(first + subset.episodes_per_shard, subset.episodes)
+Parsed = TypeVar("Parsed", bound=pydantic.BaseModel)
 
 
-def environment() -> dict[str, str]:
-    """Versions and the processor that can change a bit of the data."""
-    return dict(_environment())
-
-
-@functools.cache
-def _environment() -> dict[str, str]:
-    packages: tuple[str, ...] = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
-    versions = {name: version for name in packages if (version := _version(name))}
-    return {
-        "dmcvb-gen": __version__,
-        "python": platform.python_version(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "cpu": _cpu_name(),
-        **versions,
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _cpu_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or "unknown"
-
-
-def parse_manifest(text: str | bytes, where: str = MANIFEST) -> Manifest:
-    """A manifest from JSON.
+def parse(model: type[Parsed], text: bytes, where: str) -> Parsed:
+    """A model from canonical JSON.
 
     Raises:
-      StoreError: not JSON, not a manifest, or of a newer schema version.
+      StoreError: not JSON, not canonical, not such a model, or of another schema version.
     """
-    return _parse(Manifest, text, where)
-
-
-def local_manifest(root: Path) -> Manifest:
-    """The manifest in a release's folder.
-
-    Raises:
-      StoreError: there is none, it is damaged or cannot be read.
-    """
-    with storage_errors(root / MANIFEST):
-        if not (root / MANIFEST).is_file():
-            raise StoreError(f"{root} holds no release (no {MANIFEST}); give the folder that `rollout --out` made")
-        return parse_manifest((root / MANIFEST).read_bytes(), str(root / MANIFEST))
-
-
-def parse_commit(text: str | bytes, where: str = "commit record") -> CommitRecord:
-    """A commit record from JSON, see `parse_manifest`."""
-    return _parse(CommitRecord, text, where)
-
-
-def checked_commit(text: str | bytes, where: str, subset: SubsetRecord, shard: int) -> CommitRecord:
-    """A shard's commit record from JSON, wherever it was read.
-
-    Raises:
-      StoreError: it is damaged, another shard's, or names files outside of the subset's folder.
-    """
-    commit = parse_commit(text, where)
-    if (commit.subset, commit.shard, commit.episodes) != (subset.name, shard, shard_episodes(subset, shard)):
-        raise StoreError(
-            f"{where} is not the record of episodes {_span(shard_episodes(subset, shard))} of {subset.name} but of "
-            f"{_span(commit.episodes)} of {commit.subset}; put the release's own record back (`dmcvb-gen regenerate` "
-            "makes it again)"
-        )
-    folder = f"{subset_path(subset.name)}/"
-    if any(not file.path.startswith(folder) for file in (*commit.files, *commit.pictures)):
-        raise StoreError(f"{where} names files outside of {folder}; do not trust this release")
-    return commit
-
-
-def _span(episodes: tuple[int, int]) -> str:
-    return f"{episodes[0]}:{episodes[1]}"
-
-
-def _parse(model, text, where):
     try:
         data = parse_json(text)
     except ValueError as error:
         raise StoreError(f"{where} is not JSON ({error}); fetch it again, or make a new release") from None
     version = data.get("schema_version", SCHEMA_VERSION) if isinstance(data, dict) else None
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        raise StoreError(
-            f"{where} has schema version {version}, this dmcvb-gen {__version__} reads up to {SCHEMA_VERSION}; "
-            "install a newer dmcvb-gen"
+    if isinstance(version, int) and version != SCHEMA_VERSION:
+        cure = (
+            "install a newer dmcvb-gen" if version > SCHEMA_VERSION else "make the release again, or use dmcvb-gen 0.1"
         )
-    if model is Manifest and version == 1:
-        data = _upgraded(data)
+        raise StoreError(f"{where} has schema version {version}, and this dmcvb-gen reads {SCHEMA_VERSION}; {cure}")
     try:
-        return model.model_validate(data)
+        made = model.model_validate(data)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the top"
         raise StoreError(f"{where} is not valid at {place}: {first['msg']}") from None
+    return made
 
 
-def _upgraded(data: dict[str, Any]) -> dict[str, Any]:
-    """A manifest of version 1 with what version 2 says of each subset; there were two families of tasks then."""
-    subsets, recipe = data.get("subsets"), data.get("recipe")
-    if not isinstance(subsets, list) or not isinstance(recipe, dict):
-        return data  # the model says what is wrong
-    patterns = recipe.get("subsets")
-    patterns = [p for p in patterns if isinstance(p, dict)] if isinstance(patterns, list) else []
-    upgraded = []
-    for old in subsets:
-        if not isinstance(old, dict):
-            return data
-        facts: dict[str, Any] = {"split": (old.get("backgrounds") or {}).get("split") or recipe.get("split", "train")}
-        if is_maze(str(old.get("task"))):
-            facts |= {"family": ANT_MAZE, "views": ["top", "egocentric", "follow", "overhead"], "max_steps": 1200}
-            facts["hidden_goal"] = old.get("setting") in (HIDDEN, FIXED)
-            if old.get("setting") == FIXED:
-                facts |= _goal_pairs_of_version_1(old, patterns)
-        upgraded.append(facts | old)
-    return {**data, "subsets": upgraded}
+def record_path(layer: str, shard: int) -> str:
+    """Path of a shard's record inside the release."""
+    return f"{RECORDS}{layer}/{shard:05d}.json"
 
 
-def _goal_pairs_of_version_1(record: dict[str, Any], patterns: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the number of start and goal pairs of a fixed subset, from the recipe's pattern that asked for it."""
-    for pattern in patterns:
-        tasks, per_goal = pattern.get("tasks") or (), pattern.get("episodes_per_goal")
-        if record.get("task") in tasks and FIXED in (pattern.get("settings") or ()) and per_goal:
-            return {"fixed_goals": record.get("episodes", 0) // per_goal, "episodes_per_goal": per_goal}
-    return {}
+def list_path(digest: str) -> str:
+    """Path of a layer's list inside the release."""
+    return f"{LAYERS}{digest}.json"
+
+
+def is_attachment(path: str) -> bool:
+    """Return True if a path is one of the card's files, which are copied as data and lie outside of the tree."""
+    return path in ATTACHMENT_FILES or bool(re.fullmatch(rf"{CARD_FOLDER}[A-Za-z0-9_][A-Za-z0-9_.+-]{{0,200}}", path))
+
+
+def list_bytes_limit(layer: ListedLayer) -> int:
+    """The largest list that a layer can have."""
+    names = sum(len(spec.name) + 130 for spec in layer.arrays)
+    return 1000 + layer.shards * (200 + names)
+
+
+def record_bytes_limit(layer: Layer) -> int:
+    """The largest record that a shard of a layer can have."""
+    return 1000 + sum(len(spec.name) + 130 for spec in layer.arrays)
+
+
+def check_record(record: ShardRecord, layer: Layer, shard: int, where: str) -> ShardRecord:
+    """Return a record that is the shard's.
+
+    Raises:
+      StoreError: it was made by another job, or names arrays that the layer does not have.
+    """
+    key = layer.job_key(shard)
+    if record.key != key:
+        raise StoreError(
+            f"{where} is of another job ({record.key[:12]}) than this release's ({key[:12]}): something that decides "
+            "its bytes differs; choose another place for the new one"
+        )
+    if strange := set(record.files) - {spec.name for spec in layer.arrays}:
+        raise StoreError(f"{where} names array {min(strange)}, which {layer.name} does not have")
+    return record
+
+
+# -- the manifest of recipes and records ----------------------------------------------------------
+
+Counts = Mapping[str, int]
+"""Layer -> how many shards are there without a gap from the first."""
+
+
+def merged_layers(recipes: Iterable[Resolved]) -> dict[str, Layer]:
+    """All layers of recipes.
+
+    Raises:
+      StoreError: two of them describe one layer differently.
+    """
+    layers: dict[str, Layer] = {}
+    for recipe in recipes:
+        for layer in recipe.layers:
+            there = layers.setdefault(layer.name, layer)
+            if there != layer:
+                raise StoreError(_difference(there, layer))
+    return layers
+
+
+def _difference(one: Layer, other: Layer) -> str:
+    for field in ("episodes_per_shard", "rows", "group", "kind", "source", "arrays"):
+        first, second = getattr(one, field), getattr(other, field)
+        if first != second:
+            return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+    keys = sorted(set(one.makes) | set(other.makes))
+    field = next(key for key in keys if one.makes.get(key) != other.makes.get(key))
+    first, second = one.makes.get(field), other.makes.get(field)
+    return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) < 80 else text[:77] + "..."
+
+
+def build_manifest(
+    recipes: Iterable[Resolved], lists: Mapping[str, tuple[ShardRecord, ...]]
+) -> tuple[Manifest, dict[str, LayerList]] | None:
+    """The manifest of recipes and records: of each subset the largest count asked for whose shards all exist.
+
+    Args:
+      recipes: in any order; the result is the same.
+      lists: layer -> its records from the first shard on, up to the first gap.
+
+    Returns:
+      The manifest and the lists that it names by their SHA-256; None if no subset is whole.
+
+    Raises:
+      StoreError: recipes contradict one another.
+    """
+    recipes = sorted(recipes, key=lambda recipe: recipe.sha256)
+    layers = merged_layers(recipes)
+    whole = [(recipe, subset) for recipe in recipes for subset in recipe.subsets if _is_whole(subset, layers, lists)]
+    if not whole:
+        return None
+    subsets: dict[str, SubsetRecord] = {}
+    needed: dict[str, int] = {}
+    for _, subset in whole:
+        there = subsets.get(subset.name)
+        subsets[subset.name] = subset if there is None else merged_subset(there, subset)
+        for name in subset.layers:
+            needed[name] = max(needed.get(name, 0), layers[name].shards_for(subset.episodes))
+    made = {name: LayerList(shards=lists[name][:count]) for name, count in sorted(needed.items())}
+    used = list({recipe.sha256: recipe for recipe, _ in whole}.values())
+    newest = max(used, key=lambda recipe: (_version_key(recipe.version), recipe.name, recipe.sha256))
+    inputs = {file.path: file for recipe in used for file in recipe.inputs}
+    manifest = Manifest(
+        name=newest.name,
+        version=newest.version,
+        license=newest.license,
+        authors=newest.authors,
+        description=newest.description,
+        recipes=tuple(recipe.sha256 for recipe in used),
+        inputs=tuple(inputs[path] for path in sorted(inputs)),
+        layers=tuple(
+            ListedLayer(**_facts(layers[name]), shards=len(each.shards), list=sha256_bytes(canonical_json(each)))
+            for name, each in made.items()
+        ),
+        subsets=tuple(subsets[name] for name in sorted(subsets)),
+    )
+    return manifest, made
+
+
+def _facts(layer: Layer) -> dict[str, Any]:
+    return {name: getattr(layer, name) for name in Layer.model_fields}
+
+
+def _is_whole(subset: SubsetRecord, layers: Mapping[str, Layer], lists: Mapping[str, tuple[ShardRecord, ...]]) -> bool:
+    return all(len(lists.get(name, ())) >= layers[name].shards_for(subset.episodes) for name in subset.layers)
+
+
+def merged_subset(one: SubsetRecord, other: SubsetRecord) -> SubsetRecord:
+    """One subset that two recipes ask for: the larger number of episodes, the layers of both.
+
+    Raises:
+      StoreError: they differ in anything else.
+    """
+    for field in SubsetRecord.model_fields:
+        first, second = getattr(one, field), getattr(other, field)
+        if field not in ("episodes", "layers") and first != second:
+            raise StoreError(
+                f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+            )
+    layers = tuple(sorted({*one.layers, *other.layers}, key=layer_order))
+    return one.model_copy(update={"episodes": max(one.episodes, other.episodes), "layers": layers})
+
+
+def layer_order(name: str) -> tuple[int, str]:
+    """The key by which the layers of a subset are in order: trajectories, labels, then images by name."""
+    last = name.rsplit("/", 1)[-1]
+    return {"trajectories": 0, "labels": 1}.get(last, 2), name
+
+
+def _version_key(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version))
+
+
+def shard_size(episodes: int, most: int) -> int:
+    """Episodes a shard, so that shards are nearly equal and every one is full: ceil(n / ceil(n / most))."""
+    return -(-episodes // -(-episodes // most))

@@ -82,13 +82,11 @@ def view_arrays(folder: str, views: Sequence[str]) -> tuple[str, ...]:
 
 
 def stored_pictures(record: SubsetRecord, goal: bool) -> tuple[str, ...]:
-    """Names of the picture arrays that a subset stores (once they are painted); none of a subset without pictures.
+    """Names of the picture arrays that a subset has once it is painted.
 
     Args:
       goal: True if its task has a goal that can be left out of pictures.
     """
-    if not record.pixels:
-        return ()
     if record.only_shown:
         return picture_arrays(record.views, record.hidden_goal)
     return picture_arrays(record.views) + (picture_arrays(record.views, hide_goal=True) if goal else ())

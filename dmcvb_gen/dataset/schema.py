@@ -1,18 +1,18 @@
-r"""Describe the Zarr arrays that hold the episodes of a subset.
+r"""Describe the layers and arrays of a subset, and how an array's shard becomes bytes.
 
-One Zarr v3 group a subset, arrays episode-major, one shard file an array and job::
+One Zarr v3 group a set of trajectories, arrays episode-major, one file an array and shard::
 
-    <release>/manifest.json
-    <release>/<task>/<level>/<setting>.zarr/
-        pixels                    (episode, step, height, width, channel) uint8
-        pixels_top ...            the same, of tasks with several views: pixels_<view>, pixels_hidden_goal_<view>
-        state action reward ...   (episode, step, ...)
-        length return ...         (episode,)
-        exogenous/...             (episode, step, ...) labels of the distractors
+    <release>/<task>/<level>.zarr/                 the settings of a task and level share their trajectories
+        trajectories/  state action reward ...     (episode, step, ...)
+                       length return ...           (episode,)
+        dynamic/       exogenous/...               (episode, step, ...) labels of the distractors
+                       pixels                      (episode, step, height, width, channel) uint8
+                       pixels_top ...              the same, of tasks with several views
+                       at84/pixels                 the same images at another size
+    <release>/<task>/<level>/<setting>.zarr/       a setting with trajectories of its own (mazes, --independent)
 
-Everything but the labels lies at the root, so `xarray.open_zarr` shows it. In Python the picture of a view is called
-"pixels/top" (`stored_name` says where it lies; releases of version 1 have such a group). Dimensions are named so that
-none has the name of an array: action_dim, state_dim, physics_dim (in version 1: action, state, physics).
+In Python the image of a view is called "pixels/top"; `ArraySpec.stored_name` says where it lies. No dimension has the
+name of an array: action_dim, state_dim, physics_dim.
 
 An episode of `length` L transitions fills rows 0..L; row t holds observation t, the action taken there
 and the reward that it earned; row L holds the last observation and no action (zeros)::
@@ -29,42 +29,26 @@ Rows past L are never written: a missing chunk costs no storage.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import zarr
-from zarr.codecs import Crc32cCodec, TransposeCodec, ZstdCodec
+from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec, TransposeCodec, ZstdCodec
+from zarr.core.array import AsyncArray
+from zarr.core.buffer import default_buffer_prototype
+from zarr.core.metadata.v3 import ArrayV3Metadata
+from zarr.dtype import parse_dtype
+from zarr.storage import MemoryStore, StorePath
 
-from dmcvb_gen.dataset.manifest import SCHEMA_VERSION, SubsetRecord
-from dmcvb_gen.dataset.pictures import picture_arrays, stored_pictures
+from dmcvb_gen.dataset.manifest import ArraySpec, Codec, Layer
 from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_LABELS
+from dmcvb_gen.errors import StoreError
 
 PIXEL_CHUNK_STEPS = 32
-"""Steps an inner chunk of the pictures: the unit of reading (chosen with scripts/bench_store.py)."""
-
-
-@dataclass(frozen=True)
-class ArraySpec:
-    """One array of a subset.
-
-    Attributes:
-      name: path inside the group, e.g. "pixels" or "exogenous/camera_position".
-      dtype: numpy name.
-      shape: shape of one step, or of one episode's entry if `steps` is false.
-      dims: names of the axes of `shape`.
-      steps: True if the array has a step axis.
-      picture: True if it holds pictures (another chunking and codec).
-      attributes: stored with the array.
-    """
-
-    name: str
-    dtype: str
-    shape: tuple[int, ...] = ()
-    dims: tuple[str, ...] = ()
-    steps: bool = True
-    picture: bool = False
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+"""Steps of a chunk of images: the unit of reading (chosen with scripts/bench_store.py)."""
 
 
 @dataclass(frozen=True)
@@ -72,19 +56,21 @@ class EpisodeShape:
     """Shape of a task's episodes: all that the layout needs to know of the task.
 
     Attributes:
-      views: names of the pictures of a frame, in their order; ("pixels",) for one.
-      goal: True if there are pictures with the goal hidden beside them.
+      views: names of the images of a frame, in their order; ("pixels",) for one.
+      goal: True if there are images with the goal hidden beside them.
       state_fields: name -> (first, last + 1) in the state.
-      action_size, state_size, physics_size: entries of one step.
+      action_low, action_high: (action,) bounds of the environment's actions.
+      state_size, physics_size: entries of one step.
       materials: materials whose colors are labels.
       max_steps: transitions at which the time limit ends an episode.
-      attributes: what is stored with the arrays of these names, beside the fields of states.
+      attributes: what else is stored with the arrays of these names.
     """
 
     views: tuple[str, ...]
     goal: bool
     state_fields: Mapping[str, tuple[int, int]]
-    action_size: int
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
     state_size: int
     physics_size: int
     materials: int
@@ -98,7 +84,8 @@ class EpisodeShape:
             views=tuple(task.views),
             goal=bool(task.goal_geoms),
             state_fields={name: (part.start, part.stop) for name, part in task.state_slices.items()},
-            action_size=task.action_size,
+            action_low=tuple(map(float, task.action_low)),
+            action_high=tuple(map(float, task.action_high)),
             state_size=task.state_size,
             physics_size=task.physics_size,
             materials=len(task.material_colors),
@@ -112,145 +99,193 @@ class EpisodeShape:
         return self.max_steps + 1
 
 
-def stored_name(name: str, schema_version: int = SCHEMA_VERSION) -> str:
-    """Path of an array inside its Zarr group: "pixels/top" lies at "pixels_top", labels in their group."""
-    return name if schema_version < 2 or name.startswith("exogenous/") else name.replace("/", "_")
+def trajectory_arrays(shape: EpisodeShape) -> tuple[ArraySpec, ...]:
+    """The arrays of a set of trajectories."""
+    fields = {name: list(part) for name, part in shape.state_fields.items()}
+    bounds = {"low": list(shape.action_low), "high": list(shape.action_high)}
+    physics = dict(shape.attributes.get("physics", {}))
+    action = len(shape.action_low)
+    return (
+        ArraySpec(
+            name="state", dtype="float32", shape=(shape.state_size,), dims=("state_dim",), attributes={"fields": fields}
+        ),
+        ArraySpec(name="action", dtype="float32", shape=(action,), dims=("action_dim",), attributes=bounds),
+        ArraySpec(name="reward", dtype="float32"),
+        ArraySpec(name="discount", dtype="float32"),
+        ArraySpec(
+            name="physics", dtype="float64", shape=(shape.physics_size,), dims=("physics_dim",), attributes=physics
+        ),
+        ArraySpec(name="length", dtype="int32", steps=False),
+        ArraySpec(name="terminated", dtype="bool", steps=False),
+        ArraySpec(name="return", dtype="float64", steps=False),
+        ArraySpec(name="seed", dtype="uint64", steps=False),
+        ArraySpec(name="behaviour", dtype="int16", steps=False),
+        ArraySpec(name="goal_pair", dtype="int16", steps=False),
+    )
 
 
-def picture_spec(name: str, size: int) -> ArraySpec:
-    """The spec of one picture array of `size` x `size` RGB."""
-    return ArraySpec(name, "uint8", (size, size, 3), ("height", "width", "channel"), picture=True)
-
-
-def subset_specs(shape: EpisodeShape, record: SubsetRecord) -> tuple[ArraySpec, ...]:
-    """All arrays of the subset of a record, with the pictures that it stores."""
-    varying = [part for part in OPTIONAL_LABELS.values() if record.distractor.varies(part)]
-    return array_specs(shape, record.size, stored_pictures(record, shape.goal), varying)
-
-
-def array_specs(
-    shape: EpisodeShape, size: int, pictures: Sequence[str] | None = None, varying: Collection[str] = ()
-) -> tuple[ArraySpec, ...]:
-    """All arrays of a subset with episodes of `shape` and pictures of `size`.
+def label_arrays(shape: EpisodeShape, varying: Collection[str] = ()) -> tuple[ArraySpec, ...]:
+    """The arrays of a setting's labels, in the order of `DistractorState`.
 
     Args:
-      pictures: names of its picture arrays; those of all views by default, with the goal and without it.
       varying: parts of the distractor that vary and have labels of their own, see `OPTIONAL_LABELS`.
     """
-    both = picture_arrays(shape.views) + (picture_arrays(shape.views, hide_goal=True) if shape.goal else ())
-    names = both if pictures is None else pictures
-    fields, given = {name: list(part) for name, part in shape.state_fields.items()}, shape.attributes
-    specs = [picture_spec(name, size) for name in names]
-    specs += [
-        ArraySpec("state", "float32", (shape.state_size,), ("state_dim",), attributes={"fields": fields}),
-        ArraySpec("action", "float32", (shape.action_size,), ("action_dim",), attributes=given.get("action", {})),
-        ArraySpec("reward", "float32"),
-        ArraySpec("discount", "float32"),
-        ArraySpec("physics", "float64", (shape.physics_size,), ("physics_dim",), attributes=given.get("physics", {})),
-        *_label_specs(shape, varying),
-        ArraySpec("length", "int32", steps=False),
-        ArraySpec("terminated", "bool", steps=False),
-        ArraySpec("return", "float64", steps=False),
-        ArraySpec("seed", "uint64", steps=False),
-        ArraySpec("behaviour", "int16", steps=False),
-        ArraySpec("goal_pair", "int16", steps=False),
-    ]
-    return tuple(specs)
-
-
-def _label_specs(shape: EpisodeShape, varying: Collection[str]) -> list[ArraySpec]:
-    """The distractors' labels, in the order of `DistractorState`."""
     sizes = {"view": len(shape.views), "material": shape.materials, "xyz": 3, "wxyz": 4, "rgb": 3}
-    return [
-        ArraySpec(f"exogenous/{name}", dtype, tuple(sizes[d] for d in LABEL_DIMENSIONS[name]), LABEL_DIMENSIONS[name])
+    return tuple(
+        ArraySpec(
+            name=f"exogenous/{name}",
+            dtype=dtype,  # type: ignore[arg-type]  # checked by the model
+            shape=tuple(sizes[axis] for axis in LABEL_DIMENSIONS[name]),
+            dims=LABEL_DIMENSIONS[name],
+        )
         for name, dtype in LABEL_DTYPES.items()
-        if OPTIONAL_LABELS.get(name, "") in ("", *varying)
-    ]
+        if OPTIONAL_LABELS.get(name, "") in ("", *varying) and all(sizes[axis] for axis in LABEL_DIMENSIONS[name])
+    )
 
 
-# -- codecs: how one inner chunk becomes bytes ----------------------------------------------------
-
-
-def picture_codecs(layout: str) -> dict[str, Any]:
-    """Codecs of a picture chunk (1, step, height, width, channel), by name of the layout.
-
-    All are standard or numcodecs' own, so plain zarr-python reads them. See scripts/bench_store.py.
-    """
-    from zarr.codecs import BloscCodec, numcodecs
-
-    time_last = TransposeCodec(order=(0, 2, 3, 4, 1))
-    width_last = TransposeCodec(order=(0, 1, 4, 2, 3))
-    channel_first = TransposeCodec(order=(0, 4, 1, 2, 3))
-    delta = numcodecs.Delta(dtype="|u1")
-    layouts: dict[str, dict[str, Any]] = {
-        "zstd": dict(filters=(), compressors=(ZstdCodec(level=3),)),
-        "blosc-bitshuffle": dict(
-            filters=(), compressors=(BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle", typesize=1),)
-        ),
-        "time-zstd": dict(filters=(time_last,), compressors=(ZstdCodec(level=3),)),
-        "time-delta-zstd": dict(filters=(time_last, delta), compressors=(ZstdCodec(level=3),)),
-        "width-delta-zstd": dict(filters=(width_last, delta), compressors=(ZstdCodec(level=3),)),
-        "channel-delta-zstd": dict(filters=(channel_first, delta), compressors=(ZstdCodec(level=1),)),
-        "width-delta-blosc": dict(
-            filters=(width_last, delta),
-            compressors=(BloscCodec(cname="zstd", clevel=3, shuffle="noshuffle", typesize=1),),
-        ),
-        "zstd-9": dict(filters=(), compressors=(ZstdCodec(level=9),)),
-        "width-delta-zstd-9": dict(filters=(width_last, delta), compressors=(ZstdCodec(level=9),)),
-    }
-    return layouts[layout]
-
-
-def picture_layout_for(camera_moves: bool) -> str:
-    """The codec layout of a subset's images, as measured with scripts/bench_store.py.
+def image_array(
+    name: str,
+    size: int,
+    camera_moves: bool,
+    rows: int,
+    *,
+    own_size: int | None = None,
+    dtype: str = "uint8",
+    shape: Sequence[int] = (3,),
+    dims: Sequence[str] = ("channel",),
+) -> ArraySpec:
+    """The array of one view's images, or of a modality of it.
 
     Images of a moving camera are smaller as differences of neighboring pixels, one color channel at a time. If the
-    camera stands still, zstd finds the repeated rows by itself, and is faster to read.
-    """
-    return "channel-delta-zstd" if camera_moves else "zstd"
-
-
-def create_arrays(
-    group: zarr.Group,
-    specs: tuple[ArraySpec, ...],
-    episodes: int,
-    rows: int,
-    episodes_per_shard: int,
-    picture_layout: str = "zstd",
-    chunk_steps: int | None = None,
-    schema_version: int = SCHEMA_VERSION,
-) -> None:
-    """Create the (empty) arrays of a subset: metadata only, no data.
+    camera stands still, zstd finds the repeated rows by itself, and is faster to read (scripts/bench_store.py).
 
     Args:
-      episodes: episodes the subset will have.
-      rows: rows of the step axis, max_steps + 1.
-      episodes_per_shard: episodes a shard file.
-      schema_version: version of the release's schema; a shard of an older one is made again where it lay.
+      name: "pixels", "pixels/top", "depth/top", ...
+      size: pixels a side.
+      rows: rows of the step axis.
+      own_size: size of the subset's own images; those of another size are called "at84/pixels", and their axes so.
+      dtype, shape, dims: of one pixel; a modality has others than RGB.
     """
-    for spec in specs:
-        if not spec.steps:
-            shape, dims = (episodes, *spec.shape), ("episode", *spec.dims)
-            chunks, shards = (episodes_per_shard, *spec.shape), None
-        else:
-            shape, dims = (episodes, rows, *spec.shape), ("episode", "step", *spec.dims)
-            steps = (chunk_steps or PIXEL_CHUNK_STEPS) if spec.picture else rows
-            steps = min(steps, rows)
-            chunks = (1, steps, *spec.shape)
-            shards = (episodes_per_shard, -(-rows // steps) * steps, *spec.shape)
-        if spec.picture:
-            codecs = dict(picture_codecs(picture_layout))
-        else:
-            codecs = dict(filters=(), compressors=(ZstdCodec(level=3),))
-        codecs["compressors"] = (*codecs["compressors"], Crc32cCodec())
-        group.create_array(
-            name=stored_name(spec.name, schema_version),
-            shape=shape,
-            chunks=chunks,
-            shards=shards,
-            dtype=spec.dtype,
-            fill_value=0,
-            dimension_names=dims,
-            attributes={"array": spec.name, **spec.attributes},
-            **codecs,
+    other = own_size is not None and size != own_size
+    axes = (f"height_{size}", f"width_{size}") if other else ("height", "width")
+    return ArraySpec(
+        name=f"at{size}/{name}" if other else name,
+        dtype=dtype,  # type: ignore[arg-type]
+        shape=(size, size, *shape),
+        dims=(*axes, *dims),
+        chunk_steps=min(PIXEL_CHUNK_STEPS, rows),
+        codec="channel-delta-zstd" if camera_moves and dtype == "uint8" and tuple(shape) == (3,) else "zstd",
+    )
+
+
+# -- arrays as Zarr has them ----------------------------------------------------------------------
+
+
+class BoundedZstd(ZstdCodec):
+    """zstd that decodes nothing larger than its chunk, whatever a frame's header claims."""
+
+    def _decode_sync(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
+        limit = math.prod(chunk_spec.shape) * chunk_spec.dtype.item_size
+        if frame_content_size(chunk_bytes.to_bytes()[:18]) not in (limit,):
+            raise ValueError(f"a chunk does not decode to its {limit} bytes")
+        return super()._decode_sync(chunk_bytes, chunk_spec)
+
+
+def frame_content_size(head: bytes) -> int | None:
+    """Decoded size that a zstd frame states (RFC 8878, section 3.1.1.1); None if it states none or is no frame."""
+    if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    flags = head[4]
+    single, dictionary, kind = bool(flags & 0x20), (0, 1, 2, 4)[flags & 3], flags >> 6
+    start = 5 + (not single) + dictionary
+    width = (1 if single else 0, 2, 4, 8)[kind]
+    if not width or len(head) < start + width:
+        return None
+    return int.from_bytes(head[start : start + width], "little") + (256 if width == 2 else 0)
+
+
+def _filters(codec: Codec) -> tuple[Any, ...]:
+    """Array codecs before bytes: all are Zarr's own or numcodecs', so plain zarr-python reads them."""
+    if codec == "zstd":
+        return ()
+    from zarr.codecs import numcodecs
+
+    return (TransposeCodec(order=(0, 4, 1, 2, 3)), numcodecs.Delta(dtype="|u1"))
+
+
+def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metadata:
+    """Zarr's metadata of an array, from its spec alone; our readers build arrays from it, others get zarr.json.
+
+    Args:
+      episodes: length of the first axis.
+    """
+    per_shard, rows = layer.episodes_per_shard, layer.rows
+    pixel_level = 1 if spec.codec == "channel-delta-zstd" else 3
+    packed = (BoundedZstd(level=pixel_level), Crc32cCodec())
+    array_to_bytes: list[Any] = [*_filters(spec.codec), BytesCodec(), *packed]
+    if not spec.steps:
+        shape, chunks, codecs = (episodes, *spec.shape), (per_shard, *spec.shape), array_to_bytes
+        dims: tuple[str, ...] = ("episode", *spec.dims)
+    else:
+        steps = min(spec.chunk_steps or rows, rows)
+        shape, dims = (episodes, rows, *spec.shape), ("episode", "step", *spec.dims)
+        chunks = (per_shard, -(-rows // steps) * steps, *spec.shape)
+        codecs = [ShardingCodec(chunk_shape=(1, steps, *spec.shape), codecs=array_to_bytes)]
+    return ArrayV3Metadata(
+        shape=shape,
+        data_type=parse_dtype(np.dtype(spec.dtype), zarr_format=3),
+        chunk_grid={"name": "regular", "configuration": {"chunk_shape": list(chunks)}},
+        chunk_key_encoding={"name": "default", "configuration": {"separator": "/"}},
+        fill_value=0,
+        codecs=codecs,
+        attributes={"array": spec.name, **spec.attributes},
+        dimension_names=dims,
+    )
+
+
+def open_array(layer: Layer, spec: ArraySpec, episodes: int, store: Any, read_only: bool = True) -> zarr.Array:
+    """An array over a Zarr store of its chunks, built from its spec; nothing is read."""
+    metadata = array_metadata(layer, spec, episodes)
+    return zarr.Array(AsyncArray(metadata=metadata, store_path=StorePath(store)))
+
+
+def encode(layer: Layer, spec: ArraySpec, values: np.ndarray) -> bytes | None:
+    """The bytes of an array's file of one shard.
+
+    Args:
+      values: (episode of the shard, row, ...) or (episode of the shard, ...); a full shard.
+
+    Returns:
+      None if all values are fill values: there is no file then.
+
+    Raises:
+      StoreError: the values have another shape or dtype than the spec.
+    """
+    rows = (layer.rows,) if spec.steps else ()
+    shape = (layer.episodes_per_shard, *rows, *spec.shape)
+    if values.shape != shape or values.dtype != np.dtype(spec.dtype):
+        raise StoreError(
+            f"{spec.name} of {layer.name} is {values.dtype} {values.shape}, and its layer stores {spec.dtype} {shape}"
         )
+    chunks: dict[str, Any] = {}
+    array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks), read_only=False)
+    array[...] = values
+    return next(iter(chunks.values())).to_bytes() if chunks else None
+
+
+def decode(layer: Layer, spec: ArraySpec, data: bytes | None) -> np.ndarray:
+    """The values of an array's file of one shard, see `encode`.
+
+    Raises:
+      StoreError: the bytes are damaged.
+    """
+    chunks: dict[str, Any] = {}
+    if data is not None:
+        key = layer.file_path(spec, 0).removeprefix(f"{layer.group}/{spec.stored_name}/")
+        chunks[key] = default_buffer_prototype().buffer.from_bytes(data)
+    array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks))
+    try:
+        return np.asarray(array[...])
+    except Exception as error:  # codecs raise anything
+        reason = type(error).__name__
+        raise StoreError(f"{spec.name} of {layer.name} cannot be decoded ({reason}); fetch it again") from None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmcvb_gen.dataset3.manifest import Layer
+from dmcvb_gen.dataset.manifest import Layer
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.generate.plan import Plan

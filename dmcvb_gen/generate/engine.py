@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dmcvb_gen.dataset3.manifest import ArraySpec, FileRecord, Layer, ShardFile, ShardRecord, SubsetRecord
-from dmcvb_gen.dataset3.schema import decode, encode
-from dmcvb_gen.dataset3.writer import file_facts, put, put_back, put_record, wrong_bytes
+from dmcvb_gen.dataset.manifest import ArraySpec, FileRecord, Layer, ShardFile, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.schema import decode, encode
+from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, wrong_bytes
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes

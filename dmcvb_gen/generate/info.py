@@ -33,7 +33,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     Raises:
       StoreError: there is no release at `path`.
     """
-    from dmcvb_gen.dataset3.gate import Release  # loads zarr, which `list` needs not
+    from dmcvb_gen.dataset.gate import Release  # loads zarr, which `list` needs not
 
     release = Release.open(path, storage_options)
     subsets = []

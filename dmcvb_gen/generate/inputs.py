@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from dmcvb_gen.dataset3.manifest import FileRecord, SubsetRecord
+from dmcvb_gen.dataset.manifest import FileRecord, SubsetRecord
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file

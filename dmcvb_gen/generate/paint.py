@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.dataset3.environment import environment
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import Layer, ListedLayer, Resolved, SubsetRecord, layer_order
-from dmcvb_gen.dataset3.pictures import Pictures
-from dmcvb_gen.dataset3.writer import begin, finish, read_provenance, write_provenance
+from dmcvb_gen.dataset.environment import environment
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import Layer, ListedLayer, Resolved, SubsetRecord, layer_order
+from dmcvb_gen.dataset.pictures import Pictures
+from dmcvb_gen.dataset.writer import begin, finish, read_provenance, write_provenance
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.executors import default_workers, run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release, read_recipes
-from dmcvb_gen.dataset3.manifest import COPY
-from dmcvb_gen.dataset3.writer import begin, check_agree, check_versions, finish, write_provenance
+from dmcvb_gen.dataset.gate import Release, read_recipes
+from dmcvb_gen.dataset.manifest import COPY
+from dmcvb_gen.dataset.writer import begin, check_agree, check_versions, finish, write_provenance
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.engine import WorkResult
 from dmcvb_gen.generate.executors import default_workers, run_works

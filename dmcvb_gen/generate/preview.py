@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.pictures import shown
-from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.extras import installed
 from dmcvb_gen.spec import select

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import record_path
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.generate.works import works_of
 
 RECENT = 3600.0

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from dmcvb_gen.dataset3.manifest import MAX_EPISODES, MAX_SHARDS
+from dmcvb_gen.dataset.manifest import MAX_EPISODES, MAX_SHARDS
 from dmcvb_gen.errors import RecipeError, UnknownNameError
 from dmcvb_gen.files import read_yaml
 from dmcvb_gen.rendering.base import check_size

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.dataset3.gate import Release, read_records
-from dmcvb_gen.dataset3.manifest import Layer, LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
-from dmcvb_gen.dataset3.writer import (
+from dmcvb_gen.dataset.gate import Release, read_records
+from dmcvb_gen.dataset.manifest import Layer, LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
+from dmcvb_gen.dataset.writer import (
     begin,
     finish,
     put,

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset3.manifest import SubsetRecord
-from dmcvb_gen.dataset3.pictures import picture_arrays, view_arrays
+from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import Backgrounds, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import RenderingError

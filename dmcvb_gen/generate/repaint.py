@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release, Shard, read_recipes
-from dmcvb_gen.dataset3.manifest import Layer, Resolved, SubsetRecord
-from dmcvb_gen.dataset3.writer import begin, finish, put, put_record, write_provenance
+from dmcvb_gen.dataset.gate import Release, Shard, read_recipes
+from dmcvb_gen.dataset.manifest import Layer, Resolved, SubsetRecord
+from dmcvb_gen.dataset.writer import begin, finish, put, put_record, write_provenance
 from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.executors import default_workers, run_works

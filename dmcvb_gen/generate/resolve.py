@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import (
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import (
     POLICIES,
     VIDEOS,
     FileRecord,
@@ -28,8 +28,8 @@ from dmcvb_gen.dataset3.manifest import (
     SubsetRecord,
     shard_size,
 )
-from dmcvb_gen.dataset3.pictures import picture_arrays, view_arrays
-from dmcvb_gen.dataset3.schema import EpisodeShape, image_array, label_arrays, trajectory_arrays
+from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
+from dmcvb_gen.dataset.schema import EpisodeShape, image_array, label_arrays, trajectory_arrays
 from dmcvb_gen.distractor_state import OPTIONAL_LABELS
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, RecipeError

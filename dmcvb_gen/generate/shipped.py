@@ -18,8 +18,8 @@ from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes
 
 if TYPE_CHECKING:
-    from dmcvb_gen.dataset3.gate import Release
-    from dmcvb_gen.dataset3.manifest import Manifest, Resolved
+    from dmcvb_gen.dataset.gate import Release
+    from dmcvb_gen.dataset.manifest import Manifest, Resolved
 
 _FOLDER = resources.files("dmcvb_gen.generate") / "data" / "manifests"
 ENDING = ".json.xz"
@@ -43,7 +43,7 @@ class Shipped:
     @property
     def digest(self) -> str:
         """The release's digest."""
-        from dmcvb_gen.dataset3.manifest import canonical_json
+        from dmcvb_gen.dataset.manifest import canonical_json
 
         return sha256_bytes(canonical_json(self.manifest))
 
@@ -61,7 +61,7 @@ def load_shipped(source: str | Path) -> Shipped:
       UnknownNameError: a plain name that is neither a file nor a shipped manifest's.
       StoreError: there is no such file, or it is no archive of a manifest.
     """
-    from dmcvb_gen.dataset3.manifest import Manifest, Resolved
+    from dmcvb_gen.dataset.manifest import Manifest, Resolved
 
     path, name = Path(source), str(source)
     if not path.is_file() and (path.suffix or path.name != name):
@@ -95,7 +95,7 @@ def pack(release: Release, out: str | Path) -> int:
 
 def record_digests(release: Release) -> dict[str, tuple[str, ...]]:
     """Layer -> SHA-256 of the record of each shard, in order."""
-    from dmcvb_gen.dataset3.manifest import canonical_json
+    from dmcvb_gen.dataset.manifest import canonical_json
 
     return {
         name: tuple(sha256_bytes(canonical_json(record)) for _, record in sorted(release.records(name).items()))

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import FileRecord, Layer, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import FileRecord, Layer, ShardRecord, SubsetRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.store import Store
 

@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from dmcvb_gen.dataset3.pictures import Pictures
+from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, UnknownNameError

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import SubsetRecord
-from dmcvb_gen.dataset3.pictures import picture_of
-from dmcvb_gen.dataset3.reader import StoredArray, without_ellipsis
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.dataset.reader import StoredArray, without_ellipsis
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.generate.inputs import background_source, local_inputs

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import SubsetRecord
-from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.loaders.sampler import Steps, StepSource, stream
 

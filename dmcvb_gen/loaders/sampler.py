@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dmcvb_gen.dataset3.pictures import shown
-from dmcvb_gen.dataset3.reader import Subset
-from dmcvb_gen.dataset3.steps import Selection, StepTable
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from dmcvb_gen.dataset3.pictures import shown
-from dmcvb_gen.dataset3.reader import Subset
-from dmcvb_gen.dataset3.steps import Selection, StepTable
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.loaders.sampler import Steps, StepSource, Views, stream
 
 

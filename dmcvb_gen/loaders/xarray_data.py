@@ -9,7 +9,7 @@ import xarray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from dmcvb_gen.dataset3.reader import StoredArray, Subset
+from dmcvb_gen.dataset.reader import StoredArray, Subset
 
 
 class _Lazy(BackendArray):

@@ -18,9 +18,9 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import CARD_FOLDER, Manifest, Resolved
-from dmcvb_gen.dataset3.writer import read_provenance
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
+from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import background, camera, color, cue, light, shake
 from dmcvb_gen.distractors.base import KINDS, DistractorSetting
 from dmcvb_gen.distractors.registry import distractors_of

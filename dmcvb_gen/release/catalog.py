@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import MANIFEST
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import MANIFEST
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.store import open_store
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from dmcvb_gen.dataset3.pictures import picture_of
-from dmcvb_gen.dataset3.reader import Subset
-from dmcvb_gen.dataset3.schema import EpisodeShape, trajectory_arrays
+from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.dataset.schema import EpisodeShape, trajectory_arrays
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.inputs import local_inputs, video_source

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import MANIFEST, ZARR_JSON
-from dmcvb_gen.dataset3.writer import read_provenance
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import MANIFEST, ZARR_JSON
+from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.release.episode_table import COLUMNS, PICTURE, TABLE
 from dmcvb_gen.release.templates import fill

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import Layer, SubsetRecord
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import Layer, SubsetRecord
 from dmcvb_gen.storage.places import is_url
 from dmcvb_gen.text import pluralize
 

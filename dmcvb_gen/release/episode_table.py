@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import CARD_FOLDER
-from dmcvb_gen.dataset3.pictures import Pictures, shown, training_pictures
-from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import CARD_FOLDER
+from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for

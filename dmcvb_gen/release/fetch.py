@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release, Shard
-from dmcvb_gen.dataset3.manifest import COPY, MANIFEST, RECIPES, FileRecord, Manifest
-from dmcvb_gen.dataset3.writer import finish_copy, wrong_bytes
+from dmcvb_gen.dataset.gate import Release, Shard
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, FileRecord, Manifest
+from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.tree import (

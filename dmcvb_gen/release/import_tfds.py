@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.dataset3.gate import Release, recorded_shards
-from dmcvb_gen.dataset3.manifest import IMPORTED, MAX_STEPS, Layer, Resolved, SubsetRecord, shard_size
-from dmcvb_gen.dataset3.pictures import picture_arrays
-from dmcvb_gen.dataset3.schema import EpisodeShape, image_array, trajectory_arrays
-from dmcvb_gen.dataset3.writer import begin, finish, put_shard, write_provenance
+from dmcvb_gen.dataset.gate import Release, recorded_shards
+from dmcvb_gen.dataset.manifest import IMPORTED, MAX_STEPS, Layer, Resolved, SubsetRecord, shard_size
+from dmcvb_gen.dataset.pictures import picture_arrays
+from dmcvb_gen.dataset.schema import EpisodeShape, image_array, trajectory_arrays
+from dmcvb_gen.dataset.writer import begin, finish, put_shard, write_provenance
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD

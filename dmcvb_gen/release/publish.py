@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release, Shard
-from dmcvb_gen.dataset3.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json, is_attachment
-from dmcvb_gen.dataset3.writer import copy_of, plain_metadata, wrong_bytes
+from dmcvb_gen.dataset.gate import Release, Shard
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json, is_attachment
+from dmcvb_gen.dataset.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export.publishing import export_format, publish_export

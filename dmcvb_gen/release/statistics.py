@@ -10,8 +10,8 @@ from itertools import islice
 import mujoco
 import numpy as np
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.reader import Subset
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from dmcvb_gen.dataset3.gate import Release, Shard
-from dmcvb_gen.dataset3.manifest import (
+from dmcvb_gen.dataset.gate import Release, Shard
+from dmcvb_gen.dataset.manifest import (
     ATTACHMENT_FILES,
     CARD_FOLDER,
     MANIFEST,
@@ -19,7 +19,7 @@ from dmcvb_gen.dataset3.manifest import (
     canonical_json,
     list_path,
 )
-from dmcvb_gen.dataset3.writer import PROVENANCE_BYTES
+from dmcvb_gen.dataset.writer import PROVENANCE_BYTES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import NotThere, Store

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import (
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import (
     COPY,
     LAYERS,
     MANIFEST,
@@ -27,8 +27,8 @@ from dmcvb_gen.dataset3.manifest import (
     FileRecord,
     is_attachment,
 )
-from dmcvb_gen.dataset3.reader import Subset
-from dmcvb_gen.dataset3.writer import plain_metadata, wrong_bytes
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.dataset.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.pictures import shown
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes

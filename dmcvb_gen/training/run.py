@@ -33,9 +33,9 @@ import filelock
 import numpy as np
 import torch
 
-from dmcvb_gen.dataset.manifest import environment, write_json_atomically
+from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import remove_partial, sha256_file, write_bytes
+from dmcvb_gen.files import write_bytes, write_json
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import checkpoints
 from dmcvb_gen.policies.evaluation import evaluate
@@ -264,7 +264,7 @@ class Run:
         """
         if found := read_config(self.folder):
             check_same(self.folder, found, self.config)
-        write_json_atomically(self.folder / "run.json", json.loads(json.dumps(dataclasses.asdict(self.config))))
+        write_json(self.folder / "run.json", json.loads(json.dumps(dataclasses.asdict(self.config))))
 
     def resume_command(self) -> str:
         """The command line that resumes this run."""

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import write_json_atomically
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
+from dmcvb_gen.files import write_json
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.evaluation import FRESH, evaluate
@@ -356,7 +356,7 @@ def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies:
             policy = policies[pick.path]
             header = selected_header(policy.header, level, pick, selection.convergence, curve)
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
-    write_json_atomically(folder / "selection.json", selection_json(selection))
+    write_json(folder / "selection.json", selection_json(selection))
 
 
 def selected_header(

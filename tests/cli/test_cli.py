@@ -14,7 +14,7 @@ from PIL import Image
 
 from dmcvb_gen.cli import COMMANDS, RESUMING, main
 from dmcvb_gen.cli.common import INTERRUPTED
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.manifest import record_path
+from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.generate.recipe import load_recipe

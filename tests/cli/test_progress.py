@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen import progress
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, start
 from dmcvb_gen.generate.recipe import make_recipe

@@ -14,7 +14,7 @@ import pytest
 import dmcvb_gen
 from dmcvb_gen.benchmarks.report import make_budget
 from dmcvb_gen.cli import COMMANDS, main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 
 FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")

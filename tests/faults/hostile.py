@@ -36,7 +36,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from dmcvb_gen.storage.store import open_store
-from tests.dataset3 import made_up
+from tests.dataset import made_up
 
 MEMORY, SECONDS = 10**9, 10.0
 """What refusing a case may take."""
@@ -355,7 +355,7 @@ def changed_pictures(draw) -> Files:
 
 
 def _read_all(root: str) -> None:
-    from dmcvb_gen.dataset3 import Release
+    from dmcvb_gen.dataset import Release
 
     release = Release.open(root)
     assert release.recipes
@@ -422,7 +422,7 @@ def take_published(folder: Path) -> None:
 
 def take_names(folder: Path) -> None:
     """A URL, a subset's name and a pattern out of names.json, each given to whoever takes such."""
-    from dmcvb_gen.dataset3.manifest import check_relative_path
+    from dmcvb_gen.dataset.manifest import check_relative_path
     from dmcvb_gen.errors import DmcvbError
     from dmcvb_gen.release.export import export
     from dmcvb_gen.release.fetch import fetch

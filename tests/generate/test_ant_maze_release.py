@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.generate.engine import paint
 from dmcvb_gen.generate.recipe import make_recipe

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, run_plan, start
 from dmcvb_gen.generate.progress import progress_of

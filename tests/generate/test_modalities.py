@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.modalities.depth import SCALE
 from dmcvb_gen.generate.modalities.flow import STEP

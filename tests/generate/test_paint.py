@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import record_path
-from dmcvb_gen.dataset3.writer import finish_copy
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import record_path
+from dmcvb_gen.dataset.writer import finish_copy
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.paint import Wanted, paint_release
 from tests.conftest import maze_recipe, roll_out, small_recipe

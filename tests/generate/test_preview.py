@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.preview import LABEL_HEIGHT, VIDEO_SIDE, episode_strip, video_frames
 
 

@@ -4,7 +4,7 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import expand, load_recipe
 from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import save_policy

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from PIL import Image
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import record_path
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.regenerate import Regeneration
 from tests.conftest import rewrite, roll_out, small_recipe

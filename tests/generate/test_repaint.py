@@ -15,8 +15,8 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import record_path
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
 from dmcvb_gen.files import PARTIAL
 from dmcvb_gen.generate.modalities import stored_in

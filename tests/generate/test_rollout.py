@@ -18,8 +18,8 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import record_path
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.generate.counts import LEAST_SHARE, check_room, count

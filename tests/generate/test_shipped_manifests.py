@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.shipped import ENDING, load_shipped, pack, shipped_manifests
 
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.rendering import default_renderer
 from dmcvb_gen.tasks import get_task

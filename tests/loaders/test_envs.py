@@ -15,7 +15,7 @@ from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
 
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.dm import DmEnv

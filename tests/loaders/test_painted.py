@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import dmcvb_gen
-from dmcvb_gen.dataset3.pictures import picture_arrays
-from dmcvb_gen.dataset3.steps import StepTable
+from dmcvb_gen.dataset.pictures import picture_arrays
+from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError, StoreError
 from tests.conftest import TINY_MAZE, roll_out, small_recipe
 

@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import DataLoader
 
 import dmcvb_gen
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.loaders import sampler
 from dmcvb_gen.loaders.release import SubsetReader

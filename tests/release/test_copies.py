@@ -7,8 +7,8 @@ from collections import namedtuple
 
 import pytest
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import COPY, MANIFEST
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.release import fetch as fetching
@@ -16,7 +16,7 @@ from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import check_files, verify_url
 from dmcvb_gen.storage.store import Store, open_store
-from tests.dataset3.made_up import make, recipe
+from tests.dataset.made_up import make, recipe
 from tests.fake_hub import fake_hub
 
 

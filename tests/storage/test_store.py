@@ -14,7 +14,7 @@ import uuid
 
 import pytest
 
-from dmcvb_gen.dataset3.manifest import ShardFile
+from dmcvb_gen.dataset.manifest import ShardFile
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.storage import folder as folder_module
 from dmcvb_gen.storage.places import Place, shown

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import canonical_json
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
 from dmcvb_gen.loaders.release import open_for_reading

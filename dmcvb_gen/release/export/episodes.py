@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dmcvb_gen.dataset3.manifest import Manifest, Resolved
-from dmcvb_gen.dataset3.pictures import Pictures, shown
+from dmcvb_gen.dataset.manifest import Manifest, Resolved
+from dmcvb_gen.dataset.pictures import Pictures, shown
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 

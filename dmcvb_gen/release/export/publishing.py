@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dmcvb_gen import files
-from dmcvb_gen.dataset3.manifest import MANIFEST, RECIPES
+from dmcvb_gen.dataset.manifest import MANIFEST, RECIPES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.export.registry import all_formats

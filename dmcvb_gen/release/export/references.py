@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import SubsetRecord
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import bundled_policies

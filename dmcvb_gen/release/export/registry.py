@@ -17,7 +17,7 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.registry import Registry

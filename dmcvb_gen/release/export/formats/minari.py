@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dmcvb_gen import files
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.registry import register_exporter

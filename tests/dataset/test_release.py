@@ -14,10 +14,10 @@ import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import ShardRecord, build_manifest, canonical_json, record_path, shard_size
-from dmcvb_gen.dataset3.schema import frame_content_size
-from dmcvb_gen.dataset3.writer import (
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import ShardRecord, build_manifest, canonical_json, record_path, shard_size
+from dmcvb_gen.dataset.schema import frame_content_size
+from dmcvb_gen.dataset.writer import (
     begin,
     check_versions,
     finish,
@@ -29,7 +29,7 @@ from dmcvb_gen.dataset3.writer import (
 )
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.store import open_store
-from tests.dataset3 import made_up, oracle
+from tests.dataset import made_up, oracle
 
 NAME = "hop/random/dynamic"
 
@@ -244,7 +244,7 @@ def test_a_release_is_not_resumed_with_other_versions(store, monkeypatch):
     begin(store, made_up.recipe(2), {})
     write_provenance(store, "test")
     check_versions(store)
-    monkeypatch.setattr("dmcvb_gen.dataset3.writer.environment", lambda: {"mujoco": "2.0"})
+    monkeypatch.setattr("dmcvb_gen.dataset.writer.environment", lambda: {"mujoco": "2.0"})
     with pytest.raises(StoreError, match="this is mujoco 2.0"):
         check_versions(store)
 

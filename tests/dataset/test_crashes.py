@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from dmcvb_gen.dataset3 import gate, writer
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset import gate, writer
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.storage.store import Store, open_store
-from tests.dataset3 import made_up, oracle
-from tests.dataset3.killing import Killed, KillingStore
+from tests.dataset import made_up, oracle
+from tests.dataset.killing import Killed, KillingStore
 
 SOURCE = "source"
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from numcodecs.zstd import Zstd
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import canonical_json
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import open_store
-from tests.dataset3 import made_up
+from tests.dataset import made_up
 
 NAME = "hop/random/dynamic"
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import Layer, Resolved, SubsetRecord, record_path
-from dmcvb_gen.dataset3.schema import EpisodeShape, image_array, label_arrays, trajectory_arrays
-from dmcvb_gen.dataset3.writer import begin, finish, put_shard
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import Layer, Resolved, SubsetRecord, record_path
+from dmcvb_gen.dataset.schema import EpisodeShape, image_array, label_arrays, trajectory_arrays
+from dmcvb_gen.dataset.writer import begin, finish, put_shard
 from dmcvb_gen.storage.store import Store
 
 PER_SHARD, MAX_STEPS, SIZE = 2, 5, 4

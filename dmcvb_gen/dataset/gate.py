@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from dmcvb_gen.dataset3.manifest import (
+from dmcvb_gen.dataset.manifest import (
     COPY,
     COPY_BYTES,
     MANIFEST,
@@ -303,7 +303,7 @@ class Release:
 
     def _subset(self, record: SubsetRecord) -> Any:
         """A subset in the form that this class of releases gives."""
-        from dmcvb_gen.dataset3.reader import Subset
+        from dmcvb_gen.dataset.reader import Subset
 
         return Subset(self, record)
 

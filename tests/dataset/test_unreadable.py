@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, PolicyFileError, StoreError
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.training.runs import RunConfig

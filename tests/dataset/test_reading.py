@@ -11,8 +11,8 @@ import xarray
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.manifest import Copy, LayerList, Manifest, Resolved, ShardRecord, check_relative_path, parse
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import Copy, LayerList, Manifest, Resolved, ShardRecord, check_relative_path, parse
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.loaders.painted import Painting, painted_release
@@ -79,7 +79,7 @@ def test_the_settings_of_a_seed_share_states_and_rewards_and_differ_in_pixels(sm
 
 
 def test_the_store_knows_no_tasks():
-    code = "import sys, dmcvb_gen.dataset3; print([m for m in sys.modules if m in ('mujoco', 'dmcvb_gen.tasks')])"
+    code = "import sys, dmcvb_gen.dataset; print([m for m in sys.modules if m in ('mujoco', 'dmcvb_gen.tasks')])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
