@@ -17,7 +17,7 @@ import yaml
 from PIL import Image, ImageDraw, ImageFont
 
 import dmcvb_gen
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.loaders.register import MAZES, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,7 +55,7 @@ def styles(work: Path) -> None:
     command("rollout", STYLE_MAZE, *small, "--out", work / "train")
     command("repaint", work / "train", "--split", "val", "--out", work / "val")
     for split in ("train", "val"):
-        [subset] = open_release(work / split).subsets.values()
+        [subset] = Release.open(work / split).subsets.values()
         shown = subset.read("exogenous/style")[:, 0] // 100
         for style in sorted(set(shown.tolist())):
             first = int((shown == style).argmax())
@@ -98,7 +98,7 @@ def _painted(folder: Path, name: str, array: str, size: int, epoch: int | None =
 
 def _under_distractors(folder: Path) -> list[tuple[str, list, list]]:
     """(distractor, large frames, small frames) of the episode that the subsets share."""
-    names = open_release(folder).subsets
+    names = Release.open(folder).subsets
     return [
         (name.split("/")[-1], *(_painted(folder, name, "pixels", size) for size in (LARGE, SMALL))) for name in names
     ]
@@ -106,7 +106,7 @@ def _under_distractors(folder: Path) -> list[tuple[str, list, list]]:
 
 def _in_styles(folder: Path) -> list[tuple[str, list, list]]:
     """(style, large frames, small frames) of one episode in three styles of walls and floor."""
-    [name] = open_release(folder).subsets
+    [name] = Release.open(folder).subsets
     found: list[tuple[str, list, list]] = []
     for epoch in range(20):
         large, small = (_painted(folder, name, f"pixels/{HERO_VIEW}", size, epoch) for size in (LARGE, SMALL))

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples" / "extending"
@@ -46,7 +46,7 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
     load("distractor")
     run("rollout", "walker-walk", "--distractor", "grey_hard", *SHORT, "--out", tmp_path / "r")
     run("verify", tmp_path / "r")
-    subset = open_release(tmp_path / "r")["walker-walk/random/grey_hard"]
+    subset = Release.open(tmp_path / "r")["walker-walk/random/grey_hard"]
     colors = subset.read("exogenous/material_rgb")
     assert (colors == colors[:, :1, :1, :1]).all() and (np.abs(colors - 0.5) <= 0.3).all()
     assert len(np.unique(colors)) == 2  # one grey an episode
@@ -60,7 +60,7 @@ def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request,
     load("modality")
     run("repaint", request.getfixturevalue(family), "--only", "*/random/*", "--label", "near", "--out", tmp_path / "r")
     run("verify", tmp_path / "r")
-    subset = next(iter(open_release(tmp_path / "r").subsets.values()))
+    subset = next(iter(Release.open(tmp_path / "r").subsets.values()))
     name = next(array for array in subset.arrays if array.split("/")[0] == "near")
     near = subset.episode(0, [name])[name]
     assert near.dtype == np.uint8 and set(np.unique(near)) <= {0, 1}

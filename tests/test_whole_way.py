@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.tasks import get_task
 
 SIZE = 16
@@ -68,7 +68,7 @@ def test_it_travels_light_and_is_painted_on_arrival(made, tmp_path):
     folder = made[2]
     run("publish", folder, f"file://{tmp_path}/there", "--no-pixels")
     run("fetch", f"file://{tmp_path}/there", "--out", tmp_path / "here", "--paint")
-    there, here = (open_release(path).manifest for path in (folder, tmp_path / "here"))
+    there, here = (Release.open(path).manifest for path in (folder, tmp_path / "here"))
     assert {s.name: s.digest for s in here.subsets} == {s.name: s.digest for s in there.subsets}
 
 
@@ -76,7 +76,7 @@ def test_it_is_repainted_in_another_style_and_size(made, tmp_path):
     _, settings, folder = made
     run("repaint", folder, "--size", 24, "--split", "val", "--out", tmp_path / "val")
     assert json.loads(run("verify", tmp_path / "val", "--json"))["sound"]
-    new, old = open_release(tmp_path / "val"), open_release(folder)
+    new, old = Release.open(tmp_path / "val"), Release.open(folder)
     for name, subset in new.subsets.items():
         pictures, before = shown(subset, 0), shown(old[name], 0)
         assert pictures.shape[2:] == (24, 24, 3) and pictures.shape[:2] == before.shape[:2]
@@ -89,7 +89,7 @@ def test_it_is_repainted_in_another_style_and_size(made, tmp_path):
 def test_every_export_shows_the_right_pictures_in_the_right_order(made, tmp_path):
     h5py = pytest.importorskip("h5py")
     _, _, folder = made
-    release = open_release(folder)
+    release = Release.open(folder)
     for to in ("hdf5", "npz", "replay-buffer", "minari", "lerobot", "rlds"):
         run("export", folder, "--to", to, "--out", tmp_path / to)
     for name, subset in release.subsets.items():
@@ -116,10 +116,10 @@ def test_its_exported_folders_are_imported_again(made, tmp_path):
     source = tmp_path / "rlds" / task / "expert" / settings[1]
     what = ["--task", task, "--level", "expert", "--setting", settings[1]]
     run("import", source, *what, "--out", tmp_path / "back")
-    [subset] = open_release(tmp_path / "back").subsets.values()
+    [subset] = Release.open(tmp_path / "back").subsets.values()
     for episode in range(2):
         np.testing.assert_array_equal(
-            shown(subset, episode), shown(open_release(folder)[f"{task}/expert/{settings[1]}"], episode)
+            shown(subset, episode), shown(Release.open(folder)[f"{task}/expert/{settings[1]}"], episode)
         )
 
 

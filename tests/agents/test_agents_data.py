@@ -16,7 +16,7 @@ from dmcvb_gen.agents.data import PAD, Slice, TrainingData, batches, load_data, 
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.paper import BehaviorCloning
 from dmcvb_gen.agents.trainer import Budget, draw, hold_out_losses, train
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset import steps as steps_module
 from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError
@@ -125,7 +125,7 @@ def test_a_training_shifts_its_pictures_as_it_is_told(monkeypatch, shift):
 
 
 def test_scattered_episodes_are_the_rows_of_all(small_release):
-    subset = open_release(small_release)["walker-walk/random/none"]
+    subset = Release.open(small_release)["walker-walk/random/none"]
     for name in ("pixels", "state", "length"):
         every = subset.read(name)
         for chosen in ([2, 0], [0, 2], [1], [2, 1, 0], [0, 1, 2]):
@@ -145,7 +145,7 @@ def test_states_are_normalized_by_the_training_episodes_with_a_floor():
 
 
 def test_a_subset_is_held_as_it_is_stored(small_release):
-    subset = open_release(small_release)["walker-walk/random/dynamic"]
+    subset = Release.open(small_release)["walker-walk/random/dynamic"]
     data = load_data({subset.name: subset}, [Slice(subset.name)])
     assert not data.frames.mapped and data.channels == 9
     assert (data.held_out.sum(), len(data), len(data.hold_out_rows)) == (1, 1000, 500)
@@ -158,7 +158,7 @@ def test_a_subset_is_held_as_it_is_stored(small_release):
 
 
 def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_release, tmp_path):
-    release = open_release(small_release)
+    release = Release.open(small_release)
     parts = [Slice(f"walker-walk/random/{name}") for name in ("none", "dynamic")]
     held, stored = load_data(release, parts), load_data(release, parts, memory=0, scratch=tmp_path)
     assert stored.frames.mapped and not held.frames.mapped and not list(tmp_path.iterdir())
@@ -179,7 +179,7 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
 
 
 def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_release, tmp_path, monkeypatch):
-    data = load_data(open_release(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
+    data = load_data(Release.open(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
     asked: list[tuple[int, int]] = []
     advise = agents_data._advise
 
@@ -197,14 +197,14 @@ def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_
 def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch):
     monkeypatch.setattr(steps_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(DmcvbError, match="fit neither into memory nor into .* another --out, or more --memory"):
-        load_data(open_release(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
+        load_data(Release.open(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
 
 
 TWO = {"episodes": 2}
 
 
 def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):
-    release, name = open_release(small_release), "walker-walk/random/none"
+    release, name = Release.open(small_release), "walker-walk/random/none"
     half, two, again = (load_data(release, [Slice(name, **part)]) for part in ({"share": 0.34}, TWO, TWO))
     assert (len(half.lengths), len(half), len(half.hold_out_rows)) == (1, 500, 0)
     assert (len(two.lengths), len(two), len(two.hold_out_rows)) == (2, 1000, 0)  # a counted few are all learned from
@@ -213,7 +213,7 @@ def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small
 
 
 def test_states_alone_need_no_pictures(small_release):
-    data = load_data(open_release(small_release), [Slice("walker-walk/random/none")], pixels=False)
+    data = load_data(Release.open(small_release), [Slice("walker-walk/random/none")], pixels=False)
     batch = data.batch(4, np.random.default_rng(0), next_observation=True)
     assert batch.observation.shape == (4, 24) and torch.equal(batch.observation, batch.state)
 

@@ -21,7 +21,7 @@ from dmcvb_gen.benchmarks.cell import CellRun, OwnAgent
 from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.plan import BUDGETS, plan_benchmark
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.tasks import get_task
 
@@ -66,7 +66,7 @@ def test_the_split_changes_what_is_seen_and_nothing_else(where):
 
 def test_it_is_the_evaluation_of_validate(small_release):
     """The same policy as a learned one of `validate` on a subset, and as one's own by the subset's name."""
-    subset = open_release(small_release)["walker-walk/random/dynamic"]
+    subset = Release.open(small_release)["walker-walk/random/dynamic"]
 
     def own(observation):
         return np.tanh(observation["pixels"].reshape(2, -1)[:, :6] / np.float32(255) - 0.5)
@@ -173,7 +173,7 @@ def changing(small_release, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, text in {"changing.py": CHANGING, "changing_late.py": "LATE = 0.5\n", "weights.txt": "0.0"}.items():
         (tmp_path / name).write_text(text)
-    release = open_release(small_release)
+    release = Release.open(small_release)
 
     def score(name):
         own_code._digests.clear()

@@ -37,10 +37,10 @@ from dmcvb_gen.benchmarks.plan import (
 )
 from dmcvb_gen.benchmarks.report import _groups, compare
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
 from dmcvb_gen.dataset.pictures import training_pictures
-from dmcvb_gen.dataset.reader import Release, Subset
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import expand
@@ -281,7 +281,7 @@ def rewards_by_hand(evaluator, actions, steps):
 
 
 def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
-    subset = open_release(small_release)["walker-walk/random/none"]
+    subset = Release.open(small_release)["walker-walk/random/none"]
     normalization = Normalization(torch.full((24,), 0.5), torch.full((24,), 2.0))
     evaluator = Evaluator(subset, pixels=False, episodes=3, max_steps=6)
     policy = Recorder(6)
@@ -295,7 +295,7 @@ def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
 
 
 def test_pictures_are_of_unseen_videos_newest_frame_last(small_release):
-    subset = open_release(small_release)["walker-walk/random/dynamic"]
+    subset = Release.open(small_release)["walker-walk/random/dynamic"]
     evaluator = Evaluator(subset, episodes=2, max_steps=4, shots=2)
     policy = Recorder(6)
     score = evaluator.score(policy.trained())
@@ -310,7 +310,7 @@ def test_pictures_are_of_unseen_videos_newest_frame_last(small_release):
 
 
 def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_release):
-    subset = open_release(small_release)["walker-walk/random/none"]
+    subset = Release.open(small_release)["walker-walk/random/none"]
     data = load_data({subset.name: subset}, [Slice(subset.name)])
     evaluator = Evaluator(subset, episodes=3, max_steps=4)
     streams = {name: evaluator.streams(name) for name in ("camera", "color", "background", "style")}
@@ -325,7 +325,7 @@ def test_an_agent_is_shown_in_evaluation_what_it_is_shown_in_training(small_rele
 
 
 def test_evaluation_episodes_are_no_releases_episodes(small_release):
-    subset = open_release(small_release)["walker-walk/random/none"]
+    subset = Release.open(small_release)["walker-walk/random/none"]
     evaluator = Evaluator(subset, pixels=False, episodes=8)
     first = evaluator.task.batch(8).reset(evaluator.streams("initial_state"))
     stored = subset.read("state")[:, 0]
@@ -364,7 +364,7 @@ SMOKE = BUDGETS["smoke"]
 
 
 def test_cells_in_processes_give_what_cells_in_this_one_give(small_release, tmp_path):
-    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    cells = plan_benchmark("b1", Release.open(small_release), ["state-bc"])[0][:1]
     scores = []
     for workers in (1, 2):
         [(cell, result)] = list(run_cells(small_release, tmp_path / str(workers), SMOKE, cells, workers))
@@ -373,14 +373,14 @@ def test_cells_in_processes_give_what_cells_in_this_one_give(small_release, tmp_
 
 
 def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path):
-    release = open_release(small_release)
+    release = Release.open(small_release)
     cells = [c for c in plan_benchmark("b1", release, ["dino+bc", "state-bc"])[0] if c.setting == "none"]
     results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, SMOKE, cells)}
     assert "--dino-weights" in results["dino+bc"]["error"] and results["state-bc"]["score"]["mean"] >= 0
 
 
 def test_processes_train_each_encoder_before_its_cells(small_release, tmp_path):
-    cells = [c for c in plan_benchmark("b1", open_release(small_release), ["state-bc", "id+bc"])[0]]
+    cells = [c for c in plan_benchmark("b1", Release.open(small_release), ["state-bc", "id+bc"])[0]]
     cells = [c for c in cells if c.setting in ("none", "static") and c.policy_label == cells[0].policy_label]
     steps = []
     found = run_cells(small_release, tmp_path, SMOKE, cells, 2, lambda what, made: steps.append(made))
@@ -396,7 +396,7 @@ def test_processes_train_each_encoder_before_its_cells(small_release, tmp_path):
 
 
 def test_a_result_of_another_seed_is_not_taken_for_this_one(small_release, tmp_path):
-    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    cells = plan_benchmark("b1", Release.open(small_release), ["state-bc"])[0][:1]
     made = []
     for seed in (0, 0, 1):
         steps, budget = [], dataclasses.replace(SMOKE, seed=seed)
@@ -407,7 +407,7 @@ def test_a_result_of_another_seed_is_not_taken_for_this_one(small_release, tmp_p
 
 def test_what_a_score_hangs_on_besides_the_data_is_in_its_fingerprint(small_release, tmp_path):
     """A row for each change: which agents' cells are other ones then."""
-    release, weights = open_release(small_release), tmp_path / "dino.safetensors"
+    release, weights = Release.open(small_release), tmp_path / "dino.safetensors"
     cells = {c.agent.name: c for c in plan_benchmark("b1", release, ["dino+bc", "id+bc", "bc", "state-bc"])[0]}
     cells |= {"encoder": cells["id+bc"].encoder}
     own = tmp_path / "clips" / "val" / "one"
@@ -432,7 +432,7 @@ def test_what_a_score_hangs_on_besides_the_data_is_in_its_fingerprint(small_rele
 
 
 def test_an_agent_of_another_package_that_changed_is_another_one(small_release, tmp_path, monkeypatch):
-    release, file = open_release(small_release), tmp_path / "theirs.py"
+    release, file = Release.open(small_release), tmp_path / "theirs.py"
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(PARTS, "_things", dict(PARTS.all()))
     monkeypatch.setattr(PARTS, "_code", dict(PARTS._code))
@@ -469,7 +469,7 @@ def test_cells_take_no_more_memory_than_their_share(small_release, tmp_path, mon
     pool = Cluster if isinstance(workers, Ray) else SerialPool
     monkeypatch.setattr(cells_module, "open_pool", lambda *_, **__: pool())
     monkeypatch.setattr(cells_module, "try_cell", lambda *given, tick=None: held.append(given[2].memory) or {})
-    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    cells = plan_benchmark("b1", Release.open(small_release), ["state-bc"])[0][:1]
     list(run_cells(small_release, tmp_path, dataclasses.replace(SMOKE, **change), cells, workers))
     assert held == [expected]
 
@@ -491,7 +491,7 @@ def test_a_node_is_shared_by_the_cells_that_fit_on_it():
 @pytest.mark.parametrize("decoder", ["observation decoder", "state decoder"])
 def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, request, tmp_path, monkeypatch):
     folder = request.getfixturevalue(whole)
-    cell = plan_benchmark("b1", open_release(folder), ["bc"])[0][0]
+    cell = plan_benchmark("b1", Release.open(folder), ["bc"])[0][0]
     expected = CellRun(folder, tmp_path / "one", SMOKE, cell).result()
     monkeypatch.setattr("dmcvb_gen.agents.trainer.SAVE_SECONDS", 0.0)
     made, again = [], []
@@ -521,7 +521,7 @@ def test_a_cell_that_was_stopped_in_a_decoder_goes_on_there(whole, decoder, requ
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, request, tmp_path, monkeypatch):
     folder, found, told = request.getfixturevalue(whole), {}, {}
-    cell = plan_benchmark("b1", open_release(folder), ["bc"])[0][0]
+    cell = plan_benchmark("b1", Release.open(folder), ["bc"])[0][0]
     budget, original = dataclasses.replace(SMOKE, frozen_shift=False), CellRun._encoded
 
     def inspection(draws):
@@ -543,7 +543,7 @@ def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, reques
 @pytest.mark.slow
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(whole, request, tmp_path):
-    release = open_release(request.getfixturevalue(whole))
+    release = Release.open(request.getfixturevalue(whole))
     cell = plan_benchmark("b1", release, ["bc"])[0][0]
     run = CellRun(release.root, tmp_path, SMOKE, cell)
     data, network = run.data(), SMOKE.network
@@ -569,7 +569,7 @@ def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(who
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 def test_a_picture_cell_is_made_again_if_the_units_of_its_state_errors_change(whole, request):
     folder = request.getfixturevalue(whole)
-    release = open_release(folder)
+    release = Release.open(folder)
     cells = {agent: plan_benchmark("b1", release, [agent])[0][0] for agent in ("bc", "state-bc")}
     before = {agent: fingerprint(release, SMOKE, cell) for agent, cell in cells.items()}
     other = next(iter(release.subsets.values()))
@@ -582,7 +582,7 @@ def test_a_picture_cell_is_made_again_if_the_units_of_its_state_errors_change(wh
 
 
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
-    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    cells = plan_benchmark("b1", Release.open(small_release), ["state-bc"])[0][:1]
     budget = dataclasses.replace(SMOKE, seed=7)  # data that no other test has loaded
 
     def out_of_memory(*_, **__):
@@ -626,13 +626,13 @@ def test_ablations_are_set_beside_bc_on_all_of_the_expert_without_distractors():
 def test_a_cells_seconds_are_those_of_all_its_sessions(small_release, tmp_path, monkeypatch):
     points = [{"step": 10, "score": {"mean": 1.0, "seconds": 20.0}, "seconds": 100.0}]
     monkeypatch.setattr(cells_module, "train", lambda *args, **options: points)  # the rest was made before
-    cells = plan_benchmark("b1", open_release(small_release), ["state-bc"])[0][:1]
+    cells = plan_benchmark("b1", Release.open(small_release), ["state-bc"])[0][:1]
     [(_, result)] = list(run_cells(small_release, tmp_path, SMOKE, cells))
     assert result["seconds"] == {"training": 80, "evaluation": 20, "inspection": 0, "all": 100}
 
 
 def test_data_that_grew_or_look_otherwise_are_read_again(small_release, tmp_path):
-    release = open_release(small_release)
+    release = Release.open(small_release)
     cell = plan_benchmark("b1", release, ["state-bc"])[0][0]
     subset = release[cell.policy[0].subset]
     half = Subset(subset.root, subset.record, {0: subset.commits[0]}, {})
@@ -651,7 +651,7 @@ def test_data_that_grew_or_look_otherwise_are_read_again(small_release, tmp_path
 
 def test_agents_of_states_have_batches_of_their_own_and_the_papers_rate(small_release, monkeypatch):
     """What `train` is told of each kind of agent, seen at its batches and its optimizer."""
-    release = open_release(small_release)
+    release = Release.open(small_release)
     pixels = load_data(release, [Slice("walker-walk/random/none")])
     for name, data, size, rate, optimizer in (
         ("brief", pixels, 64, 2e-3, "Adam"),
@@ -681,7 +681,7 @@ def test_pictures_are_shifted_from_so_many_passes_over_the_data_on():
 
 
 def test_a_release_so_small_that_quick_shifts_its_pictures_is_told(small_release):
-    release = open_release(small_release)
+    release = Release.open(small_release)
     cells = plan_benchmark("b1", release, ["bc", "state-bc", "id+bc"])[0]
     [bc] = {cell for cell in cells if cell.agent.name == "bc" and cell.setting == "none"}
     quick = BUDGETS["quick"]

@@ -41,7 +41,7 @@ from dmcvb_gen.benchmarks.report import (
 )
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import parse_manifest
 from dmcvb_gen.dataset.writer import commit_path, finish_release
 from dmcvb_gen.errors import DmcvbError
@@ -80,20 +80,20 @@ def run(*arguments):
 
 def found(folder):
     return {
-        (finding.check, finding.episode, finding.step) for finding in check_structure(open_release(folder)).findings
+        (finding.check, finding.episode, finding.step) for finding in check_structure(Release.open(folder)).findings
     }
 
 
 @pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
 def test_subsets_are_checked_side_by_side_and_only_those_asked_for(whole, tmp_path, request):
     folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")
-    damaged, other, *rest = open_release(folder).subsets
+    damaged, other, *rest = Release.open(folder).subsets
 
     def color(group):
         group["exogenous/style"][:] = group["exogenous/style"][:] + 99
 
     rewrite(folder, damaged, color)
-    release, looked_at = only(open_release(folder), [damaged, other]), []
+    release, looked_at = only(Release.open(folder), [damaged, other]), []
     alone, beside = check_structure(release, tick=looked_at.append), check_structure(release, workers=2)
     told = Counter(looked_at)  # once for its bytes, which are checked everywhere
     assert rest and all(told[name] == 1 for name in rest) and alone.checked["subsets"] == 2
@@ -199,9 +199,9 @@ def test_a_page_holds_so_many_pictures_and_says_where_the_others_are(report, mon
 
 
 def test_every_subset_and_group_of_cells_has_a_figure(release, small_release):
-    many = open_release(small_release)
+    many = Release.open(small_release)
     assert len(list(return_figures(many))) == len(many.subsets)
-    cell = plan_benchmark("b1", open_release(release), ["bc"])[0][0]
+    cell = plan_benchmark("b1", Release.open(release), ["bc"])[0][0]
     point = {"step": 1, "loss": 1.0, "score": {"mean": 1.0, "stderr": 0.1}}
     cells = [dataclasses.replace(cell, setting=f"setting{number}") for number in range(3)]
     data = {"mean": 1.0, "limit": 500}
@@ -378,7 +378,7 @@ def test_imported_data_are_checked_trained_on_and_evaluated_by_our_renderer(smal
 def test_names_are_text_on_the_page(report, release):
     facts = json.loads((report[1] / "report.json").read_text())
     facts["release"]["name"], facts["results"] = "<script>alert(1)</script>", []
-    page = render_page(facts, open_release(release), [], None)
+    page = render_page(facts, Release.open(release), [], None)
     assert "<script>" not in page and "&lt;script&gt;alert(1)" in page
 
 
@@ -386,12 +386,12 @@ def test_names_are_text_on_the_page(report, release):
 
 
 def test_the_release_of_these_tests_is_sound(release):
-    structure = check_structure(open_release(release))
+    structure = check_structure(Release.open(release))
     assert structure.sound and structure.checked == {"subsets": 1, "episodes": 2, "steps": 1000}
 
 
 def test_a_flipped_byte_fails_by_its_digest(copy):
-    file = next(file for file in open_release(copy)[NAME].commits[1].files if "/pixels/" in file.path)
+    file = next(file for file in Release.open(copy)[NAME].commits[1].files if "/pixels/" in file.path)
     data = bytearray((copy / file.path).read_bytes())
     data[len(data) // 2] ^= 1
     (copy / file.path).write_bytes(data)
@@ -401,8 +401,8 @@ def test_a_flipped_byte_fails_by_its_digest(copy):
 @pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
 def test_returns_that_cannot_be_read_cost_no_report(whole, request, tmp_path):
     folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")
-    names = list(open_release(folder).subsets)
-    [file] = [file for file in open_release(folder)[names[0]].commits[0].files if "/return/" in file.path]
+    names = list(Release.open(folder).subsets)
+    [file] = [file for file in Release.open(folder)[names[0]].commits[0].files if "/return/" in file.path]
     data = bytearray((folder / file.path).read_bytes())
     data[len(data) // 2] ^= 1
     (folder / file.path).write_bytes(data)
@@ -412,31 +412,31 @@ def test_returns_that_cannot_be_read_cost_no_report(whole, request, tmp_path):
     assert f"FAIL returns: {names[1]}, episode 0" in result.output, result.output
     facts = json.loads((tmp_path / "out/report.json").read_text())
     assert list(facts["returns"]) == names[1:]
-    left = open_release(folder)[names[1]].returns[1:]
+    left = Release.open(folder)[names[1]].returns[1:]
     assert facts["returns"][names[1]]["mean"] == pytest.approx(left.mean())
     assert "Not sound" in (tmp_path / "out/report.html").read_text()
 
 
 def test_a_truncated_shard_fails_by_its_size(copy):
-    file = next(file for file in open_release(copy)[NAME].commits[0].files if "/state/" in file.path)
+    file = next(file for file in Release.open(copy)[NAME].commits[0].files if "/state/" in file.path)
     (copy / file.path).write_bytes((copy / file.path).read_bytes()[:100])
     assert ("files", None, None) in found(copy)
 
 
 def test_a_swapped_reward_fails_by_simulating_again(copy):
-    rewards = open_release(copy)[NAME].read("reward", [0])[0]
+    rewards = Release.open(copy)[NAME].read("reward", [0])[0]
     rewrite(copy, NAME, set_rows("reward", 0, slice(0, 500), np.roll(rewards[:500], 50)))
     assert {("rewards", 0)} == {(check, episode) for check, episode, _ in found(copy)}
 
 
 def test_pixels_of_another_episode_fail_by_painting_again(copy):
-    other = open_release(copy)[NAME].read("pixels", [0])[0]
+    other = Release.open(copy)[NAME].read("pixels", [0])[0]
     rewrite(copy, NAME, set_rows("pixels", 1, slice(None), other))
     assert {("pixels", 1)} == {(check, episode) for check, episode, _ in found(copy)}
 
 
 def test_returns_that_are_not_the_sum_of_the_rewards_fail(copy):
-    total = open_release(copy)[NAME].returns[1]
+    total = Release.open(copy)[NAME].returns[1]
     rewrite(copy, NAME, lambda group: group["return"].__setitem__(1, total - 3))
     assert found(copy) == {("returns", 1, None)}
 
@@ -445,7 +445,7 @@ def test_black_pictures_fail_with_their_step_and_frozen_ones_are_a_warning(copy)
     rewrite(copy, NAME, set_rows("pixels", 1, 77, 0))
     assert ("pictures", 1, 77) in found(copy)
     rewrite(copy, NAME, lambda group: group["pixels"].__setitem__(1, np.repeat(group["pixels"][1][:1], 501, axis=0)))
-    findings, warnings = check_pictures(open_release(copy)[NAME])
+    findings, warnings = check_pictures(Release.open(copy)[NAME])
     assert not findings and [(one.check, one.episode) for one in warnings] == [("pictures", 1)]
 
 
@@ -455,12 +455,12 @@ def test_black_pictures_fail_with_their_step_and_frozen_ones_are_a_warning(copy)
 )
 def test_labels_that_do_not_fit_the_setting_fail(copy, array, step, value):
     rewrite(copy, NAME, set_rows(f"exogenous/{array}", 1, step, value))
-    [first] = list(check_labels(open_release(copy)[NAME]))[:1]
+    [first] = list(check_labels(Release.open(copy)[NAME]))[:1]
     assert (first.check, first.episode, first.step) == ("labels", 1, step if isinstance(step, int) else step.start)
 
 
 def test_labels_of_every_setting_fit(small_release):
-    for subset in open_release(small_release).subsets.values():
+    for subset in Release.open(small_release).subsets.values():
         assert not list(check_labels(subset))
 
 
@@ -482,12 +482,12 @@ def test_data_that_show_what_evaluation_shows_are_warned_of(tmp_path, small_rele
     }
     for name, recipe in seen.items():
         roll_out(recipe, tmp_path / "made" / name)
-        release = open_release(tmp_path / "made" / name)
+        release = Release.open(tmp_path / "made" / name)
         cells, _ = plan_benchmark("b1", release, ["bc", "state-bc"])
         assert seen_in(release, cells) == {subset for subset in release.subsets if not subset.endswith("/none")}
         assert not seen_in(release, [cell for cell in cells if cell.agent.sees_state])
     for folder in (small_release, maze_release):
-        release = open_release(folder)
+        release = Release.open(folder)
         assert not seen_in(release, plan_benchmark("b1", release, ["bc"])[0])
 
 
@@ -500,7 +500,7 @@ def with_policy(subset, **evaluation):
 
 
 def test_returns_unlike_the_policys_own_fail(release):
-    subset = open_release(release)[NAME]
+    subset = Release.open(release)[NAME]
     assert not list(check_policy_returns(subset))
     [finding] = check_policy_returns(with_policy(subset, mean=5000.0, std=5.0, mode="mean"))
     assert finding.check == "returns" and "its file says 5000.0" in finding.message
@@ -513,8 +513,8 @@ def test_returns_unlike_the_policys_own_fail(release):
 
 
 def test_returns_unlike_the_papers_are_a_warning(release, small_release):
-    assert not list(check_paper_returns(open_release(small_release)["walker-walk/random/none"]))
-    subset = open_release(release)[NAME]
+    assert not list(check_paper_returns(Release.open(small_release)["walker-walk/random/none"]))
+    subset = Release.open(release)[NAME]
     subset.__dict__["returns"] = np.array([400.0, 402.0])
     [finding] = check_paper_returns(subset)
     assert finding.check == "paper" and "the paper's is 957.8" in finding.message

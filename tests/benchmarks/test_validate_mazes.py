@@ -14,7 +14,7 @@ from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.checks import check_labels, check_policy_returns, check_structure
 from dmcvb_gen.benchmarks.plan import goal_cells
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import PolicyRecord
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.tasks import get_task
@@ -37,7 +37,7 @@ def release(tmp_path_factory):
 
 
 def test_a_maze_release_is_sound(release):
-    structure = check_structure(open_release(release))
+    structure = check_structure(Release.open(release))
     assert structure.sound, structure.findings
     assert structure.checked["subsets"] == 3
 
@@ -45,9 +45,9 @@ def test_a_maze_release_is_sound(release):
 def test_a_look_that_is_no_look_of_the_maze_is_found(release, tmp_path):
     name, folder = f"{NAME}/visible", tmp_path / "copy"
     shutil.copytree(release, folder)
-    assert not list(check_labels(open_release(folder)[name]))
+    assert not list(check_labels(Release.open(folder)[name]))
     rewrite(folder, name, lambda group: group["exogenous/style"].__setitem__(0, 99))
-    assert {(finding.check, finding.step) for finding in check_labels(open_release(folder)[name])} == {("labels", 0)}
+    assert {(finding.check, finding.step) for finding in check_labels(Release.open(folder)[name])} == {("labels", 0)}
 
 
 def test_episodes_of_fixed_goals_are_not_held_to_returns_over_random_ones(release):
@@ -55,14 +55,14 @@ def test_episodes_of_fixed_goals_are_not_held_to_returns_over_random_ones(releas
     policy = PolicyRecord(name="other", digest="x", header={"task": TINY, "evaluation": said})
     found = {}
     for setting in ("visible", "fixed"):
-        subset = open_release(release)[f"{NAME}/{setting}"]
+        subset = Release.open(release)[f"{NAME}/{setting}"]
         subset.record = subset.record.model_copy(update={"policies": (policy,), "deterministic": False})
         found[setting] = len(list(check_policy_returns(subset)))
     assert found == {"visible": 1, "fixed": 0}
 
 
 def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(release):
-    subset, layout = open_release(release)[f"{NAME}/fixed"], get_task(TINY).layout
+    subset, layout = Release.open(release)[f"{NAME}/fixed"], get_task(TINY).layout
     assert [goal_cells(subset, pair) for pair in range(2)] == fixed_pairs(layout, 2, seed=0)
 
 
@@ -92,7 +92,7 @@ def test_a_maze_release_goes_through_b1_and_b3(report):
 
 
 def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(release):
-    subset, task = open_release(release)[f"{NAME}/visible"], get_task(TINY)
+    subset, task = Release.open(release)[f"{NAME}/visible"], get_task(TINY)
     data = load_data({subset.name: subset}, [Slice(subset.name)], pixels=False, seed=0)
     first, ends = np.cumsum(data.lengths + 1) - data.lengths - 1, np.cumsum(data.lengths + 1) - 1
     data.discount[ends - 1] = 0  # as if the ant had got there
@@ -107,7 +107,7 @@ def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(release
 def test_maze_scores_have_reward_success_and_speed_beside_the_datas_own(report, release):
     facts = json.loads((report[0] / "report.json").read_text())
     [score] = [r for r in facts["results"] if r["cell"]["agent"] == "state-bc"]
-    subset = open_release(release)[f"{NAME}/visible"]
+    subset = Release.open(release)[f"{NAME}/visible"]
     reached = subset.read("terminated")
     assert score["data"]["success"] == reached.mean() and score["data"]["limit"] == subset.record.max_steps
     assert (score["data"]["speed"] is None) == (not reached.any())

@@ -12,8 +12,8 @@ from scipy.stats import ks_2samp, kstest
 
 from dmcvb_gen import spec
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, registry, sample_distractors
+from dmcvb_gen.dataset import Release
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
@@ -275,7 +275,7 @@ def test_a_class_of_a_file_in_this_folder_is_a_distractor(tmp_path, monkeypatch)
     made = ("rollout", "walker-walk", "--episodes", 1, "--max-steps", 2, "--size", 16, "--distractor")
     result = run(*made, "dusk_file:Dusk_hard", "--out", tmp_path / "r")
     assert result.exit_code == 0, result.output
-    [subset] = open_release(tmp_path / "r").subsets.values()
+    [subset] = Release.open(tmp_path / "r").subsets.values()
     assert subset.setting == "dusk_hard"
     task = get_task("walker-walk")
     found = labels(task, "dusk_hard", physics_of(task, 1, 2)).material_rgb

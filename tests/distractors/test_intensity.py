@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.distractors import floor_alpha_for
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
@@ -133,7 +133,7 @@ def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
     dial = ["--intensity", 0.5, "--vary", "camera,background", "--video-count", 3]
     run("rollout", task_id, *short, "--distractor", "dynamic", *dial)
     names = [f"{task_id}/random/static_0.35", f"{task_id}/random/dynamic_camera0.5-background3"]
-    assert list(open_release(folder).subsets) == names
+    assert list(Release.open(folder).subsets) == names
     assert json.loads(run("verify", folder, "--json"))["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
     few = ["--profile", "smoke", "--agents", "state-bc,bc", "--workers", 1, "--out", tmp_path / "report"]
@@ -143,7 +143,7 @@ def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
     card = (folder / "README.md").read_text()
     assert "the model's own" in card and "up to 3 videos" in card and "s = 0.35" in card
     run("repaint", folder, "--only", names[0], "--distractor", "dynamic_color0.9", "--out", tmp_path / "repainted")
-    [again] = open_release(tmp_path / "repainted").subsets.values()
+    [again] = Release.open(tmp_path / "repainted").subsets.values()
     assert again.setting == "dynamic_color0.9" and (again.episode(0)["exogenous/background_video"] == -1).all()
     env = DistractedEnv(task_id, "dynamic_background2", size=16)
     env.reset(seed=0)
@@ -200,7 +200,7 @@ def test_the_cue_in_the_data_correlates_with_the_action_as_asked(task_id, rho, t
     folder = tmp_path / "r"
     words = ["--level", "random", "--episodes", 20, "--max-steps", 100, "--no-pixels", "--out", folder]
     run("rollout", task_id, *words, "--distractor", f"dynamic_cue{rho}")
-    [subset] = open_release(folder).subsets.values()
+    [subset] = Release.open(folder).subsets.values()
     cue, action = cue_and_action(subset)
     assert len(cue) == 2000 and set(np.unique(cue)) == {-1.0, 1.0}
     assert abs(np.corrcoef(cue, action)[0, 1] - rho) < 4 / np.sqrt(2000)
@@ -213,7 +213,7 @@ def test_a_cue_stands_beside_all_other_distractors_in_every_command(tmp_path):
     folder = tmp_path / "r"
     words = ["--level", "random", "--episodes", 2, "--max-steps", 6, "--size", 16, "--no-pixels", "--out", folder]
     run("rollout", "walker-walk", "--distractor", "dynamic", "--correlated", 0.8, *words)
-    [subset] = open_release(folder).subsets.values()
+    [subset] = Release.open(folder).subsets.values()
     assert subset.setting == "dynamic_camera0.2-color0.2-background8-cue0.8"
     run("paint", folder)
     assert json.loads(run("verify", folder, "--json"))["sound"]
@@ -223,14 +223,14 @@ def test_a_cue_stands_beside_all_other_distractors_in_every_command(tmp_path):
     run("card", folder)
     assert "(correlation 0.8)" in (folder / "README.md").read_text()
     run("repaint", folder, "--distractor", "dynamic_cue1", "--out", tmp_path / "again")
-    [again] = open_release(tmp_path / "again").subsets.values()
+    [again] = Release.open(tmp_path / "again").subsets.values()
     run("repaint", folder, "--distractor", "dynamic_shake0.5", "--out", tmp_path / "shaken")
     assert json.loads(run("verify", tmp_path / "shaken", "--json"))["sound"]
     assert "same digest" in run("regenerate", tmp_path / "shaken", "--check")
     run("repaint", folder, "--distractor", "dynamic_color0.2-light0.5", "--out", tmp_path / "lit")
     assert json.loads(run("verify", tmp_path / "lit", "--json"))["sound"]
     assert "same digest" in run("regenerate", tmp_path / "lit", "--check")
-    [lit] = open_release(tmp_path / "lit").subsets.values()
+    [lit] = Release.open(tmp_path / "lit").subsets.values()
     assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
     run("card", tmp_path / "lit")
     assert "lamps walk within" in (tmp_path / "lit" / "README.md").read_text()

@@ -9,9 +9,9 @@ from unittest import mock
 
 import pytest
 from click.testing import CliRunner
+from dmcvb_gen.dataset.index import CLAIM
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset.index import CLAIM
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.export.publishing import export_format, publish_export

@@ -21,7 +21,7 @@ from torch import nn
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import _show_returns
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate import engine
 from dmcvb_gen.generate.returns import evaluate_behaviour
@@ -92,7 +92,7 @@ def goes_the_whole_way(task, behaviour, folder):
     done("rollout", task.id, *TINY, "--behaviour", behaviour, "--out", folder)
     assert json.loads(done("verify", folder, "--json"))["sound"]
     assert "same digest" in done("regenerate", folder, "--check")
-    return open_release(folder)
+    return Release.open(folder)
 
 
 # -- functions ------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def test_a_functions_noise_comes_from_each_episodes_own_stream(task, code, tmp_p
     done("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--out", tmp_path / "a")
     alone = [*TINY, "--episodes-per-shard", "1", "--behaviour", f"{code}:noisy", "--out", tmp_path / "b"]
     done("rollout", task.id, *alone)
-    [first], [second] = (list(open_release(tmp_path / name).subsets.values()) for name in "ab")
+    [first], [second] = (list(Release.open(tmp_path / name).subsets.values()) for name in "ab")
     np.testing.assert_array_equal(first.read("action"), second.read("action"))
 
 
@@ -365,7 +365,7 @@ def test_a_file_that_was_written_anew_is_read_anew(task, tmp_path):
         torch.manual_seed(seed)
         torch.save(CleanRlSac(task.behaviour_size, task.action_size).state_dict(), path)
         done("rollout", task.id, *TINY, "--behaviour", path, "--out", tmp_path / str(seed))
-        releases.append(next(iter(open_release(tmp_path / str(seed)).subsets.values())))
+        releases.append(next(iter(Release.open(tmp_path / str(seed)).subsets.values())))
         [policy] = releases[-1].record.policies
         assert policy.header["training"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     assert np.abs(releases[0].read("action") - releases[1].read("action")).max() > 0.01

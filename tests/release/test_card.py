@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 from click.testing import CliRunner
+from dmcvb_gen.dataset.index import card_files
 from PIL import Image
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.dataset.index import card_files
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.writer import sha256_file
 from dmcvb_gen.errors import StoreError

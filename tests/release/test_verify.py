@@ -9,10 +9,10 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from dmcvb_gen.dataset.index import is_card
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import open_release
-from dmcvb_gen.dataset.index import is_card
 from dmcvb_gen.dataset.writer import commit_path, finish_release
 from dmcvb_gen.errors import RenderingError, StoreError
 from dmcvb_gen.release.card import write_card

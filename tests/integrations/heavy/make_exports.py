@@ -15,7 +15,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT))
 
-from dmcvb_gen.dataset import open_release  # noqa: E402
+from dmcvb_gen.dataset import Release  # noqa: E402
 from dmcvb_gen.dataset.pictures import shown  # noqa: E402
 from dmcvb_gen.generate.modalities import all_modalities  # noqa: E402
 from dmcvb_gen.generate.repaint import Repainting, repaint  # noqa: E402
@@ -28,7 +28,7 @@ FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer"
 def export_modalities(work: Path) -> None:
     """The walker with depth, segmentation and flow for LeRobot, and the images of the first episode beside."""
     repaint(Repainting(work / "walker", work / "causes", labels=list(all_modalities())))
-    [subset] = open_release(work / "causes").subsets.values()
+    [subset] = Release.open(work / "causes").subsets.values()
     values = subset.episode(0, list(all_modalities()))
     np.savez(work / "causes.npz", **{name: one.color(values[name]) for name, one in all_modalities().items()})
     export(str(work / "causes"), "lerobot", work / "causes_export", merge=True)
@@ -46,7 +46,7 @@ def main() -> None:
     for name, pattern in (("walker", walker), ("maze", maze)):
         folder = work / name
         roll_out(small_recipe(name=name, size=64, subsets=[pattern]), folder)
-        for subset in open_release(folder).subsets.values():
+        for subset in Release.open(folder).subsets.values():
             pictures = shown(subset)
             flat = subset.name.replace("/", "_")
             arrays = {"views": np.array(pictures.views)}
