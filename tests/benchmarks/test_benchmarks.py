@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import importlib
 import json
@@ -38,14 +39,14 @@ from dmcvb_gen.benchmarks.plan import (
 from dmcvb_gen.benchmarks.report import _groups, compare
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.manifest import CommitRecord, Manifest, SubsetRecord
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer, Resolved, ShardRecord, SubsetRecord
 from dmcvb_gen.dataset.pictures import training_pictures
-from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import expand
 from dmcvb_gen.parallel import Needs, Ray, SerialPool
 from dmcvb_gen.parallel.ray_pool import share_of_node
+from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.tasks import get_task
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples" / "extending"
@@ -53,25 +54,33 @@ EXAMPLES = Path(__file__).parents[2] / "docs" / "examples" / "extending"
 
 def release_of(*names, episodes=100, committed=None, shape=(), **facts):
     """A release of subsets without data, enough to plan with; its shards of ten are committed, or the first few."""
-    subsets = {}
+    records, layers = [], []
     for name in names:
         task, level, setting = name.split("/")
         own = facts if setting == "fixed" else {}
         if task.startswith("ant-maze"):
             views = get_task(task).views
             own = own | dict(family="ant-maze", views=views, hidden_goal=setting != "visible")
-        own = own | dict(task=task, level=level, setting=setting, episodes=episodes, episodes_per_shard=10)
+        own = own | dict(task=task, level=level, setting=setting, episodes=episodes, layers=(f"{name}/trajectories",))
         own = dict(size=64, max_steps=get_task(task).max_steps) | dict(shape) | own
-        record = SubsetRecord(name=name, **own)
+        records.append(SubsetRecord(name=name, **own))
+        layers.append(
+            Layer(
+                name=f"{name}/trajectories",
+                group=f"{name}.zarr/trajectories",
+                kind="trajectories",
+                rows=records[-1].max_steps + 1,
+                episodes_per_shard=10,
+                arrays=(ArraySpec(name="length", dtype="int32", steps=False),),
+                makes={"seed": 0},
+            )
+        )
+    resolved = Resolved(name="x", version="1", license="x", layers=tuple(layers), subsets=tuple(records))
+    release = Release(open_store("nowhere"), resolved, None, False, None)
+    for layer in layers:
         shards = range((committed or episodes) // 10)
-        commits = {
-            shard: CommitRecord(subset=name, shard=shard, episodes=(10 * shard, 10 * shard + 10), steps=0, files=())
-            for shard in shards
-        }
-        subsets[name] = Subset("nowhere", record, commits, {})
-    records = tuple(subset.record for subset in subsets.values())
-    manifest = Manifest(name="x", version="1", license="x", recipe={"seed": 0}, subsets=records)
-    return Release("nowhere", manifest, subsets)
+        release._records[layer.name] = {n: ShardRecord(key=layer.job_key(n), files={}) for n in shards}
+    return release
 
 
 WALKER = [f"walker-walk/{level}/{s}" for level in ("expert", "medium", "mixed", "random") for s in ("none", "dynamic")]
@@ -574,9 +583,8 @@ def test_a_picture_cell_is_made_again_if_the_units_of_its_state_errors_change(wh
     before = {agent: fingerprint(release, SMOKE, cell) for agent, cell in cells.items()}
     other = next(iter(release.subsets.values()))
     record = other.record.model_copy(update={"name": f"{other.task}/other/{other.setting}"})
-    one = dict(list(other.commits.items())[:1])
-    manifest = release.manifest.model_copy(update={"subsets": (*release.manifest.subsets, record)})
-    grown = Release(release.root, manifest, release.subsets | {record.name: Subset(folder, record, one, {})})
+    grown = copy.copy(release)
+    grown.manifest = release.manifest.model_copy(update={"subsets": (*release.manifest.subsets, record)})
     assert fingerprint(grown, SMOKE, cells["bc"]) != before["bc"]
     assert fingerprint(grown, SMOKE, cells["state-bc"]) == before["state-bc"]
 
@@ -635,8 +643,8 @@ def test_data_that_grew_or_look_otherwise_are_read_again(small_release, tmp_path
     release = Release.open(small_release)
     cell = plan_benchmark("b1", release, ["state-bc"])[0][0]
     subset = release[cell.policy[0].subset]
-    half = Subset(subset.root, subset.record, {0: subset.commits[0]}, {})
-    less = Release(release.root, release.manifest, {subset.name: half})
+    less = copy.copy(release)
+    less._here = {layer.name: frozenset({0}) for layer in subset.layers}
 
     def data_of(release, budget=SMOKE):
         run = CellRun(small_release, tmp_path, budget, cell)

@@ -42,8 +42,7 @@ from dmcvb_gen.benchmarks.report import (
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.manifest import parse_manifest
-from dmcvb_gen.dataset.writer import commit_path, finish_release
+from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import DmcvbError
 from tests.conftest import maze_recipe, rewrite, roll_out, small_recipe
 
@@ -344,9 +343,9 @@ def test_a_folder_that_cannot_be_written_is_refused_before_any_work(release, tmp
 def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
     part = tmp_path / "part"
     shutil.copytree(small_release, part)
-    (part / commit_path("walker-walk/random/none", 1)).unlink()
-    shutil.rmtree(part / "commits" / "walker-walk" / "random" / "dynamic")
-    finish_release(part, parse_manifest((part / "manifest.json").read_bytes()))  # as a rollout of a part ends
+    (part / record_path("walker-walk/random/none/labels", 1)).unlink()
+    shutil.rmtree(part / "records" / "walker-walk" / "random" / "dynamic")
+    (part / "manifest.json").unlink()  # as a rollout is left in the middle
     result = run("validate", part, "--checks-only", "--out", tmp_path / "out")
     assert result.exit_code == 1, result.output
     assert "incomplete: 5 of 9 episodes; what is there is sound" in result.output
@@ -390,11 +389,22 @@ def test_the_release_of_these_tests_is_sound(release):
     assert structure.sound and structure.checked == {"subsets": 1, "episodes": 2, "steps": 1000}
 
 
-def test_a_flipped_byte_fails_by_its_digest(copy):
-    file = next(file for file in Release.open(copy)[NAME].commits[1].files if "/pixels/" in file.path)
-    data = bytearray((copy / file.path).read_bytes())
+def file_of(folder, name, array, shard):
+    """Path of an array's file of a shard."""
+    subset = Release.open(folder)[name]
+    layer = next(layer for layer in subset.layers if any(spec.name == array for spec in layer.arrays))
+    return folder / layer.file_path(layer.array(array), shard)
+
+
+def flip(path):
+    """Change one bit in the middle of a file."""
+    data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
-    (copy / file.path).write_bytes(data)
+    path.write_bytes(data)
+
+
+def test_a_flipped_byte_fails_by_its_digest(copy):
+    flip(file_of(copy, NAME, "pixels", 1))
     assert found(copy) == {("files", None, None)}
 
 
@@ -402,10 +412,7 @@ def test_a_flipped_byte_fails_by_its_digest(copy):
 def test_returns_that_cannot_be_read_cost_no_report(whole, request, tmp_path):
     folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")
     names = list(Release.open(folder).subsets)
-    [file] = [file for file in Release.open(folder)[names[0]].commits[0].files if "/return/" in file.path]
-    data = bytearray((folder / file.path).read_bytes())
-    data[len(data) // 2] ^= 1
-    (folder / file.path).write_bytes(data)
+    flip(file_of(folder, names[0], "return", 0))
     rewrite(folder, names[1], lambda group: group["return"].__setitem__(0, np.nan))
     result = run("validate", folder, "--checks-only", "--out", tmp_path / "out")
     assert result.exit_code == 1 and f"FAIL files: {names[0]}" in result.output, result.output
@@ -418,8 +425,8 @@ def test_returns_that_cannot_be_read_cost_no_report(whole, request, tmp_path):
 
 
 def test_a_truncated_shard_fails_by_its_size(copy):
-    file = next(file for file in Release.open(copy)[NAME].commits[0].files if "/state/" in file.path)
-    (copy / file.path).write_bytes((copy / file.path).read_bytes()[:100])
+    file = file_of(copy, NAME, "state", 0)
+    file.write_bytes(file.read_bytes()[:100])
     assert ("files", None, None) in found(copy)
 
 
