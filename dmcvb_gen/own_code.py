@@ -64,6 +64,11 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
         os.environ[variable] = ",".join(dict.fromkeys([*allowed(variable), *own]))
 
 
+def permissions() -> dict[str, str]:
+    """The environment variables that let code run here, for workers that do not inherit them."""
+    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS) if name in os.environ}
+
+
 def allowed(variable: str) -> list[str]:
     """The names in an environment variable; people write a space after a comma, or a comma at the end."""
     return [name for part in os.environ.get(variable, "").split(",") if (name := part.strip())]

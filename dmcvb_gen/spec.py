@@ -223,28 +223,6 @@ class DistractorSetting:
         return cls(kind, difficulty or "medium")
 
 
-def difficulty_of(
-    intensity: float | None, parts: Sequence[str] = (), videos: int | None = None, cue: float | None = None
-) -> str:
-    """The difficulty of an intensity, of the parts that vary (all by default), of a number of videos and of a cue's
-    correlation.
-
-    Raises:
-      UnknownNameError: there is no such part. DmcvbError: a number is out of range.
-    """
-    for part in parts:
-        if part not in (*DISTRACTOR_PARTS, *FURTHER_PARTS):
-            raise UnknownNameError("part of a distractor", part, (*DISTRACTOR_PARTS, *FURTHER_PARTS))
-    scale = DIFFICULTY_SCALES["medium"] if intensity is None else intensity
-    if not parts and videos is None and cue is None:
-        return _canonical(_number(scale))
-    count = _videos_at(scale) if videos is None else videos
-    numbers = {"camera": _number(scale), "color": _number(scale), "background": ALL if count is None else str(count)}
-    numbers |= dict.fromkeys(FURTHER_PARTS, _number(scale))
-    words = [f"{part}{numbers[part]}" for part in parts or DISTRACTOR_PARTS]
-    return _canonical("-".join(words + ([f"{CUE}{_number(cue)}"] if cue is not None else [])))
-
-
 def _number(value: float) -> str:
     return f"{value:.3f}".rstrip("0").rstrip(".")
 

@@ -37,7 +37,10 @@ def local_inputs(store: Store, files: Iterable[FileRecord]) -> Path:
 @functools.cache
 def _brought(store: Store) -> Path:
     """A folder of this process for a store's files, which goes with it."""
-    folder = Path(tempfile.mkdtemp(prefix="dmcvb-gen-"))
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="dmcvb-gen-"))
+    except OSError as error:
+        raise StoreError(f"no temporary folder can be made ({error}); set TMPDIR to one with room") from None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 

@@ -334,7 +334,7 @@ def load_recipe(source: str | Path) -> Recipe:
       UnknownNameError: a plain name that is no shipped recipe's.
       RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
     """
-    path = Path(source)
+    path = Path(source).expanduser()
     if not path.is_file() and not path.suffix and path.name == str(source) and str(source) not in shipped_recipes():
         raise UnknownNameError("recipe", source, shipped_recipes())
     shipped = not path.is_file() and str(source) in shipped_recipes()

@@ -77,6 +77,7 @@ def task_id_of(given: str | Path) -> str:
       DmcvbError: the file cannot be read, or is no maze.
     """
     path, at, reward = str(given).partition("@")
+    path = str(Path(path).expanduser()) if path.startswith("~") else path
     if not (path.endswith(".txt") or Path(path).is_file()):
         return str(given)
     if at and reward not in REWARDS:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import atexit
 import concurrent.futures
+import contextlib
 import itertools
 import multiprocessing
 import os
 import pickle
 import queue
 import signal
+import sys
 import threading
 import traceback
+import types
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
+from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError
@@ -78,7 +82,8 @@ class ProcessPool(Pool):
             key, function, arguments = self._waiting.popleft()
             number = next(self._numbers)
             try:
-                future = self._pool.submit(_work, number, function, arguments)
+                with _without_guardless_main():
+                    future = self._pool.submit(_work, number, function, arguments)
             except OSError:
                 if self._pool._broken:  # a worker died, and its queue was closed while the next worker started
                     raise BrokenProcessPool from None
@@ -109,6 +114,28 @@ class ProcessPool(Pool):
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._listen()
         self._messages.close()
+
+
+@contextlib.contextmanager
+def _without_guardless_main() -> Iterator[None]:
+    """Keep new processes from running the user's script again if it has no `if __name__ == "__main__"`.
+
+    A process that is started imports the script, which would start processes in its turn. What it works on lies in
+    modules, so it can do without.
+    """
+    main = sys.modules["__main__"]
+    try:
+        guarded = "__name__" in Path(getattr(main, "__file__", None) or "").read_text()
+    except (OSError, ValueError):  # no script: a notebook, `python -c`
+        guarded = True
+    if guarded:
+        yield
+        return
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 # -- in a worker ----------------------------------------------------------------------------------

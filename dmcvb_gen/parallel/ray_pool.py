@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.own_code import permissions
 from dmcvb_gen.parallel.base import (
     IN_FLIGHT,
     POLL_SECONDS,
@@ -74,7 +75,7 @@ class RayPool(Pool):
         while self._waiting or self._running:
             while self._waiting and len(self._running) < self._bound():
                 key, function, arguments = self._waiting.popleft()
-                self._running[work.remote(function, arguments, self._threads)] = key
+                self._running[work.remote(function, arguments, self._threads, tuple(permissions().items()))] = key
             done, _ = ray.wait(list(self._running), num_returns=1, timeout=10 * POLL_SECONDS)
             if not done:
                 self._tell_if_no_node_fits()
@@ -162,8 +163,13 @@ def _nobody(address: str, reason: str) -> DmcvbError:
     )
 
 
-def _work(function, arguments, threads: int) -> tuple[list[tuple], Any]:
-    """Run a function and return its progress (numbers are added up) and its result."""
+def _work(function, arguments, threads: int, allowed: Sequence[tuple[str, str]]) -> tuple[list[tuple], Any]:
+    """Run a function and return its progress (numbers are added up) and its result.
+
+    Args:
+      allowed: code of the user's own that may run, see `own_code.permissions`; nodes do not inherit it.
+    """
+    os.environ.update(dict(allowed))
     limit_threads(threads)
     told: list[tuple] = []
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numba
 import numpy as np
 
 from dmcvb_gen import arithmetic
+from dmcvb_gen.kept import kept_njit
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
 from dmcvb_gen.policies.open_maze import PLACE_SCALE, open_maze_observation, places
 from dmcvb_gen.tasks.base import Task
@@ -20,7 +20,7 @@ NORM_EPSILON = 1e-5
 """Added to the variance in a layer norm, as torch does."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kept_njit(nogil=True, error_model="numpy")
 def _affine(x, weight, bias, out):
     """out = bias + x @ weight, each entry added up from the first input to the last.
 

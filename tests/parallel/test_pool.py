@@ -242,3 +242,19 @@ def test_a_cluster_without_a_node_for_the_work_says_once_what_it_waits_for(needs
     pool.submit("a", square, 3)
     assert list(pool.results()) == [("a", 9)]
     assert [record.getMessage() for record in caplog.records] == told
+
+
+GUARDLESS = """
+from dmcvb_gen.parallel import run_all
+import helper
+
+print("began")
+print(sorted(result for _, result in run_all(helper.double, [1, 2, 3], 2)))
+"""
+
+
+def test_a_script_without_a_main_guard_is_run_once(tmp_path):
+    (tmp_path / "helper.py").write_text("def double(number, tick):\n    return 2 * number\n")
+    (tmp_path / "script.py").write_text(GUARDLESS)
+    done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.stdout.split("\n")[:2] == ["began", "[2, 4, 6]"] and done.returncode == 0, done.stderr

@@ -6,10 +6,21 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.layout import distinct, get, leaf, part, put, put3, stage
+from dmcvb_gen.kept import kept_njit
+from dmcvb_gen.rendering.native.lanes import (
+    BASE_BLUE,
+    BASE_GREEN,
+    BASE_RED,
+    CHUNK,
+    ROWS,
+    distinct,
+    get,
+    leaf,
+    part,
+    put,
+    stage,
+)
 from dmcvb_gen.rendering.native.lighting import aim_shadows, light_vertices
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE, SPHERE
 from dmcvb_gen.rendering.native.shading import aim, cover, set_color, shade_body, shade_plane, shade_sky
@@ -736,8 +747,13 @@ def label_frames(scene, frames, scratch, depth, geom):
 def painter(version: int):
     """`paint_frames` compiled and kept on disk under a version: numba itself looks at one file's date alone."""
 
-    @njit(nogil=True, error_model="numpy", cache=True)
-    def paint_them(scene, frames, scratch, stays, shown, hidden):
+    @kept_njit(nogil=True, error_model="numpy")
+    def paint_them(
+        looks, constants, lamps, boxes, texels, width, rays,
+        center, turn, eye, axes, lamp, rgb, look, sky,
+        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
+        stays, shown, hidden,
+    ):  # fmt: skip
         if version != 0:
             paint_frames(scene, frames, scratch, stays, shown, hidden)
 
@@ -747,8 +763,13 @@ def painter(version: int):
 def labeler(version: int):
     """`label_frames` compiled and kept on disk under a version."""
 
-    @njit(nogil=True, error_model="numpy", cache=True)
-    def label_them(scene, frames, scratch, depth, geom):
+    @kept_njit(nogil=True, error_model="numpy")
+    def label_them(
+        looks, constants, lamps, boxes, texels, width, rays,
+        center, turn, eye, axes, lamp, rgb, look, sky,
+        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
+        depth, geom,
+    ):  # fmt: skip
         if version != 0:
             label_frames(scene, frames, scratch, depth, geom)
 

@@ -1,0 +1,42 @@
+"""Compile functions with numba and keep their code on disk, where that works: a cache that fails stops nothing."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+
+_log = logging.getLogger(__name__)
+
+
+def kept_njit(**options: Any) -> Callable[[Callable], Any]:
+    """numba's `njit(cache=True, ...)`, which goes on without the cache if it cannot be read or written."""
+
+    def decorate(function: Callable) -> Any:
+        compiled = njit(**options)(function)
+        try:
+            compiled.enable_caching()
+        except RuntimeError:  # numba finds no folder that it may write to
+            _log.info("%s is compiled in every process: numba has no folder to keep it in", function.__name__)
+            return compiled
+        cache = compiled._cache
+        cache.load_overload = _forgiving(cache.load_overload)
+        cache.save_overload = _forgiving(cache.save_overload)
+        return compiled
+
+    return decorate
+
+
+def _forgiving(work: Callable) -> Callable:
+    """The same function, that gives None if the disk fails it."""
+
+    def attempt(*arguments: Any) -> Any:
+        try:
+            return work(*arguments)
+        except OSError as error:
+            _log.info("compiled code is not kept: %s", error)
+            return None
+
+    return attempt

@@ -1,0 +1,33 @@
+"""Compiled code that cannot be kept on disk is compiled again; it stops nothing."""
+
+import errno
+
+import numba
+import pytest
+from numba.core import caching
+
+from dmcvb_gen.kept import kept_njit
+
+
+def double(number):
+    return number * 2
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+FAULTS = {
+    "no folder": (caching.CompileResultCacheImpl, "_locator_classes", []),
+    "a full disk": (caching.IndexDataCacheFile, "save", full),
+    "a folder that cannot be read": (caching.IndexDataCacheFile, "load", full),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_cache_that_fails_stops_nothing(monkeypatch, fault):
+    monkeypatch.setattr(*FAULTS[fault])
+    assert kept_njit(nogil=True)(double)(21) == 42
+    if fault != "a folder that cannot be read":
+        with pytest.raises((RuntimeError, OSError)):  # what numba itself does
+            numba.njit(cache=True)(double)(2)
