@@ -13,10 +13,12 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.storage.places import is_url, shown
 
 CLIENTS = frozenset(
-    "adlfs aiobotocore aiohttp asyncio azure botocore fsspec gcsfs google httpcore httpx huggingface_hub numcodecs "
-    "requests s3fs ssl urllib3 zarr".split()
+    "adlfs aiobotocore aiohttp asyncio azure botocore fsspec gcsfs google httpcore httpx huggingface_hub requests s3fs "
+    "ssl urllib3".split()
 )
-"""Packages whose exceptions come from storage."""
+"""Packages whose exceptions come from a network or a disk."""
+DECODERS = frozenset(("numcodecs", "zarr"))
+"""Packages whose exceptions come from damaged bytes."""
 REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "Unauthorized")
 """Words of errors that are about who is asking."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -50,10 +52,10 @@ def storage_errors(place: str | Path, doing: str = "read", decoding: bool = Fals
     except (DmcvbError, MemoryError):
         raise
     except Exception as error:
-        client = type(error).__module__.split(".")[0] in CLIENTS
-        if not (decoding or client or isinstance(error, OSError | ImportError)):
+        package = type(error).__module__.split(".")[0]
+        if not (decoding or package in CLIENTS | DECODERS or isinstance(error, OSError | ImportError)):
             raise
-        raise StoreError(_explained(error, str(place), doing, client)) from None
+        raise StoreError(_explained(error, str(place), doing, package in CLIENTS)) from None
 
 
 def reason(error: BaseException) -> str:
@@ -72,8 +74,8 @@ def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
         package = (error.name or why).split(".")[0]
         return f"{package} is needed for {where} and not installed: pip install {package}"
     if not isinstance(error, OSError):
-        if client or url:
-            return _at_url(error, where, doing) if url else f"cannot {doing} {where} ({why}); fetch or regenerate it"
+        if client:
+            return _not_reached(error, where, doing)
         return f"{where} is damaged ({why.split('. ')[0]}); repair it with `dmcvb-gen regenerate`, or fetch it again"
     if not url and isinstance(error.filename, str) and os.path.isabs(error.filename):
         where = error.filename  # the file that failed, e.g. of a scratch folder
@@ -84,12 +86,12 @@ def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
         cure = "check the path, or fetch or regenerate it" if doing == "read" else there
         return f"cannot {doing} {where}: it is not there ({why}); {cure}"
     if url:
-        return _at_url(error, where, doing)
+        return _not_reached(error, where, doing)
     cure = "change its rights" if doing == "read" else "choose a place that you may write to"
     return f"cannot {doing} {where}: {error.strerror or why}; {cure}"
 
 
-def _at_url(error: Exception, where: str, doing: str) -> str:
+def _not_reached(error: Exception, where: str, doing: str) -> str:
     why = reason(error)
     if isinstance(error, PermissionError) or any(word in f"{type(error).__name__} {error}" for word in REFUSALS):
         return (
