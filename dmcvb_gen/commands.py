@@ -7,12 +7,13 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.public import paint
 from dmcvb_gen.options import (
-    Between,
     Count,
     GoalPictures,
     Local,
@@ -206,7 +207,7 @@ def validate(
     release: Location,
     *,
     profile: str = "smoke",
-    scale: Annotated[float, Between(0, open=True)] = 1.0,
+    scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     benchmarks: Names = ("b1",),
     agents: Names = (),
     only: Names = (),
@@ -215,11 +216,11 @@ def validate(
     train_unsound: bool = False,
     workers: Workers | None = None,
     threads: Count | None = None,
-    device: Annotated[str, ("cpu", "cuda")] = "cpu",
+    device: Literal["cpu", "cuda"] = "cpu",
     precision: Precision = "auto",
     compile: bool = False,
-    memory: Annotated[float, Between(0)] | None = None,
-    seed: Annotated[int, Between(0, 2**31 - 1)] = 0,
+    memory: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None,
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
     dino_weights: Location | None = None,
     backgrounds: Location | None = None,
     progress: bool = True,

@@ -1,144 +1,84 @@
 """Types of the arguments that people give: to a Python function, and by the same names to its command.
 
-`Annotated` adds what a type alone does not say: bounds, choices, or a place that cannot be a URL.
+pydantic checks them. `Annotated` adds what a type alone does not say: bounds, or a place that cannot be a URL.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-import numbers
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.spec import DIFFICULTIES, GOAL_PICTURES, REWARDS, SPLITS
+import pydantic
+
+from dmcvb_gen.errors import DmcvbError
 
 if TYPE_CHECKING:
     from dmcvb_gen.progress import ProgressBar
 
-
-@dataclass(frozen=True)
-class Between:
-    """Mark of a number's type: its bounds; with `open`, the lowest one is left out."""
-
-    lowest: float
-    highest: float | None = None
-    open: bool = False
-
-    def allow(self, value: float) -> bool:
-        """Whether a number is within the bounds."""
-        above = value > self.lowest if self.open else value >= self.lowest
-        return above and (self.highest is None or value <= self.highest)
-
-    def __str__(self) -> str:
-        """The bounds in words."""
-        lowest = f"above {self.lowest:g}" if self.open else f"of at least {self.lowest:g}"
-        return lowest + (f" and at most {self.highest:g}" if self.highest is not None else "")
-
-
 LOCAL = "local"
 """Mark of a folder or file to write to, which cannot be a URL."""
 
-Names = str | Sequence[str]
-"""One name or several."""
+
+def _several(value: Any) -> Any:
+    if isinstance(value, str | Path):
+        return (value,)
+    return tuple(value) if hasattr(value, "__iter__") else value
+
+
+def _range(value: tuple[int, int]) -> tuple[int, int]:
+    if not 0 <= value[0] < value[1]:
+        raise ValueError("give (A, B) with 0 <= A < B")
+    return value
+
+
 Location = str | Path
 """A folder, a file or a URL."""
 Local = Annotated[Location, LOCAL]
-Count = Annotated[int, Between(1)]
-Seed = Annotated[int, Between(0)]
-Share = Annotated[float, Between(0, 1, open=True)]
-Samples = Annotated[int, Between(1, 8)]
-RANGE, PART = "range", "part"
-"""Marks of two whole numbers: (A, B) with 0 <= A < B, and (K, N) with 1 <= K <= N."""
-Span = Annotated[tuple[int, int], RANGE]
+Names = Annotated[tuple[Location, ...], pydantic.BeforeValidator(_several)]
+"""One name or several."""
+Count = Annotated[int, pydantic.Field(ge=1)]
+Seed = Annotated[int, pydantic.Field(ge=0)]
+Samples = Annotated[int, pydantic.Field(ge=1, le=8)]
+Span = Annotated[tuple[int, int], pydantic.AfterValidator(_range)]
 """(first, last + 1)."""
-Part = Annotated[tuple[int, int], PART]
-"""(part, parts)."""
-Difficulty = Annotated[str, DIFFICULTIES]
-GoalPictures = Annotated[str, GOAL_PICTURES]
-Precision = Annotated[str, ("auto", "float32", "bfloat16")]
-Reward = Annotated[str, REWARDS]
-Split = Annotated[str, SPLITS]
+GoalPictures = Literal["visible", "hidden"]
+Precision = Literal["auto", "float32", "bfloat16"]
+Split = Literal["train", "val"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: a function refuses arguments that its types do not allow, as its command does.
-
-    Numbers become Python's own, and iterators tuples, so that they can be read more than once.
+    """Decorator: a function takes what pydantic makes of its arguments by their types.
 
     Raises:
-      DmcvbError: at a call, a number or range that is none or out of bounds, or None for what has to be given.
-      UnknownNameError: a word that is no choice.
+      DmcvbError: at a call, in one line, a value that its type does not allow.
     """
     signature = inspect.signature(function)
+
+    @functools.cache
+    def adapter(name: str) -> pydantic.TypeAdapter[Any]:
+        return pydantic.TypeAdapter(signature.parameters[name].annotation)
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
-            parameter = signature.parameters[name]
-            if value is None and parameter.default is parameter.empty:
-                raise DmcvbError(f"{name} is None; give {_wanted(parameter.annotation)}")
-            given.arguments[name] = _checked(name, value, parameter.annotation)
+            try:
+                given.arguments[name] = adapter(name).validate_python(value)
+            except pydantic.ValidationError as error:
+                reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+                raise DmcvbError(f"{name} is {value!r}: {reason[0].lower()}{reason[1:]}") from None
         return function(*given.args, **given.kwargs)
 
     return call
-
-
-def _checked(name: str, value: Any, annotation: Any) -> Any:
-    kinds, marks = parts_of(annotation)
-    if value is None:
-        return value
-    if any(typing.get_origin(kind) is Sequence for kind in kinds):
-        return value if isinstance(value, str | Path) or not hasattr(value, "__iter__") else tuple(value)
-    if RANGE in marks or PART in marks:
-        return _pair(name, value, is_range=RANGE in marks)
-    choices = next((mark for mark in marks if isinstance(mark, tuple)), None)
-    if choices and value not in choices:
-        raise UnknownNameError(name, value, choices)
-    numeric = {int, float} & set(kinds)
-    if not numeric or any(isinstance(kind, type) and isinstance(value, kind) for kind in set(kinds) - numeric):
-        return value
-    bounds = next((mark for mark in marks if isinstance(mark, Between)), None)
-    return _number(name, value, float not in numeric, bounds)
-
-
-def _wanted(annotation: Any) -> str:
-    """What a parameter takes, for people."""
-    kinds, marks = parts_of(annotation)
-    if Path in kinds:
-        return "a folder" if LOCAL in marks else "a folder or a URL"
-    return "text"
-
-
-def _pair(name: str, value: Any, is_range: bool) -> tuple[int, int]:
-    given = value if isinstance(value, tuple | list) else ()
-    if len(given) == 2 and all(isinstance(n, numbers.Integral) and not isinstance(n, bool) for n in given):
-        first, last = map(int, given)
-        if 0 <= first < last if is_range else 1 <= first <= last:
-            return first, last
-    form = "(A, B), whole numbers with 0 <= A < B" if is_range else "(K, N), whole numbers with 1 <= K <= N"
-    raise DmcvbError(f"{name} is {value!r}; give {form}")
-
-
-def _number(name: str, value: Any, whole: bool, bounds: Between | None) -> int | float:
-    wanted = "a whole number" if whole else "a number"
-    fits = isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
-    if not fits:
-        raise DmcvbError(f"{name} is {value!r}; give {wanted}")
-    number = int(value) if whole else float(value)
-    if bounds and not bounds.allow(number):
-        raise DmcvbError(f"{name} is {number}; give {wanted} {bounds}")
-    return number
 
 
 def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:

@@ -18,13 +18,14 @@ import inspect
 import re
 import typing
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import click
+from pydantic.fields import FieldInfo
 
 from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
 from dmcvb_gen.cli.unused_options import is_given
-from dmcvb_gen.options import LOCAL, Between, parts_of
+from dmcvb_gen.options import LOCAL, parts_of
 from dmcvb_gen.parallel import Ray, Workers
 
 METAVARS = {"RANGE": "A:B", "BEHAVIOUR": "FILE|RUN|MODULE:FUNCTION"}
@@ -76,7 +77,7 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
             continue
         (metavar, text), (kinds, marks) = helps[name], parts_of(parameter.annotation)
         required = parameter.default is parameter.empty
-        several = any(typing.get_origin(kind) is Sequence for kind in kinds)
+        several = any(Ellipsis in typing.get_args(kind) for kind in kinds)
         kind = _click_type(kinds, marks)
         if name in (arguments or [next(iter(signature))]):
             form = metavar if required else f"[{metavar}]" + "..." * several
@@ -113,15 +114,21 @@ def help_of(function: Callable) -> dict[str, tuple[str | None, str]]:
 
 
 def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
-    number = click.FloatRange if float in kinds else click.IntRange
-    for mark in marks:
-        if isinstance(mark, Between):
-            return number(mark.lowest, mark.highest, min_open=mark.open)
-        if isinstance(mark, tuple):
-            return click.Choice(mark)
-        if mark == LOCAL:
-            return OutPath()
-    return click.IntRange(1) if Ray in kinds else int if int in kinds else float if float in kinds else str
+    """The click type of an argument: choices, a number with its bounds, a place to write to, or text."""
+    if LOCAL in marks:
+        return OutPath()
+    if Literal in map(typing.get_origin, kinds):
+        return click.Choice(typing.get_args(kinds[0]))
+    if not {int, float} & {*kinds}:
+        return str
+    sides = {"ge": ("min", False), "gt": ("min", True), "le": ("max", False), "lt": ("max", True)}
+    bounds: dict[str, Any] = {}
+    for limit in (limit for mark in marks if isinstance(mark, FieldInfo) for limit in mark.metadata):
+        for name, (side, is_open) in sides.items():
+            if hasattr(limit, name):
+                bounds |= {side: getattr(limit, name), f"{side}_open": is_open}
+    plain, ranged = (float, click.FloatRange) if float in kinds else (int, click.IntRange)
+    return ranged(**bounds) if bounds else plain
 
 
 def _repeatable(text: str) -> str:
@@ -130,7 +137,7 @@ def _repeatable(text: str) -> str:
     return f"{words} Repeatable.{mark}{default}"
 
 
-def _cluster(*, executor: Annotated[str, ("processes", "ray")] = "processes", ray_address: str | None = None):
+def _cluster(*, executor: Literal["processes", "ray"] = "processes", ray_address: str | None = None):
     """Return the options that come with `workers`.
 
     Args:

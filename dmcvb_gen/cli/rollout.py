@@ -117,10 +117,9 @@ def finish(release, options, as_json):
     from dmcvb_gen.storage.store import open_store
 
     store = open_store(release, options)
-    asked = {record.name: record.episodes for record in Release.in_making(store).manifest.subsets}
+    Release.in_making(store)  # or says that nothing was begun there
     done = write(store)
-    there = {} if done.in_the_making else {record.name: record.episodes for record in done.manifest.subsets}
-    missing = [name for name, episodes in asked.items() if there.get(name, 0) < episodes]
+    missing = _missing(done)
     state = "complete"
     if missing:
         state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
@@ -174,7 +173,7 @@ def _run(plan, workers, as_json, whole=True):
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     release, steps, place = made.release, made.steps, plan.store.place
-    complete = whole and not release.in_the_making and not release.shortfalls
+    complete = whole and not _missing(release)
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
     facts |= dict(seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()})
     named = shlex.quote(str(place))
@@ -186,6 +185,15 @@ def _run(plan, workers, as_json, whole=True):
     images = not is_url(str(place)) and any(layer.kind == "images" for layer in release.layers.values())
     look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if images else "")
     answer(as_json, facts, done, *([look] if whole else []))
+
+
+def _missing(release):
+    """Subsets that recipes ask for, and that a release does not have, or not whole."""
+    from dmcvb_gen.dataset.gate import Release
+
+    asked = {record.name: record.episodes for record in Release.in_making(release.store).manifest.subsets}
+    there = {} if release.in_the_making else {record.name: record.episodes for record in release.manifest.subsets}
+    return [name for name, episodes in asked.items() if there.get(name, 0) < episodes]
 
 
 def _show_plan(plan, as_json):

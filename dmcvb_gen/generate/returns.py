@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+from pydantic import Field
+
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Between, Local, Location, Names, Seed, checked
+from dmcvb_gen.options import Local, Location, Names, Seed, checked
 from dmcvb_gen.spec import Level, is_maze, task_folder
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.text import as_names
@@ -17,7 +19,7 @@ def evaluate_behaviour(
     *,
     levels: Names = (),
     behaviour: Location | None = None,
-    episodes: Annotated[int, Between(2)] = 100,
+    episodes: Annotated[int, Field(ge=2)] = 100,
     seed: Seed = 1,
     sample: bool = False,
     pictures: Local | None = None,

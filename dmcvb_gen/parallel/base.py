@@ -8,9 +8,9 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
-from dmcvb_gen.options import Between
+from dmcvb_gen.options import Count
 
 ProgressCallback = Callable[..., None]
 """Told by the functions at work how far they are; called in the process that asked for the work. One that can `expect`
@@ -132,7 +132,7 @@ class Ray:
     address: str | None = None
 
 
-Workers = Annotated[int, Between(1)] | Ray
+Workers = Count | Ray
 """Executor of the work: so many processes (1: this one), or a Ray cluster."""
 
 

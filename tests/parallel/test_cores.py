@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from dmcvb_gen.benchmarks import run
+from dmcvb_gen.benchmarks import cell
 from dmcvb_gen.parallel import cores
 
 
@@ -19,7 +19,7 @@ def test_the_fewer_of_affinity_and_container_count(tmp_path, monkeypatch, limit,
     if limit:
         (tmp_path / "cpu.max").write_text(limit + "\n")
     assert cores.usable_cores() == wanted
-    assert run.default_workers("cpu") * run.default_threads(run.default_workers("cpu")) <= wanted
+    assert cell.default_workers("cpu") * cell.default_threads(cell.default_workers("cpu")) <= wanted
 
 
 def test_a_system_without_affinities_gives_all_cores(tmp_path, monkeypatch):
