@@ -1,4 +1,4 @@
-"""Strike commands on small releases with random faults, and look at what lies there after each, for as long as you want.
+"""Strike commands on small releases with random faults, and look at what lies there after each.
 
     python scripts/campaign.py --minutes 30                # a line for each thing that was wrong, then a table
     python scripts/campaign.py --minutes 30 --seed 7       # other faults

@@ -231,14 +231,18 @@ def check_structure(
     """
     started = time.perf_counter()
     wanted = {record.name for record in release.manifest.subsets}
-    others = {record.name for record in Release.open(release.path).manifest.subsets} - wanted
+    all_records = Release.open(release.path).manifest.subsets
+    others = {record.name for record in all_records} - wanted
+    ours = {name for record in release.manifest.subsets for name in record.layers}
+    not_ours = {name for record in all_records for name in record.layers} - ours | others
     again = len(release.subsets)  # for labels; and of the others only the bytes are looked at
     tick = _Longer(tick, again - (len(wanted | others) - again))
     with open_pool(workers, tick=tick) as pool:
         verified = verify(release.path, backgrounds, tick, pool, names=release.subsets)
-        findings, warnings = [f for f in verified.findings if f.subset not in others], [*verified.unchecked]
+        findings, warnings = [f for f in verified.findings if f.subset not in not_ours], [*verified.unchecked]
         unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
-        readable = [subset for name, subset in release.subsets.items() if name not in unreadable]
+        subsets = release.subsets.values()
+        readable = [subset for subset in subsets if not unreadable & {subset.name, *subset.record.layers}]
         for found, odd in in_order(_check_subset, readable, pool):
             findings += found
             warnings += odd

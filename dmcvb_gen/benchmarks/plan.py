@@ -318,7 +318,7 @@ class SubsetFinder:
             return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count}{shape} {out}"
         goals = [setting for setting in settings if setting != FIXED]
         asked = [f"--goal {setting}" for setting in goals] + [f"--episodes {count}"] * bool(goals)
-        asked += [f"--fixed-goals {FIXED_GOALS}"] * (FIXED in settings)
+        asked += [f"--goal {FIXED}{FIXED_GOALS}"] * (FIXED in settings)
         return f"{rollout} {' '.join(asked)}{shape} {out}"
 
     def _sources(self, task: str, levels: Iterable[str]) -> str:

@@ -41,6 +41,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import ArraySpec, Layer, Resolved, ShardRecord, SubsetRecord
 from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import expand
@@ -189,7 +190,7 @@ def test_the_one_command_that_b3_names_makes_one_release_that_has_its_data(tmp_p
         raise click.Abort()
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dmcvb_gen.generate.rollout.make_plan", stop)
+    monkeypatch.setattr("dmcvb_gen.generate.plan.make_plan", stop)
     result = CliRunner().invoke(main, [command, *words])
     assert result.exit_code == 1 and {request.name for request in planned} == set(missing.subsets), result.output
     cells, none = plan_benchmark("b3", release_of(*missing.subsets, fixed_goals=5, episodes_per_goal=10))

@@ -386,7 +386,7 @@ def test_names_are_text_on_the_page(report, release):
 
 def test_the_release_of_these_tests_is_sound(release):
     structure = check_structure(Release.open(release))
-    assert structure.sound and structure.checked == {"subsets": 1, "episodes": 2, "steps": 1000}
+    assert structure.sound and structure.checked.items() >= {"subsets": 1, "episodes": 2, "steps": 1000}.items()
 
 
 def file_of(folder, name, array, shard):
