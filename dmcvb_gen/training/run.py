@@ -35,7 +35,7 @@ import torch
 
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import write_bytes, write_json
+from dmcvb_gen.files import remove_partial, sha256_file, write_bytes, write_json
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import checkpoints
 from dmcvb_gen.policies.evaluation import evaluate
@@ -43,7 +43,8 @@ from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, MazeName
 from dmcvb_gen.state_file import STATE, pack_state, read_state_file
-from dmcvb_gen.storage.remote import local_path, storage_errors
+from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import useless_setting
 from dmcvb_gen.training.networks import as_arrays, as_tensors

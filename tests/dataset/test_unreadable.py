@@ -14,8 +14,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, PolicyFileError, StoreError
 from dmcvb_gen.policies.bundled import resolve_policies
-from dmcvb_gen.training.runs import RunConfig
-from dmcvb_gen.training.training import open_run
+from dmcvb_gen.training.run import RunConfig, open_run
 
 NAME = "walker-walk/random/dynamic"
 
