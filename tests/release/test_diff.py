@@ -12,8 +12,8 @@ import threading
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
 from dmcvb_gen.dataset.writer import commit_path
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.diff import diff
 from dmcvb_gen.release.publish import publish
@@ -63,7 +63,7 @@ def test_a_release_is_listed_described_and_verified_where_it_is(maze_release, tm
     (there / "half").mkdir()
     run = CliRunner().invoke
     listed = json.loads(run(main, ["list", "--remote", f"file://{there}", "--json"]).output)
-    digest = open_release(maze_release).manifest.digest
+    digest = Release.open(maze_release).manifest.digest
     [facts] = listed
     assert (facts["name"], facts["version"], facts["episodes"], facts["digest"]) == ("mazes", "1.0.0", 2, digest)
     url = facts["url"]

@@ -7,14 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset import open_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.release.statistics import _root_columns, level_statistics, state_statistics, states_json
 from dmcvb_gen.tasks import get_task
 
 
 @pytest.mark.parametrize("fixture", ["small_release", "small_mazes"])
 def test_every_number_of_the_states(fixture, request):
-    release = open_release(request.getfixturevalue(fixture))
+    release = Release.open(request.getfixturevalue(fixture))
     [states] = state_statistics(release)
     subset = next(iter(release.subsets.values()))
     rows = np.concatenate([subset.episode(int(e))["state"] for e in subset.episodes]).astype(float)
@@ -43,9 +43,9 @@ def test_the_root_moves_along_x_and_y(task_id, columns):
 
 
 def test_how_levels_move(small_release, small_mazes):
-    [walker] = level_statistics(open_release(small_release))
+    [walker] = level_statistics(Release.open(small_release))
     assert (walker.task, walker.level, walker.success) == ("walker-walk", "random", None)
-    subset = next(iter(open_release(small_release).subsets.values()))
+    subset = next(iter(Release.open(small_release).subsets.values()))
     task = get_task("walker-walk")
     heights = [subset.episode(int(e))["state"][:, task.state_slices["height"]] for e in subset.episodes]
     assert walker.height == pytest.approx(float(np.concatenate(heights).mean()))
@@ -53,8 +53,8 @@ def test_how_levels_move(small_release, small_mazes):
     moved = [np.diff(subset.episode(int(e))["physics"][:, 2]) for e in subset.episodes]
     assert walker.speed == pytest.approx(float(np.abs(np.concatenate(moved)).mean() / 0.05), rel=1e-6)
 
-    [ant] = level_statistics(open_release(small_mazes))
-    mazes = open_release(small_mazes)
+    [ant] = level_statistics(Release.open(small_mazes))
+    mazes = Release.open(small_mazes)
     visible = next(iter(mazes.subsets.values()))
     place = get_task(visible.task).state_slices["walker_position"]
     walked = [np.diff(visible.episode(int(e))["state"][:, place][:, :2], axis=0) for e in visible.episodes]

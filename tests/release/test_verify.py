@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 
@@ -12,14 +11,14 @@ from click.testing import CliRunner
 from dmcvb_gen.dataset.index import is_card
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset import open_release
-from dmcvb_gen.dataset.writer import commit_path, finish_release
+from dmcvb_gen.dataset3.gate import Release
 from dmcvb_gen.errors import RenderingError, StoreError
-from dmcvb_gen.release.card import write_card
+from dmcvb_gen.files import sha256_file
+from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.verify import check_files, verify
 from tests.conftest import rewrite, roll_out, small_recipe
 
-NAME = "walker-walk/random/dynamic"
+NAME, MAZE = "walker-walk/random/dynamic", "ant-maze-tiny/random/visible"
 
 
 @pytest.fixture
@@ -28,15 +27,92 @@ def copy(small_release, tmp_path):
     return tmp_path / "copy"
 
 
-def test_the_cure_is_that_of_what_is_damaged(copy):
-    write_card(copy)
-    card = copy / "README.md"
-    card.write_text(card.read_text() + "more")
-    result = CliRunner().invoke(main, ["verify", str(copy)])
-    assert result.exit_code == 1 and "FAIL files: README.md: has" in result.output, result.output
-    assert "`dmcvb-gen card" in result.output and "regenerate" not in result.output
-    write_card(copy)
-    assert verify(copy).sound
+@pytest.mark.parametrize(
+    ("release", "counts"),
+    [
+        ("small_release", {"subsets": 3, "episodes": 9, "steps": 4500}),
+        ("small_mazes", {"subsets": 3, "episodes": 6}),
+    ],
+)
+def test_a_sound_release_passes(release, counts, request):
+    folder = request.getfixturevalue(release)
+    result = verify(folder)
+    assert result.sound and result.complete and {**result.checked, **counts} == result.checked
+    assert result.digest == sha256_file(folder / "manifest.json") and not result.compared
+    done = CliRunner().invoke(main, ["verify", f"{folder}@sha256:{result.digest}"])
+    assert done.exit_code == 0 and "All checks passed" in done.output and "not compared" not in done.output
+    wrong = CliRunner().invoke(main, ["verify", f"{folder}@sha256:{'0' * 64}"])
+    assert wrong.exit_code == 2 and f"is release {result.digest}, not 0000" in wrong.output
+
+
+def swap_rewards(arrays):
+    arrays["reward"][0, :500] = np.roll(arrays["reward"][0, :500], 7)  # the return stays the same
+
+
+def swap_pixels(arrays):
+    arrays["pixels"][1] = arrays["pixels"][0]
+
+
+def spoil_state(arrays):
+    arrays["state"][2, 123, 4] = np.nan
+
+
+def inflate_return(arrays):
+    arrays["return"][1] += 100
+
+
+def duplicate(arrays):
+    for name in ("state", "action", "reward", "physics", "return"):
+        arrays[name][2] = arrays[name][0]
+
+
+def repeat_actions(arrays):
+    arrays["action"][2] = arrays["action"][0]
+
+
+def wild_action(arrays):
+    arrays["action"][1, 7, 0] = 1.5
+
+
+def cut_length(arrays):
+    arrays["length"][1] = 0
+
+
+DAMAGE = {
+    swap_rewards: {"rewards", 0},
+    swap_pixels: {"pixels", 1},
+    spoil_state: {"finite", 2, 123},
+    inflate_return: {"returns", 1},
+    duplicate: {"duplicates", 2},
+    wild_action: {"actions", 1, 7},
+    cut_length: {"lengths", 1},
+}
+"""What is done to the arrays -> the check that finds it, the episode, and the step where that is known."""
+
+
+@pytest.mark.parametrize("change", DAMAGE, ids=lambda change: change.__name__)
+def test_wrong_values_are_found_by_their_check(copy, change):
+    rewrite(copy, NAME, change)
+    found = verify(copy, names=[NAME]).findings
+    places = [{finding.check, finding.episode, finding.step} for finding in found]
+    assert any(DAMAGE[change] <= place for place in places), found
+    assert {finding.subset for finding in found} == {NAME}
+
+
+def test_equal_actions_alone_are_no_duplicate(copy):
+    rewrite(copy, NAME, repeat_actions)
+    assert not any(finding.check == "duplicates" for finding in verify(copy, names=[NAME]).findings)
+
+
+def test_returns_of_longer_episodes_may_be_higher(tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 1, "max_steps": 600}
+    roll_out(small_recipe(subsets=[pattern], size=8, seed=4), tmp_path / "long")
+    assert Release.open(tmp_path / "long")["walker-walk/expert/none"].returns.max() > 1000
+    assert verify(tmp_path / "long").sound
+    [policy] = (tmp_path / "long/policies").iterdir()
+    policy.write_bytes(policy.read_bytes()[:-1] + b"x")
+    [found] = check_files(tmp_path / "long")
+    assert found.subset == f"policies/{policy.name}" and "does not have its digest" in found.message
 
 
 def test_what_this_machine_cannot_check_is_not_called_damaged(copy, monkeypatch):
@@ -48,182 +124,38 @@ def test_what_this_machine_cannot_check_is_not_called_damaged(copy, monkeypatch)
     assert result.exit_code == 3 and "NOT CHECKED" in result.output and "regenerate" not in result.output
 
 
-def checks(folder):
-    return {(finding.check, finding.subset) for finding in verify(folder).findings}
+def test_a_damaged_layer_is_named_with_its_cure_and_its_values_are_not_read(copy):
+    path = next(copy.rglob("random.zarr/dynamic/pixels/c/*/0/0/0/0"))
+    path.write_bytes(path.read_bytes()[:100])
+    done = CliRunner().invoke(main, ["verify", str(copy), "--json"])
+    facts = json.loads(done.output)
+    assert done.exit_code == 1 and facts["checked"]["subsets"] == 2
+    [finding] = facts["findings"]
+    assert finding["subset"] == f"{NAME}/pixels" and "has 100 bytes instead of" in finding["message"]
+    assert "`dmcvb-gen regenerate" in CliRunner().invoke(main, ["verify", str(copy)]).output
 
 
-def test_a_sound_release_passes(small_release):
-    result = verify(small_release)
-    assert result.sound and result.checked == {"subsets": 3, "episodes": 9, "steps": 4500}
-
-
-def test_a_flipped_byte_is_found_by_its_digest(copy):
-    file = next(file for file in open_release(copy)[NAME].commits[1].files if "/pixels/" in file.path)
-    data = bytearray((copy / file.path).read_bytes())
-    data[len(data) // 2] ^= 1
-    (copy / file.path).write_bytes(data)
-    [finding] = verify(copy).findings
-    assert finding.check == "files" and "pixels" in finding.message and "shard 1" in finding.message
-
-
-@pytest.fixture(scope="module")
-def policy_release(tmp_path_factory):
-    """A release with a policy file and a card."""
-    folder = tmp_path_factory.mktemp("policies") / "release"
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 1}
-    roll_out(small_recipe(name="policies", subsets=[pattern]), folder)
-    write_card(folder)
-    return folder
-
-
-@pytest.mark.parametrize("which", ["walker", "maze"])
-def test_a_flipped_byte_in_any_file_is_found_and_named(policy_release, maze_release, which):
-    folder = policy_release if which == "walker" else maze_release
-    assert not list(check_files(folder))
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.stat().st_size]
-    names = {path.relative_to(folder).as_posix() for path in files}
-    assert {"manifest.json", "files.json"} <= names and any(name.endswith("/zarr.json") for name in names)
-    assert which == "maze" or any(name.startswith("policies/") for name in names)
-    for path in files:
-        data = path.read_bytes()
-        for place in {0, len(data) // 2, len(data) - 1}:
-            changed = bytearray(data)
-            changed[place] ^= 1
-            path.write_bytes(changed)
-            found = [str(finding) for finding in check_files(folder)]
-            path.write_bytes(data)
-            name = path.relative_to(folder).as_posix()
-            assert found and any(name in text for text in found), (name, place, found)
-    assert not list(check_files(folder))
-
-
-def test_the_root_digest_is_printed_and_covers_all_but_card_and_machine(policy_release, tmp_path):
-    digest = open_release(policy_release).manifest.digest
-    lines = []
-    for path in sorted(policy_release.rglob("*"), key=lambda path: path.relative_to(policy_release).as_posix()):
-        name = path.relative_to(policy_release).as_posix()
-        if path.is_file() and path.name not in (".created", ".lock", "files.json") and not is_card(name):
-            if name.startswith("commits/"):
-                continue
-            data = path.read_bytes()
-            if name == "manifest.json":
-                bare = json.loads(data) | {"digest": None, "environments": []}
-                data = (json.dumps(bare, indent=1) + "\n").encode()
-            lines.append(f"{hashlib.sha256(data).hexdigest()}  {name}\n")
-    assert hashlib.sha256("".join(lines).encode()).hexdigest() == digest
-    for command in ("verify", "info"):
-        assert digest in CliRunner().invoke(main, [command, str(policy_release)]).output
-    assert digest in (policy_release / "README.md").read_text()
-
-
-def test_a_part_of_a_release_is_called_incomplete(copy, maze_release, tmp_path):
-    for shard in (0, 1):
-        (copy / commit_path(NAME, shard)).unlink()
-    finish_release(copy, open_release(copy).manifest)
-    result = CliRunner().invoke(main, ["verify", str(copy)])
-    assert result.exit_code == 3 and f"{NAME}: 0 of 3 episodes" in result.output
-    assert "incomplete: 6 of 9 episodes" in result.output
-    with pytest.raises(StoreError, match="none of its episodes are here"):
-        open_release(copy)[NAME]
-    shutil.copytree(maze_release, tmp_path / "maze")
-    (tmp_path / "maze" / commit_path("ant-maze-tiny/random/visible", 1)).unlink()
-    finish_release(tmp_path / "maze", open_release(tmp_path / "maze").manifest)
-    found = verify(tmp_path / "maze")
-    assert found.sound and found.incomplete == {"ant-maze-tiny/random/visible": (1, 2)}
-
-
-def test_a_truncated_shard_is_found(copy):
-    file = next(file for file in open_release(copy)[NAME].commits[0].files if "/state/" in file.path)
-    (copy / file.path).write_bytes((copy / file.path).read_bytes()[:100])
-    assert ("files", NAME) in checks(copy)
-
-
-def test_a_swapped_reward_is_found_by_simulating_again(copy):
-    def swap(group):
-        rewards = group["reward"][0]
-        rewards[:500] = np.roll(rewards[:500], 7)  # the return stays the same
-        group["reward"][0] = rewards
-
-    rewrite(copy, NAME, swap)
-    found = verify(copy).findings
-    assert {finding.check for finding in found} <= {"rewards", "returns"} and any(f.check == "rewards" for f in found)
-    assert all(finding.episode == 0 and finding.subset == NAME for finding in found)
-
-
-def test_pixels_of_another_episode_are_found_by_painting_again(copy):
-    def swap(group):
-        group["pixels"][1] = group["pixels"][0]
-
-    rewrite(copy, NAME, swap)
-    found = verify(copy).findings
-    assert {finding.check for finding in found} == {"pixels"} and {finding.episode for finding in found} == {1}
-
-
-def test_a_nan_state_is_found_with_its_step(copy):
-    def spoil(group):
-        state = group["state"][2]
-        state[123, 4] = np.nan
-        group["state"][2] = state
-
-    rewrite(copy, NAME, spoil)
-    found = [finding for finding in verify(copy).findings if finding.check == "finite"]
-    assert [(finding.episode, finding.step) for finding in found] == [(2, 123)]
-
-
-def test_returns_of_longer_episodes_may_be_higher(tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 1, "max_steps": 600}
-    roll_out(small_recipe(subsets=[pattern], size=8, seed=4), tmp_path / "long")
-    assert open_release(tmp_path / "long")["walker-walk/expert/none"].returns.max() > 1000
-    assert verify(tmp_path / "long").sound
-
-
-def test_a_return_that_does_not_match_is_found(copy):
-    def inflate(group):
-        returns = group["return"][:]
-        returns[1] += 100
-        group["return"][:] = returns
-
-    rewrite(copy, NAME, inflate)
-    assert checks(copy) == {("returns", NAME)}
-
-
-def test_a_duplicated_episode_is_found(copy):
-    def duplicate(group):
-        for name in ("state", "action", "reward", "physics", "return"):
-            group[name][2] = group[name][0]
-
-    rewrite(copy, NAME, duplicate)
-    assert ("duplicates", NAME) in checks(copy)
-
-
-def test_a_missing_shard_of_a_complete_release_is_found(copy):
-    (copy / commit_path(NAME, 1)).unlink()
-    assert ("files", NAME) in checks(copy)
-
-
-def test_a_manifest_that_names_another_digest_is_found(copy):
-    data = json.loads((copy / "manifest.json").read_text())
-    data["subsets"][0]["digest"] = "0" * 64
-    (copy / "manifest.json").write_text(json.dumps(data))
-    assert {check for check, _ in checks(copy)} == {"files"}
+@pytest.mark.parametrize(("release", "name", "here"), [("small_release", NAME, 2), ("maze_release", MAZE, 1)])
+def test_a_part_of_a_release_is_called_incomplete(release, name, here, request, tmp_path):
+    source = request.getfixturevalue(release)
+    fetch(f"file:{source}", tmp_path / "part", [name], (0, 1))
+    result = CliRunner().invoke(main, ["verify", str(tmp_path / "part")])
+    planned = Release.open(source)[name].record.episodes
+    assert result.exit_code == 3 and f"{name}: {here} of {planned} episodes" in result.output, result.output
+    assert "incomplete:" in result.output and "not compared" not in result.output
+    others = [other for other in Release.open(source) if other != name]
+    for other in others:
+        with pytest.raises(StoreError, match="has no episode of it"):
+            Release.open(tmp_path / "part")[other]
 
 
 def test_files_that_no_digest_speaks_of_are_named(copy):
-    (copy / "preview").mkdir()
-    (copy / "preview" / "sheet.png").write_bytes(b"")  # where `preview` writes
-    assert verify(copy).sound
-    extra = {f"{NAME}.zarr/pixels/c/9/0/0/0/0": NAME, "policies/other.safetensors": "policies/other.safetensors"}
-    for path in extra:
-        (copy / path).parent.mkdir(parents=True, exist_ok=True)
+    for path in ("preview/sheet.png", "README.md", "card/returns.png"):  # where commands write
+        (copy / path).parent.mkdir(exist_ok=True)
+        (copy / path).write_bytes(b"x")
+    assert not check_files(copy)
+    strange = {"notes.txt", "policies/other.safetensors"}
+    for path in strange:
+        (copy / path).parent.mkdir(exist_ok=True)
         (copy / path).write_bytes(b"stray")
-    found = verify(copy).findings
-    assert {(finding.check, finding.subset) for finding in found} == {("files", place) for place in extra.values()}
-    assert all("not part of the release" in finding.message for finding in found)
-
-
-def test_equal_actions_alone_are_no_duplicate(copy):
-    def repeat(group):
-        group["action"][2] = group["action"][0]
-
-    rewrite(copy, NAME, repeat)
-    assert ("duplicates", NAME) not in checks(copy)
+    assert {(issue.subset, issue.check) for issue in check_files(copy)} == {(path, "files") for path in strange}
