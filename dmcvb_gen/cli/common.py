@@ -60,7 +60,7 @@ def print_table(
     from rich.console import Console
     from rich.text import Text
 
-    console, heads = Console(highlight=False), [column.removeprefix("<") for column in columns]
+    console, heads = Console(highlight=False), [printable(column.removeprefix("<")) for column in columns]
     left = {i for i, column in enumerate(columns) if i == 0 or column.startswith("<")}
     lines, shown, stacked = [[printable(str(cell)) for cell in row] for row in rows], list(range(len(heads))), False
     widths = [max(len(line[i]) for line in [heads, *lines]) for i in range(len(heads))]

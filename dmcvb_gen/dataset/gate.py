@@ -267,7 +267,13 @@ class Release:
                 layer = self.layers[name]
                 if layer.kind == "images" and not (images or layer.source):
                     continue
-                records, here = self.records(name), self.here(name)
+                here = self.here(name)
+                try:
+                    records = self.records(name)
+                except NotThere:
+                    if self.copy is None or here:
+                        raise
+                    continue  # a part has the lists of its own layers
                 for number in sorted(records):
                     span = layer.episodes_of(number)
                     wanted = span.start < subset.episodes and (

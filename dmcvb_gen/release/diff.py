@@ -81,7 +81,7 @@ def _shards(a: Release, b: Release, one: Layer, other: Layer) -> Iterator[Differ
         fields = [n for n in ("rows", "episodes_per_shard", "arrays") if getattr(one, n) != getattr(other, n)]
         fields += sorted(key for key in {*one.makes, *other.makes} if one.makes.get(key) != other.makes.get(key))
         yield Difference(one.name, f"made in another way: {', '.join(fields) or 'what lies below it'}")
-    if one.episodes_per_shard != other.episodes_per_shard:
+    if one.episodes_per_shard != other.episodes_per_shard or not (a.here(one.name) and b.here(one.name)):
         return
     mine, theirs = a.records(one.name), b.records(one.name)
     arrays: dict[str, list[tuple[int, int]]] = {}

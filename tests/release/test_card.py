@@ -152,13 +152,10 @@ def test_a_fitting_card_passes_and_a_lying_one_is_found(copy):
 HOSTILE = "<img src=x>[a](javascript:alert(1))|b`\"'"
 
 
-def test_names_become_no_markup(small_release, tmp_path):
-    recipe = small_recipe(authors=[HOSTILE], license=HOSTILE, description=HOSTILE)
-    shutil.copytree(small_release, tmp_path / "r")
-    for folder in ("recipes", "layers", "manifest.json"):
-        path = tmp_path / "r" / folder
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    roll_out(recipe, tmp_path / "r")
+def test_names_become_no_markup(tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 3}
+    facts = {"authors": [HOSTILE], "license": HOSTILE, "description": HOSTILE, "size": 8}
+    roll_out(small_recipe(subsets=[pattern], **facts), tmp_path / "r")
     write_card(tmp_path / "r", tmp_path / "card")
     _, header, text = (tmp_path / "card/README.md").read_text().split("---\n", 2)
     assert yaml.safe_load(header)["license"] == HOSTILE.lower()
@@ -175,7 +172,7 @@ def test_a_terminal_gets_no_commands_of_its_own(capsys):
         answer(False, None, hostile)
         print_table([hostile], [[hostile]], title=hostile)
     said = capsys.readouterr().out
-    assert not set("\x1b\x07\u202e") & set(said) and said.count("?]0;title??x") == 3
+    assert not set("\x1b\x07\u202e") & set(said) and said.count("?]0;title??x") == 4
 
 
 def test_the_card_of_a_part_is_compared_by_its_rows(carded, tmp_path):
@@ -183,7 +180,7 @@ def test_the_card_of_a_part_is_compared_by_its_rows(carded, tmp_path):
     result = CliRunner().invoke(main, ["card", str(tmp_path / "part"), "--check"])
     assert result.exit_code == 3 and "the card fits the episodes that are here; 7 are not" in result.output
     table = pq.read_table(carded / "card/episodes.parquet")
-    pq.write_table(table.slice(1), tmp_path / "part/card/episodes.parquet")
+    pq.write_table(table.slice(0, 0), tmp_path / "part/card/episodes.parquet")
     result = CliRunner().invoke(main, ["card", str(tmp_path / "part"), "--check"])
     assert result.exit_code == 1 and "episodes.parquet does not fit the episodes that are here" in result.output
 

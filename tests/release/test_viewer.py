@@ -20,7 +20,7 @@ from PIL import Image
 import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.generate.paint import without_pictures
+from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.viewer import view
 from tests.conftest import roll_out, small_recipe
 
@@ -53,6 +53,8 @@ const middle = number => {  // the mean color of a picture
   seen.views = [...document.querySelector(".views").querySelectorAll("figcaption")].map(node => node.textContent);
   seen.charts = [...document.querySelector(".pane").querySelectorAll(".chart b")].map(node => node.textContent);
   seen.command = document.querySelector("code").textContent;
+  seen.below = document.querySelector(".chart").getBoundingClientRect().bottom;
+  seen.curves = [...document.querySelectorAll(".chart")[1].querySelectorAll(".key")].map(node => node.textContent);
   seen.first = middle(0);
   press("ArrowRight"); seen.right = at();
   press("ArrowRight", {shiftKey: true}); seen.ten = at();
@@ -72,9 +74,11 @@ const middle = number => {  // the mean color of a picture
   get("subset").value = seen.subsets[1]; get("subset").dispatchEvent(new Event("change"));
   await wait(100);
   seen.changed = titles();
+  seen.lastcharts = [...document.querySelector(".pane").querySelectorAll(".chart b")].map(node => node.textContent);
   press("]"); seen.next = titles();
   press("ArrowDown"); seen.episode = titles();
   press("b"); seen.twins = titles();
+  press("ArrowDown"); seen.kept = titles();
   seen.problems = problems;
   document.body.dataset.seen = JSON.stringify(seen);
 })();
@@ -101,7 +105,7 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
     source = folder = request.getfixturevalue(family)
     if light:
         folder = tmp_path / source.name
-        without_pictures(source, folder)
+        publish(source, f"file:{folder}", pixels=False)
     written = view(str(folder), tmp_path / "viewer.html", episodes=2)
     release = dmcvb_gen.open(str(source))
     names = list(release.subsets)
@@ -112,8 +116,11 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
     assert seen["subsets"] == names and seen["titles"][0] == f"{names[0]}, episode 0"
     assert tuple(seen["views"]) == first.record.views
     assert seen["charts"] == ["Reward", "Action", "State", "Distractor"]
-    name = folder.name
-    assert seen["command"] == f"dmcvb-gen regenerate {name} --only {names[0]} --range 0:1 --out again"
+    assert seen["command"] == f"dmcvb-gen regenerate {folder} --only {names[0]} --range 0:1 --out again"
+    assert seen["below"] < 900  # pixels down the page, of the first curve: images leave room for curves
+    actuators = first.record.actuators
+    assert [text.rpartition(" ")[0] for text in seen["curves"]] == list(actuators) and "" not in actuators
+    assert ("Distractor" in seen["lastcharts"]) == (family == "small_mazes")  # of setting none there are no labels
     length = int(first.lengths[0])
     assert (seen["right"], seen["ten"], seen["left"]) == (1, min(11, length), min(11, length) - 1)
     assert seen["end"] == length and seen["home"] == 0
@@ -127,6 +134,7 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
     assert seen["episode"] == [f"{names[2]}, episode 1"]
     if family == "small_release":  # the three distractors share their trajectories
         assert seen["titles"][1] == f"{names[1]}, episode 0" and len(seen["twins"]) == 2
+        assert seen["kept"] == [f"{names[2]}, episode 0", f"{names[0]}, episode 0"]
         assert [text for text in seen["beside"] if text.startswith("same trajectory")] == [
             f"same trajectory: {other}, episode 0" for other in names[1:]
         ]
@@ -150,7 +158,7 @@ def test_the_command_writes_and_refuses(small_release, tmp_path):
     assert result.exit_code == 0 and "1 episode of 1 subset" in result.output
     data = re.search(r'id="data">(.*?)</script>', (tmp_path / "v.html").read_text())[1]
     [episode] = json.loads(data)["episodes"]
-    assert episode["views"][0]["width"] == 24 and str(tmp_path) not in data
+    assert episode["views"][0]["width"] == 24 and "--range 0:1" in data
     with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
         view(str(small_release), only=["cheetah-run"])
     with pytest.raises(StoreError, match="--out"):
@@ -187,6 +195,9 @@ def test_lamps_have_curves_and_a_url_the_command_that_fetches(tmp_path):
     }
     roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "lamps")
     here = view(str(tmp_path / "lamps"), tmp_path / "here.html").path.read_text()
-    assert all(f"light_shift {axis}" in here for axis in "xyz") and "dmcvb-gen regenerate lamps --only" in here
+    assert (
+        all(f"light_shift {axis}" in here for axis in "xyz")
+        and f"dmcvb-gen regenerate {tmp_path / 'lamps'} --only" in here
+    )
     there = view(f"file://{tmp_path / 'lamps'}", tmp_path / "there.html").path.read_text()
     assert f"dmcvb-gen fetch file://{tmp_path / 'lamps'} --only" in there and "regenerate" not in there
