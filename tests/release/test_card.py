@@ -11,13 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 from click.testing import CliRunner
-from dmcvb_gen.dataset.index import card_files
 from PIL import Image
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import answer, print_table
-from dmcvb_gen.dataset3.gate import Release
-from dmcvb_gen.dataset3.pictures import training_pictures
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.paper import paper_returns

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.diff import diff
 from dmcvb_gen.release.fetch import fetch

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner
+from dmcvb_gen.benchmarks.goals import GoalPairs, goal_pairs
 from PIL import Image
 
 import dmcvb_gen
-from dmcvb_gen.benchmarks.plan import goal_pairs
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.generate.executors import run_jobs
 from dmcvb_gen.generate.paint import paint_release

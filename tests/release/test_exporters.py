@@ -19,7 +19,7 @@ from PIL import Image
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset3.pictures import shown
+from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.release.export import STAMP, export, registry
 from dmcvb_gen.release.export.publishing import export_format

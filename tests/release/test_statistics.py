@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset3.gate import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.release.statistics import _root_columns, level_statistics, state_statistics, states_json
 from dmcvb_gen.tasks import get_task
 
