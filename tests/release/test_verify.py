@@ -120,7 +120,7 @@ def test_what_this_machine_cannot_check_is_not_called_damaged(copy, monkeypatch)
 
     monkeypatch.setattr("dmcvb_gen.release.contents.renderer_for", fail)
     result = CliRunner().invoke(main, ["verify", str(copy)])
-    assert result.exit_code == 1 and "FAIL unchecked" in result.output and "regenerate" not in result.output
+    assert result.exit_code == 3 and "NOT CHECKED walker-walk" in result.output and "regenerate" not in result.output
 
 
 def test_a_damaged_layer_is_named_with_its_cure_and_its_values_are_not_read(copy):
