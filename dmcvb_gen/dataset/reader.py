@@ -16,6 +16,7 @@ from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.zarr_files import ZarrFiles
 from dmcvb_gen.text import quoted
 
 TRANSITIONS = "action", "reward", "discount"
@@ -216,7 +217,7 @@ class Subset:
             layer, spec = self._layer_of(name)
             prefix = f"{layer.group}/{spec.stored_name}"
             files = array_files(self.release.records(layer.name), layer, spec, self.release.here(layer.name))
-            chunks = self.release.store.zarr_store(prefix, files)
+            chunks = ZarrFiles(self.release.store, prefix, files)
             place, cure = (
                 f"{self.release.place}/{prefix}",
                 self._without_images if layer.kind == "images" else self._not_here,

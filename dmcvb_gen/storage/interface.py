@@ -11,19 +11,14 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.storage.errors import storage_errors
-
-if TYPE_CHECKING:
-    from zarr.abc.store import Store as ZarrStore
-
-    from dmcvb_gen.storage.zarr_files import Recorded
 
 PIECE = 16 * 2**20
 """Bytes that are in memory at once while a file passes."""
@@ -152,11 +147,7 @@ class Store(abc.ABC):
 
     def size(self, path: str) -> int | None:
         """Bytes of a file; None if it is not there."""
-        try:
-            with self._errors(path, "read"):
-                return self._size(path)
-        except NotThere:
-            return None
+        return self._found(path, lambda: self._size(path), None)
 
     def sha256(self, path: str, limit: int) -> str:
         """SHA-256 of a file, in hex, read piece by piece.
@@ -174,28 +165,17 @@ class Store(abc.ABC):
 
     def version(self, path: str) -> str | None:
         """An opaque name of a file's present content, for `replace`; None if it is not there. Ask before you read."""
-        try:
-            with self._errors(path, "read"):
-                return self._version(path)
-        except NotThere:
-            return None
+        return self._found(path, lambda: self._version(path), None)
 
     def list(self, prefix: str = "") -> dict[str, int]:
         """Path -> bytes of every file below a folder, hidden ones (a part begins with ".") apart; maybe none."""
-        try:
-            with self._errors(prefix.strip("/") or None, "read"):
-                found = self._list(prefix.strip("/"))
-        except NotThere:
-            return {}
+        prefix = prefix.strip("/")
+        found = self._found(prefix or None, lambda: self._list(prefix), {})
         return {path: size for path, size in sorted(found.items()) if "/." not in f"/{path}"}
 
     def folders(self) -> Sequence[str]:
         """Names of the folders right below, hidden ones apart; maybe none."""
-        try:
-            with self._errors(None, "read"):
-                return sorted(name for name in self._folders() if not name.startswith("."))
-        except NotThere:
-            return []
+        return self._found(None, lambda: sorted(name for name in self._folders() if not name.startswith(".")), [])
 
     def download(self, path: str, target: str | Path, size: int, sha256: str) -> None:
         """Copy a file to `target` on this machine, whole or not at all; what is there already stays.
@@ -228,17 +208,13 @@ class Store(abc.ABC):
         out.flush()
         os.fsync(out.fileno())
 
-    def zarr_store(self, prefix: str, files: Mapping[str, Recorded]) -> ZarrStore:
-        """The files below a folder for Zarr, to read.
-
-        Args:
-          files: key below `prefix` -> size and SHA-256, as recorded. Other keys are absent without a request; one of
-            these that is not there, or has other bytes, is an error, never zeros. The digest of a file is compared if
-            all of it is read; parts have checksums of their own.
-        """
-        from dmcvb_gen.storage.zarr_files import ZarrFiles
-
-        return ZarrFiles(self, prefix, files)
+    def _found(self, path: str | None, look: Callable[[], Any], default: Any) -> Any:
+        """What `look` gives; the default if nothing is there."""
+        try:
+            with self._errors(path, "read"):
+                return look()
+        except NotThere:
+            return default
 
     # -- writing ----------------------------------------------------------------------------------
 

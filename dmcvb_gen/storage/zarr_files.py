@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import AsyncIterator, Iterable, Mapping
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
 
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.storage.interface import Store as Files
 
 
 class Recorded(Protocol):
@@ -22,20 +23,15 @@ class Recorded(Protocol):
     def sha256(self) -> str: ...
 
 
-class Files(Protocol):
-    """What a store has of it."""
-
-    @property
-    def place(self) -> str: ...
-
-    def read_range(self, path: str, start: int, length: int) -> bytes: ...
-
-
 class ZarrFiles(Store):
-    """A read-only Zarr store, see `dmcvb_gen.storage.interface.Store.zarr_store`."""
+    """The files below a folder of a store for Zarr, to read.
 
-    supports_writes = supports_deletes = False
-    supports_listing = True
+    Args:
+      files: key below `prefix` -> its record. Other keys are absent without a request; one of these that is not there,
+        or has other bytes, is an error, never zeros.
+    """
+
+    supports_writes = supports_deletes = supports_listing = False
 
     def __init__(self, store: Files, prefix: str, files: Mapping[str, Recorded]):
         super().__init__(read_only=True)
@@ -69,25 +65,10 @@ class ZarrFiles(Store):
     async def exists(self, key: str) -> bool:
         return key in self.files
 
-    async def set(self, key: str, value: Buffer) -> None:
-        raise ValueError("a release is never changed")
+    def _not_offered(self, *_: object) -> Any:
+        raise NotImplementedError("arrays are read by their records alone")
 
-    async def delete(self, key: str) -> None:
-        raise ValueError("a release is never changed")
-
-    async def list(self) -> AsyncIterator[str]:
-        for key in self.files:
-            yield key
-
-    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        for key in self.files:
-            if key.startswith(prefix):
-                yield key
-
-    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        folder = f"{prefix.strip('/')}/".lstrip("/")
-        for name in {key[len(folder) :].split("/")[0] for key in self.files if key.startswith(folder)}:
-            yield name
+    set = delete = list = list_prefix = list_dir = _not_offered  # type: ignore[assignment]
 
 
 def _range(part: ByteRequest | None, size: int) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.storage import folder as folder_module
 from dmcvb_gen.storage.places import Place, shown
 from dmcvb_gen.storage.store import ANY, NotThere, open_store
+from dmcvb_gen.storage.zarr_files import ZarrFiles
 from tests.fake_hub import fake_hub
 from tests.web_server import serving
 
@@ -107,7 +108,7 @@ class ReadTests:
         files = {"zarr.json": recorded(meta), "c/0": recorded(b"\x01\x02"), "c/1": recorded(b"\x03\x04")}
 
         def read(prefix, files):
-            return zarr.open_array(pickle.loads(pickle.dumps(store.zarr_store(prefix, files))), mode="r")[:]
+            return zarr.open_array(pickle.loads(pickle.dumps(ZarrFiles(store, prefix, files))), mode="r")[:]
 
         np.testing.assert_array_equal(read("g/x", files), [1, 2, 3, 4])
         np.testing.assert_array_equal(read("g/x", {k: f for k, f in files.items() if k != "c/1"}), [1, 2, 7, 7])
