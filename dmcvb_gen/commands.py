@@ -5,11 +5,12 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 """
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from annotated_types import Ge, Gt, Lt
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.public import paint
@@ -207,7 +208,7 @@ def validate(
     release: Location,
     *,
     profile: str = "smoke",
-    scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    scale: Annotated[float, Gt(0), Lt(math.inf)] = 1.0,
     benchmarks: Names = ("b1",),
     agents: Names = (),
     only: Names = (),
@@ -219,8 +220,8 @@ def validate(
     device: Literal["cpu", "cuda"] = "cpu",
     precision: Precision = "auto",
     compile: bool = False,
-    memory: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None,
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
+    memory: Annotated[float, Ge(0), Lt(math.inf)] | None = None,
+    seed: Annotated[int, Ge(0), Lt(2**31)] = 0,
     dino_weights: Location | None = None,
     backgrounds: Location | None = None,
     progress: bool = True,

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
-import pydantic
+from annotated_types import Ge, Le
 
 from dmcvb_gen.errors import DmcvbError
 
@@ -25,27 +25,20 @@ LOCAL = "local"
 """Mark of a folder or file to write to, which cannot be a URL."""
 
 
-def _several(value: Any) -> Any:
-    if isinstance(value, str | Path):
-        return (value,)
-    return tuple(value) if hasattr(value, "__iter__") else value
-
-
-def _range(value: tuple[int, int]) -> tuple[int, int]:
-    if not 0 <= value[0] < value[1]:
-        raise ValueError("give (A, B) with 0 <= A < B")
-    return value
-
+SEVERAL = "several"
+"""Mark of names: one may be given alone, or an iterator."""
+RANGE = "range"
+"""Mark of (A, B) with 0 <= A < B."""
 
 Location = str | Path
 """A folder, a file or a URL."""
 Local = Annotated[Location, LOCAL]
-Names = Annotated[tuple[Location, ...], pydantic.BeforeValidator(_several)]
+Names = Annotated[tuple[Location, ...], SEVERAL]
 """One name or several."""
-Count = Annotated[int, pydantic.Field(ge=1)]
-Seed = Annotated[int, pydantic.Field(ge=0)]
-Samples = Annotated[int, pydantic.Field(ge=1, le=8)]
-Span = Annotated[tuple[int, int], pydantic.AfterValidator(_range)]
+Count = Annotated[int, Ge(1)]
+Seed = Annotated[int, Ge(0)]
+Samples = Annotated[int, Ge(1), Le(8)]
+Span = Annotated[tuple[int, int], RANGE]
 """(first, last + 1)."""
 GoalPictures = Literal["visible", "hidden"]
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -63,22 +56,31 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     """
     signature = inspect.signature(function)
 
-    @functools.cache
-    def adapter(name: str) -> pydantic.TypeAdapter[Any]:
-        return pydantic.TypeAdapter(signature.parameters[name].annotation)
-
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
-            try:
-                given.arguments[name] = adapter(name).validate_python(value)
-            except pydantic.ValidationError as error:
-                reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-                raise DmcvbError(f"{name} is {value!r}: {reason[0].lower()}{reason[1:]}") from None
+            given.arguments[name] = _checked(name, value, signature.parameters[name].annotation)
         return function(*given.args, **given.kwargs)
 
     return call
+
+
+def _checked(name: str, value: Any, annotation: Any) -> Any:
+    import pydantic  # here, so that --help is quick
+
+    _, marks = parts_of(annotation)
+    taken = value
+    if SEVERAL in marks and value is not None:
+        taken = (value,) if isinstance(value, str | Path) else tuple(value)
+    try:
+        taken = pydantic.TypeAdapter(annotation).validate_python(taken)
+    except pydantic.ValidationError as error:
+        reason = error.errors()[0]["msg"]
+        raise DmcvbError(f"{name} is {value!r}: {reason[0].lower()}{reason[1:]}") from None
+    if RANGE in marks and taken is not None and not 0 <= taken[0] < taken[1]:
+        raise DmcvbError(f"{name} is {value!r}: give (A, B) with 0 <= A < B")
+    return taken
 
 
 def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:

@@ -30,6 +30,7 @@ FLOORS = (
         "arithmetic",
         "precision",
         "compilation",
+        "kept",
         "progress",
         "options",
         "own_code",

@@ -21,7 +21,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import click
-from pydantic.fields import FieldInfo
 
 from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
 from dmcvb_gen.cli.unused_options import is_given
@@ -123,7 +122,7 @@ def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
         return str
     sides = {"ge": ("min", False), "gt": ("min", True), "le": ("max", False), "lt": ("max", True)}
     bounds: dict[str, Any] = {}
-    for limit in (limit for mark in marks if isinstance(mark, FieldInfo) for limit in mark.metadata):
+    for limit in marks:
         for name, (side, is_open) in sides.items():
             if hasattr(limit, name):
                 bounds |= {side: getattr(limit, name), f"{side}_open": is_open}

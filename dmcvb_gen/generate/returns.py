@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from annotated_types import Ge
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Local, Location, Names, Seed, checked
@@ -19,7 +19,7 @@ def evaluate_behaviour(
     *,
     levels: Names = (),
     behaviour: Location | None = None,
-    episodes: Annotated[int, Field(ge=2)] = 100,
+    episodes: Annotated[int, Ge(2)] = 100,
     seed: Seed = 1,
     sample: bool = False,
     pictures: Local | None = None,

@@ -21,7 +21,7 @@ FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "
 FUNCTIONS += ("train_behaviour", "evaluate_behaviour")
 FAMILIES = {
     "locomotion": dict(tasks="walker-walk", distractors=["none", "dynamic"]),
-    "suite": dict(tasks="cartpole-swingup", distractors="static"),
+    "suite": dict(tasks="cartpole-swingup", levels="random", distractors="static"),
     "maze": dict(tasks="ant-maze-empty7x7", goals="visible"),
 }
 TINY = dict(episodes=2, max_steps=8, size=32, episodes_per_shard=1, progress=False)

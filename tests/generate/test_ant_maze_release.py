@@ -198,12 +198,12 @@ def test_bad_requests(tmp_path):
     hole = tmp_path / "hole.txt"
     hole.write_text("****\n*   \n****\n")
     for arguments, message in [
-        (["--layout", str(hole)], "hole"),
-        (["--layout", "no-such"], "empty7x7"),
+        ([str(hole)], "hole"),
+        (["no-such.txt"], "cannot read layout"),
         (["ant-maze-empty7x7", "--distractor", "dynamic"], "--goal"),
         (["ant-maze-empty7x7", "--goal", "seen"], "visible"),
-        (["walker-walk", "--goal", "hidden"], "no effect outside mazes"),
-        (["ant-maze-empty7x7", "--fixed-goals", "100000"], "fixed-goals"),
+        (["walker-walk", "--goal", "hidden"], "--goal is for mazes"),
+        (["ant-maze-empty7x7", "--goal", "fixed100000"], "fixed goals"),
         (["ant-maze-empty7x7", "--steps", "100"], "episodes"),
     ]:
         result = run(*arguments)
