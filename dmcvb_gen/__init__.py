@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.commands import export, fetch, publish, validate, verify
-from dmcvb_gen.generate.public import paint, regenerate, repaint, rollout
 from dmcvb_gen.generate.returns import evaluate_behaviour
 from dmcvb_gen.loaders.register import register_with_gymnasium
+from dmcvb_gen.making import paint, regenerate, repaint, rollout
 from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.version import __version__
 

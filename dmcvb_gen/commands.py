@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from annotated_types import Ge, Gt, Lt
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.generate.public import paint
+from dmcvb_gen.making import paint
 from dmcvb_gen.options import (
     Count,
     GoalPictures,

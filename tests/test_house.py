@@ -48,7 +48,10 @@ FLOORS = (
     ("loaders",),
     ("release",),
     ("benchmarks",),
-    ("commands",),
+    (
+        "commands",
+        "making",
+    ),
     ("cli",),
 )
 """From the ground up; a module may import from its own floor (its own package there) and those below."""

@@ -6,14 +6,13 @@ import dataclasses
 
 import click
 
-from dmcvb_gen import commands
+from dmcvb_gen import commands, making
 from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
-from dmcvb_gen.generate import public
 from dmcvb_gen.text import pluralize
 
 
-@command_of(public.paint)
+@command_of(making.paint)
 def paint(release, as_json, **options):
     """Render the images of a release stored without pixels, and compare them with their known digests.
 
@@ -25,7 +24,7 @@ def paint(release, as_json, **options):
     dmcvb-gen rollout walker-walk --level expert --episodes 20 --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
-    done = public.paint(release, notify=_tell, **options)
+    done = making.paint(release, notify=_tell, **options)
     facts = {"out": release} | _painted_facts(done)
     answer(as_json, facts, *_painted(release, done), code=1 if done.differing else 0)
 

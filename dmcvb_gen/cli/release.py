@@ -7,12 +7,11 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen import commands
+from dmcvb_gen import commands, making
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.dataset.manifest import VIDEOS
-from dmcvb_gen.generate import public
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.storage.places import is_url, shown
 from dmcvb_gen.text import pluralize, quoted
@@ -76,7 +75,7 @@ def _cures(path, places):
         yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` copies the videos from FOLDER again."
 
 
-@command_of(public.regenerate)
+@command_of(making.regenerate)
 def regenerate(release, out, as_json, **options):
     """Make a release's shards again from its manifest alone, bit for bit.
 
@@ -89,7 +88,7 @@ def regenerate(release, out, as_json, **options):
     dmcvb-gen regenerate releases/mini
     dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --range 0:3 --out data/part
     """
-    outcome = public.regenerate(release, out=out, **options)
+    outcome = making.regenerate(release, out=out, **options)
     facts = {"sound": outcome.sound, "shards": [dataclasses.asdict(shard) for shard in outcome.shards]}
     facts |= {"environment": outcome.environment, "not_here": outcome.left, "restored": outcome.restored}
     code = 1 if not outcome.sound else 3 if outcome.left else 0
@@ -114,7 +113,7 @@ def _regenerated(place, outcome):
         yield f"{place}: " + ("none of these shards is here" if outcome.left else "nothing is damaged or missing")
 
 
-@command_of(public.repaint)
+@command_of(making.repaint)
 def repaint(release, out, as_json, **options):
     """Render stored episodes again from their physics states. Nothing is simulated.
 
@@ -122,7 +121,7 @@ def repaint(release, out, as_json, **options):
     dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\
         --out releases/mini84
     """
-    release = public.repaint(release, out=out, **options)
+    release = making.repaint(release, out=out, **options)
     subsets = release.manifest.subsets
     facts = {"out": out, "complete": not release.shortfalls, "subsets": [subset.name for subset in subsets]}
     made = (f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}" for subset in subsets)

@@ -7,10 +7,10 @@ import shlex
 
 import click
 
+from dmcvb_gen import making
 from dmcvb_gen.cli.common import answer, print_json, print_table, remote_option
 from dmcvb_gen.cli.options import command_of, parse_part
 from dmcvb_gen.cli.slurm import script_for_slurm
-from dmcvb_gen.generate import public
 from dmcvb_gen.options import progress_bar
 from dmcvb_gen.storage.places import is_url
 from dmcvb_gen.text import format_bytes, pluralize
@@ -41,7 +41,7 @@ def _with_table(command: click.Command) -> click.Command:
 
 
 @_with_table
-@command_of(public.rollout, groups=OPTION_GROUPS)
+@command_of(making.rollout, groups=OPTION_GROUPS)
 @click.option("--dry-run", is_flag=True, help="Show what is there and what would be made, and write nothing.")
 def rollout(dry_run, as_json, progress, workers, other_versions, **options):
     """Roll out behaviour policies into a release of episodes.
@@ -82,7 +82,7 @@ WHAT = tuple(name for names in OPTION_GROUPS.values() for name in names)
 
 
 @_with_table
-@command_of(public.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
+@command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
 def begin(as_json, progress, **options):
     """Create a release without generating any episodes. The options are those of `rollout`."""
     from dmcvb_gen.generate.plan import start
@@ -94,7 +94,7 @@ def begin(as_json, progress, **options):
     answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
 
 
-@command_of(public.make_part, "release", "part")
+@command_of(making.make_part, "release", "part")
 def part(release, part, as_json, workers, other_versions, only, episode_range, storage_options, progress):
     """Make part K of N of a release that was begun: every N-th shard, starting with the K-th."""
     from dmcvb_gen.generate.plan import make_plan, start
@@ -127,7 +127,7 @@ def finish(release, options, as_json):
     answer(as_json, facts, f"{store.place}: {state}", code=1 if missing else 0)
 
 
-@command_of(public.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
+@command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
 @click.option("--tasks", "count", type=click.IntRange(1), required=True, metavar="N", help="Tasks of the Slurm array.")
 @click.option("--cores", type=click.IntRange(1), default=1, show_default=True, help="Cores of each task.")
 def slurm(count, cores, as_json, progress, **options):
