@@ -8,19 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dmcvb_gen.kept import kept_njit
-from dmcvb_gen.rendering.native.lanes import (
-    BASE_BLUE,
-    BASE_GREEN,
-    BASE_RED,
-    CHUNK,
-    ROWS,
-    distinct,
-    get,
-    leaf,
-    part,
-    put,
-    stage,
-)
+from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native.layout import distinct, get, leaf, part, put, put3, stage
 from dmcvb_gen.rendering.native.lighting import aim_shadows, light_vertices
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE, SPHERE
 from dmcvb_gen.rendering.native.shading import aim, cover, set_color, shade_body, shade_plane, shade_sky
@@ -748,12 +737,7 @@ def painter(version: int):
     """`paint_frames` compiled and kept on disk under a version: numba itself looks at one file's date alone."""
 
     @kept_njit(nogil=True, error_model="numpy")
-    def paint_them(
-        looks, constants, lamps, boxes, texels, width, rays,
-        center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-        stays, shown, hidden,
-    ):  # fmt: skip
+    def paint_them(scene, frames, scratch, stays, shown, hidden):
         if version != 0:
             paint_frames(scene, frames, scratch, stays, shown, hidden)
 
@@ -764,12 +748,7 @@ def labeler(version: int):
     """`label_frames` compiled and kept on disk under a version."""
 
     @kept_njit(nogil=True, error_model="numpy")
-    def label_them(
-        looks, constants, lamps, boxes, texels, width, rays,
-        center, turn, eye, axes, lamp, rgb, look, sky,
-        inverse, number, behind, behind_number, rec, k, plane, s, jobs, color, kept,
-        depth, geom,
-    ):  # fmt: skip
+    def label_them(scene, frames, scratch, depth, geom):
         if version != 0:
             label_frames(scene, frames, scratch, depth, geom)
 

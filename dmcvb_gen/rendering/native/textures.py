@@ -11,10 +11,10 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
-from numba import njit
 from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.kept import kept_njit
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.layout import call, distinct, get, leaf, part, put
 
@@ -294,7 +294,7 @@ def sky_maker(version: int):
     one after another; see `frame.painter`.
     """
 
-    @njit(nogil=True, error_model="numpy", cache=True)
+    @kept_njit(nogil=True, error_model="numpy")
     def make(picture, across, across_weight, down, down_weight, narrow, tall, out):
         rows, columns, side = picture.shape[0], picture.shape[1], down.size
         if version != 0:
