@@ -48,10 +48,8 @@ FLOORS = (
     ("loaders",),
     ("release",),
     ("benchmarks",),
-    (
-        "commands",
-        "making",
-    ),
+    ("making",),
+    ("commands",),
     ("cli",),
 )
 """From the ground up; a module may import from its own floor (its own package there) and those below."""
