@@ -160,7 +160,7 @@ class _Download:
         if needed > free:
             raise StoreError(
                 f"{format_bytes(needed)} are needed and {format_bytes(free)} are free at {self._folder}; make room, "
-                "choose another --out, or fetch less with --only and --episodes"
+                "choose another --out, or fetch less with --only and --range"
             )
 
     def bring_shards(self, shards: Sequence[Shard]) -> None:

@@ -30,13 +30,16 @@ class Stored:
 
     def episode(self, index):
         """(length, arrays by name, "pixels" (L + 1, view, size, size, 3)), without the goal where it must be hidden."""
-        group = zarr.open_group(str(self.folder / f"{self.name}.zarr"), mode="r")
+        task, level, setting = self.name.split("/")
+        own = self.folder / f"{self.name}.zarr"  # mazes share no trajectories among settings
+        root = zarr.open_group(str(own if own.is_dir() else self.folder / f"{task}/{level}.zarr"), mode="r")
+        group, images = root["trajectories"], root[setting]
         length = int(group["length"][index])
-        root = "pixels_hidden_goal" if self.name.endswith(("hidden", "fixed")) else "pixels"
-        names = [f"{root}_{view}" for view in VIEWS] if len(self.views) > 1 else ["pixels"]
+        shown = "pixels_hidden_goal" if self.name.endswith(("hidden", "fixed")) else "pixels"
+        names = [f"{shown}_{view}" for view in VIEWS] if len(self.views) > 1 else ["pixels"]
         values = {name: group[name][index, :length] for name in ("action", "reward")}
         values["state"] = group["state"][index, : length + 1]
-        values["pixels"] = np.stack([group[name][index, : length + 1] for name in names], axis=1)
+        values["pixels"] = np.stack([images[name][index, : length + 1] for name in names], axis=1)
         return length, values, bool(group["terminated"][index])
 
 

@@ -68,12 +68,12 @@ def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):
     [folder] = export(release, "lerobot", tmp_path / "all", ["*/hidden", "*/fixed"], merge=True)
     assert folder == tmp_path / "all"
     info = json.loads((folder / "meta/info.json").read_text())
-    lengths = [stored[f"ant-maze-tiny/random/{goal}"].episode(i)[0] for goal in ("hidden", "fixed") for i in range(2)]
+    lengths = [stored[f"ant-maze-tiny/random/{goal}"].episode(i)[0] for goal in ("fixed", "hidden") for i in range(2)]
     assert info["total_episodes"] == 4 and info["total_frames"] == sum(lengths)
     table = pq.read_table(folder / "data/chunk-000/file-000.parquet")
     np.testing.assert_array_equal(table["index"], np.arange(sum(lengths)))
     rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [row["tasks"][0].rpartition("(")[2] for row in rows] == ["random, hidden)"] * 2 + ["random, fixed)"] * 2
+    assert [row["tasks"][0].rpartition("(")[2] for row in rows] == ["random, fixed)"] * 2 + ["random, hidden)"] * 2
     with pytest.raises(DmcvbError, match="--merge is not for npz; it is for lerobot"):
         export(release, "npz", tmp_path / "x", merge=True)
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import minari
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from minari.cli import app
 from PIL import Image
 from typer.testing import CliRunner as TyperRunner
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.export.references import reference_returns
@@ -78,7 +76,7 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
             picture.save(tmp_path / "videos" / split / "one" / f"{frame}.png")
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "static", "episodes": 1, "max_steps": 3}
     recipe = small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "videos"), split="val", size=32)
-    videos = roll_out(recipe, tmp_path / "r").subsets[0].backgrounds["source"]
+    videos = roll_out(recipe, tmp_path / "r").manifest.subsets[0].backgrounds["source"]
     export(str(tmp_path / "r"), "minari", tmp_path / "out")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     dataset = minari.load_dataset("dmcvb_gen/walker-walk/random-static-v0")
@@ -94,25 +92,6 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
     assert np.abs(color - episode.observations["pixels"][0, 0].mean(axis=0)).max() < 5
 
 
-@pytest.mark.parametrize("goal", ["visible", "hidden"])
-def test_the_environment_shows_the_goal_as_the_data_were_painted(goal, tmp_path, monkeypatch):
-    asked = [f"--goal={setting}" for setting in ("visible", "hidden")]
-    asked += ["--level=random", "--episodes=1", "--max-steps=3", "--size=16", "--no-pixels", "--goal=fixed1"]
-    for command in (
-        ["rollout", "ant-maze-empty7x7", *asked, f"--out={tmp_path / 'r'}"],
-        ["paint", str(tmp_path / "r"), f"--goal={goal}"],
-    ):
-        result = CliRunner().invoke(main, command)
-        assert result.exit_code == 0, result.output
-    export(str(tmp_path / "r"), "minari", tmp_path / "out")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
-    for setting in ("visible", "hidden", "fixed"):
-        env = minari.load_dataset(f"dmcvb_gen/ant-maze-empty7x7/random-{setting}-v0").recover_environment()
-        assert env.unwrapped._stage.pictures.hide_goal == (goal == "hidden")
-        assert bool(env.unwrapped._stage.pairs) == (setting == "fixed")
-        env.close()
-
-
 def test_references_are_of_episodes_as_long_as_the_datas(maze_release, tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 10}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "short")
@@ -120,7 +99,7 @@ def test_references_are_of_episodes_as_long_as_the_datas(maze_release, tmp_path)
     record = release["walker-walk/random/none"].record
     assert reference_returns(release, record) == {}  # the package's expert was measured over 500 steps
     expert = record.model_copy(update={"level": "expert"})
-    release.subsets["x"] = type(release["walker-walk/random/none"])("x", expert, {}, {})
+    release.subsets["x"] = type(release["walker-walk/random/none"])(release, expert)
     release.subsets["x"].__dict__["returns"] = np.array([15.0])
     found = reference_returns(release, record)
     assert found["ref_max_score"] == 15 and 0 < found["ref_min_score"] < 10

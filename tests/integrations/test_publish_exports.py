@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -33,8 +34,8 @@ def test_an_export_arrives_whole_and_is_mixed_with_nothing(to, stored, tmp_path)
     (there / "LICENSE").write_text("mine")  # no data, whatever the format's files are called
     again = publish_export(folder, f"file://{there}")
     assert again.moved == 0 and again.files == len(content(folder))
-    data = next(path for path in content(folder) if "." in path and not path.rpartition("/")[2].startswith("."))
-    left = f"left-by-another.{data.rpartition('.')[2]}"
+    data = next(path for path in map(Path, content(folder)) if path.suffix and not path.name.startswith("."))
+    left = f"left-by-another{data.suffix}"
     (there / left).write_bytes(b"of a larger export")
     with pytest.raises(StoreError, match=f"{left}.*give another URL"):
         publish_export(folder, f"file://{there}")

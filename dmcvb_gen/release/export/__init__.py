@@ -136,7 +136,7 @@ def _episodes(release: Release, name: str, asked: tuple[int, int] | None) -> tup
     if missing:
         raise StoreError(
             f"{name} has {len(wanted) - len(missing)} of {len(wanted)} episodes here, episode {missing[0]} is not; "
-            "finish the rollout or fetch the rest, or name what is here with --only and --episodes"
+            "finish the rollout or fetch the rest, or name what is here with --only and --range"
         )
     return tuple(wanted)
 

@@ -1,0 +1,282 @@
+"""DMC-VB's published folders come in whole: imports of locomotion and mazes, read, checked, exported, refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dmcvb_gen
+from dmcvb_gen.cli import main
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.repaint import Repainting, repaint
+from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.export import export
+from dmcvb_gen.release.import_tfds import import_tfds
+from dmcvb_gen.release.statistics import level_statistics
+from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
+from dmcvb_gen.release.verify import verify
+from dmcvb_gen.tasks import get_task
+
+NAME = "walker-walk/random/static"
+
+
+@pytest.fixture(scope="module")
+def episodes(small_release):
+    subset = Release.open(small_release)[NAME]
+    return [subset.episode(index) for index in range(3)]
+
+
+@pytest.fixture(scope="module")
+def rlds(small_release, tmp_path_factory):
+    """Episodes 0 and 1 of the static subset as TFDS has them."""
+    [folder] = export(small_release, "rlds", tmp_path_factory.mktemp("rlds"), [NAME], (0, 2))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def imported(rlds, tmp_path_factory):
+    """A release imported from a folder in DMC-VB's layout: locomotion/<task>/<level>/<setting>."""
+    root = tmp_path_factory.mktemp("dmc_vb")
+    target = root / "locomotion/walker_walk/random/static_medium"
+    target.parent.mkdir(parents=True)
+    shutil.copytree(rlds, target)
+    result = CliRunner().invoke(main, ["import", str(root / "locomotion"), "--out", str(root / "release")])
+    assert result.exit_code == 0 and f"{NAME}: 2 episodes" in result.output
+    return root / "release"
+
+
+def test_dmc_vbs_folders_are_imported_whole(imported, episodes):
+    release = dmcvb_gen.open(imported)
+    assert list(release.subsets) == [NAME] and not release.shortfalls
+    for index in range(2):
+        found = release[NAME].episode(index)
+        for name in ("pixels", "state", "action", "reward", "discount", "length", "terminated", "return"):
+            np.testing.assert_array_equal(found[name], episodes[index][name])
+    assert verify(imported).sound
+    assert next(release[NAME].batches(16))["pixels"].shape == (16, 9, 16, 16)
+    with pytest.raises(StoreError, match="was imported"):
+        Regeneration(imported).check()
+    with pytest.raises(StoreError, match="was imported"):
+        repaint(Repainting(imported, imported.parent / "x", size=8))
+
+
+def test_an_imported_release_keeps_its_pictures(imported, tmp_path):
+    """Nobody could paint them again."""
+    command = ["publish", str(imported), f"file:{tmp_path / 'there'}", "--no-pixels"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2 and "publish it with them, without --no-pixels" in result.output
+    assert len(result.output.strip().splitlines()) == 1 and not (tmp_path / "there").exists()
+    assert not list(imported.parent.glob(".*-light*"))
+    with pytest.raises(StoreError, match="was imported.*without paint"):
+        dmcvb_gen.open(str(imported), paint=True)
+
+
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_an_imported_release_is_exported_to_lerobot(imported, dmcvb_mazes, tmp_path, family):
+    folder = imported
+    if family == "mazes":
+        import_tfds(dmcvb_mazes, folder := tmp_path / "r")
+    for out in export(str(folder), "lerobot", tmp_path / "out"):
+        info = json.loads((out / "meta/info.json").read_text())
+        assert info["fps"] == 20
+
+
+def check_imported_card(folder):
+    """Its card is written, fits, and claims nothing that it has not."""
+    write_card(folder)
+    assert check_card(folder) == []
+    text, metadata = (folder / "README.md").read_text(), (folder / "croissant.json").read_text()
+    assert "Imported by dmcvb-gen" in text and "those of the imported data" in text
+    for claim in ("regenerate", "full physics states", "`exogenous/`", "`physics`", "None samples", "seed None"):
+        assert claim not in text, claim
+    assert "exogenous/style" not in text
+    assert "can be made again from them" not in metadata and "roll out" not in metadata
+    return level_statistics(Release.open(folder))
+
+
+def test_the_card_of_imported_locomotion(imported, small_release, tmp_path):
+    shutil.copytree(imported, tmp_path / "r")
+    [found], [made] = check_imported_card(tmp_path / "r"), level_statistics(Release.open(small_release))
+    assert found.speed == pytest.approx(made.speed, rel=0.2) and found.height == pytest.approx(made.height, rel=0.1)
+
+
+def test_the_card_of_imported_mazes(dmcvb_mazes, small_mazes, tmp_path):
+    import_tfds(dmcvb_mazes, tmp_path / "r")
+    [found], ours = check_imported_card(tmp_path / "r"), Release.open(small_mazes)["ant-maze-tiny/random/fixed"]
+    place = get_task(ours.task).state_slices["walker_position"]
+    walked = [np.diff(ours.episode(int(e))["state"][:, place][:, :2], axis=0) for e in ours.episodes]
+    assert found.speed == pytest.approx(np.linalg.norm(np.concatenate(walked), axis=1).mean() / 0.05)
+
+
+def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):
+    with pytest.raises(StoreError, match="no features.json"):
+        import_tfds(tmp_path, tmp_path / "r")
+    shutil.copytree(rlds, tmp_path / "somewhere")
+    with pytest.raises(StoreError, match="--task"):
+        import_tfds(tmp_path / "somewhere", tmp_path / "r")
+    [path] = (tmp_path / "somewhere").rglob("*.tfrecord-*")
+    data = path.read_bytes()
+    what = dict(task="walker-walk", level="random", setting="static")
+    for damaged in (data[:-100], data[:5000] + b"x" + data[5001:], b"not records at all"):
+        path.write_bytes(damaged)
+        with pytest.raises(StoreError, match="damaged"):
+            import_tfds(tmp_path / "somewhere", tmp_path / "r", **what)
+
+
+@pytest.fixture(scope="module")
+def dmcvb_mazes(small_mazes, tmp_path_factory):
+    """Maze folders as DMC-VB has them: 165 numbers (no height, no activation), fixed goals a folder a seed."""
+    root = tmp_path_factory.mktemp("dmc_vb_mazes")
+    left_out = ("steps/observation/walker/body_height", "steps/observation/target_activated")
+    for setting in ("visible", "hidden", "fixed"):
+        for episodes in ((0, 1), (1, 2)) if setting == "fixed" else ((0, 2),):
+            out = root / f"made_{setting}_{episodes[0]}"
+            [made] = export(str(small_mazes), "rlds", out, [f"*/{setting}"], episodes)
+            for file in made.rglob("*.tfrecord*"):
+                examples = [read_example(file, *place) for place in offsets(file)]
+                thinned = [{k: v for k, v in example.items() if k not in left_out} for example in examples]
+                assert all(len(t) == len(e) - 2 for t, e in zip(thinned, examples, strict=True))
+                file.write_bytes(b"".join(record(encode_example(example)) for example in thinned))
+            place = f"antmaze_random_{setting}_goal/empty7x7/expert"
+            place = f"antmaze_fixed_hidden_goal/empty7x7/{episodes[0]}" if setting == "fixed" else place
+            (root / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(made, root / place)
+            shutil.rmtree(out)
+    return root
+
+
+def test_dmc_vbs_mazes_are_imported_by_the_names_of_their_fields(dmcvb_mazes, small_mazes, tmp_path):
+    import_tfds(dmcvb_mazes, tmp_path / "r")
+    release, ours = dmcvb_gen.open(str(tmp_path / "r")), Release.open(small_mazes)
+    assert len(release.subsets) == 3 and not release.shortfalls
+    for setting in ("visible", "hidden", "fixed"):
+        subset, made = release[f"ant-maze-empty7x7/expert/{setting}"], ours[f"ant-maze-tiny/random/{setting}"]
+        assert subset.record.hidden_goal == (setting != "visible") and subset.record.views == made.record.views
+        assert subset.record.fixed_goals == (2 if setting == "fixed" else None)
+        root = "pixels" if setting == "visible" else "pixels_hidden_goal"
+        assert set(subset.pixel_arrays) == {f"{root}/{view}" for view in made.record.views}
+        for index in range(2):
+            found, expected = subset.episode(index), made.episode(index)
+            for name in (*subset.pixel_arrays, "state", "action", "reward", "discount", "terminated", "goal_pair"):
+                np.testing.assert_array_equal(found[name], expected[name])
+        batch = next(subset.batches(8, pictures=["top"]))
+        assert batch["pixels"].shape == (8, 9, 16, 16) and batch["state"].shape == (8, 167)
+    result = verify(tmp_path / "r")
+    assert result.sound, result.findings
+
+
+def split_files(folder, count):
+    """The one TFRecord file of a folder as `count` files, an episode or none each; gives their paths."""
+    [whole] = folder.rglob("*.tfrecord-*")
+    data = [record(encode_example(read_example(whole, *place))) for place in offsets(whole)]
+    stem = whole.name.rsplit("-", 3)[0]
+    whole.unlink()
+    files = [whole.with_name(f"{stem}-{number:05d}-of-{count:05d}") for number in range(count)]
+    for number, file in enumerate(files):
+        file.write_bytes(data[number] if number < len(data) else b"")
+    return files
+
+
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_folders_that_lack_files_are_imported_only_when_asked(rlds, dmcvb_mazes, tmp_path, family):
+    mazes = family == "mazes"
+    place = "antmaze_random_visible_goal/empty7x7/expert" if mazes else "locomotion/walker_walk/random/static_medium"
+    shutil.copytree(dmcvb_mazes / place if mazes else rlds, tmp_path / place)
+    files = split_files(tmp_path / place, 3)
+    for missing, out in ((files[0], "without_first"), (files[1], "without_second")):
+        hidden = missing.rename(tmp_path / "away")
+        number = files.index(missing)
+        command = ["import", str(tmp_path / place.split("/")[0]), "--out", str(tmp_path / out)]
+        refused = CliRunner().invoke(main, command)
+        assert refused.exit_code == 2 and f"2 of 3 files (number {number} is missing)" in refused.output
+        assert not (tmp_path / out).exists()
+        assert CliRunner().invoke(main, [*command, "--partial"]).exit_code == 0
+        again = CliRunner().invoke(main, [*command, "--partial"])
+        assert again.exit_code == 0 and "1 episode" in again.output
+        hidden.rename(missing)
+        before = (tmp_path / out / "manifest.json").read_bytes()
+        other = CliRunner().invoke(main, command)
+        assert other.exit_code == 2 and "choose another --out" in other.output
+        assert (tmp_path / out / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_an_import_has_the_time_limit_of_its_episodes(family, tmp_path):
+    if family == "mazes":
+        task, setting, place = "ant-maze-empty7x7", "--goal=hidden", "antmaze_random_hidden_goal/empty7x7/random"
+    else:
+        task, setting, place = "cheetah-run", "--distractor=static", "locomotion/cheetah_run/random/static_medium"
+    made = ["rollout", task, "--level=random", setting, "--episodes=2", "--max-steps=7", "--size=16"]
+    assert CliRunner().invoke(main, [*made, f"--out={tmp_path / 'made'}"]).exit_code == 0
+    [folder] = export(str(tmp_path / "made"), "rlds", tmp_path / "out")
+    (tmp_path / place).parent.mkdir(parents=True)
+    shutil.move(folder, tmp_path / place)
+    import_tfds(tmp_path / place.split("/")[0], tmp_path / "r")
+    assert [record.max_steps for record in Release.open(tmp_path / "r").manifest.subsets] == [7]
+    result = verify(tmp_path / "r")
+    assert result.sound, result.findings
+
+
+def test_fixed_goals_of_unequal_numbers_of_episodes_are_all_found(dmcvb_mazes, small_mazes, tmp_path):
+    place = "antmaze_fixed_hidden_goal"
+    shutil.copytree(dmcvb_mazes / place, tmp_path / place)
+    first, _ = sorted((tmp_path / place).rglob("*.tfrecord-*"))
+    first.write_bytes(first.read_bytes() * 3)
+    import_tfds(tmp_path / place, tmp_path / "r")
+    [subset] = dmcvb_gen.open(tmp_path / "r").subsets.values()
+    assert subset.read("goal_pair").tolist() == [0, 0, 0, 1]
+    made = Release.open(small_mazes)["ant-maze-tiny/random/fixed"]
+    for pair in (0, 1):
+        target = get_task(made.task).state_slices["target_position"]
+        row = int(np.flatnonzero(subset.read("goal_pair") == pair)[0])
+        np.testing.assert_array_equal(subset.episode(row)["state"][0, target], made.episode(pair)["state"][0, target])
+
+
+def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path):
+    shutil.copytree(dmcvb_mazes / "antmaze_random_hidden_goal/empty7x7/expert", tmp_path / "x")
+    with pytest.raises(StoreError, match="antmaze_fixed_hidden_goal/empty7x7/<seed>"):
+        import_tfds(tmp_path / "x", tmp_path / "r")
+    what = dict(task="ant-maze-empty7x7", level="expert")
+    with pytest.raises(StoreError, match="no image observation/lowres_top_camera;"):
+        import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="visible")
+    import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="hidden")
+
+
+def test_a_feature_that_is_none_is_refused_in_one_line(tmp_path):
+    steps = {"featuresDict": {"features": {"reward": [1, 2]}}}
+    tree = {"featuresDict": {"features": {"steps": {"sequence": {"feature": steps}}}}}
+    (tmp_path / "features.json").write_text(json.dumps(tree))
+    with pytest.raises(StoreError, match="features.json does not describe RLDS steps"):
+        import_tfds(tmp_path, tmp_path / "out", task="walker-walk", level="expert", setting="none")
+
+
+def test_fixed_goals_exported_to_rlds_keep_their_pairs(small_mazes, tmp_path):
+    [made] = export(str(small_mazes), "rlds", tmp_path / "out", ["*/fixed"])
+    import_tfds(made, tmp_path / "r", task="ant-maze-empty7x7", level="random", setting="fixed")
+    [subset] = dmcvb_gen.open(tmp_path / "r").subsets.values()
+    assert subset.read("goal_pair").tolist() == [0, 1]
+    assert (subset.record.fixed_goals, subset.record.episodes_per_goal) == (2, 1)
+
+
+def test_the_time_limit_is_that_of_a_late_episode_if_the_first_ones_reach_the_goal(dmcvb_mazes, tmp_path):
+    place = "antmaze_random_visible_goal/empty7x7/expert"
+    shutil.copytree(dmcvb_mazes / place, tmp_path / place)
+    [file] = (tmp_path / place).rglob("*.tfrecord-*")
+    example = read_example(file, *next(iter(offsets(file))))
+    steps = {name: value for name, value in example.items() if name.startswith("steps/")}
+    count = len(steps["steps/reward"])
+    short = {name: value[: len(value) * 3 // count] for name, value in steps.items()}  # two transitions
+    short |= {"steps/is_terminal": np.array([0, 0, 1])}
+    cut = {name: value[: len(value) * 5 // count] for name, value in steps.items()}
+    cut |= {"steps/is_terminal": np.zeros(5, int)}
+    few = record(encode_example(short)), record(encode_example(cut))
+    file.write_bytes(few[0] * 25 + few[1])
+    import_tfds(tmp_path / place.split("/")[0], tmp_path / "r")
+    [subset] = Release.open(tmp_path / "r").subsets.values()
+    assert subset.record.max_steps == 4 and subset.read("length").tolist() == [2] * 25 + [4]
