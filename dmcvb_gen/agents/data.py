@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from dmcvb_gen.agents.learners import Batch
+from dmcvb_gen.arithmetic import to_unit
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.pictures import training_pictures
 from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable

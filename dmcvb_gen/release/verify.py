@@ -250,6 +250,7 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
     subset, backgrounds = work
     tick(subset.name)
     try:
+        from dmcvb_gen.distractors.registry import distractors_of
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
     except ModuleNotFoundError as error:

@@ -357,7 +357,7 @@ def test_without_held_out_episodes_there_is_no_test_loss():
 def test_agents_learn_actions_in_unit_bounds_from_data_with_the_tasks_own(tmp_path):
     pattern = {"tasks": "quadruped-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 4}
     roll_out(make_recipe({"name": "r", "size": 16, "subsets": [pattern]}), tmp_path / "r")
-    release = open_release(tmp_path / "r")
+    release = Release.open(tmp_path / "r")
     [subset] = release.subsets.values()
     spec = suite.load("quadruped", "walk").action_spec()
     attributes, action = subset.array("action").attributes, subset.read("action")[:, :-1]

@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp, kstest
 from dmcvb_gen import spec
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, registry, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
 from dmcvb_gen.errors import UnknownNameError
