@@ -6,6 +6,8 @@ draws episodes in a shuffled order, holds `buffer` of them in memory, and mixes 
 costs a tenth of reading single frame stacks.
 """
 
+from __future__ import annotations
+
 import itertools
 import threading
 from collections.abc import Iterator, Sequence
@@ -17,7 +19,6 @@ from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.steps import Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Count, Seed, checked
 from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.parallel.memory import UNKNOWN_MEMORY, free_memory
 
@@ -28,6 +29,17 @@ Steps = dict[str, np.ndarray]
 Views = Sequence[str] | Literal["agents"] | None
 """Views (or their arrays), in this order; None: all that the subset shows; "agents": those that agents see and
 `dmcvb_gen.evaluate` gives, which are all but the overhead view of mazes; (): states alone."""
+
+
+def check_count(name: str, value: int, least: int = 1) -> int:
+    """Return `value` if it is a whole number, and at least so large.
+
+    Raises:
+      DmcvbError: it is not.
+    """
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise DmcvbError(f"{name} is {value!r}; give a whole number of at least {least}")
+    return int(value)
 
 
 class StepSource:
@@ -50,17 +62,16 @@ class StepSource:
       UnknownNameError: no such view. StoreError: no such episode.
     """
 
-    @checked
     def __init__(
         self,
         subset: Subset,
         episodes: Sequence[int] | None = None,
         pictures: Views = None,
-        stack: Count = 3,
+        stack: int = 3,
         next_step: bool = False,
         in_memory: bool | None = None,
     ):
-        self.subset, self.stack, self.next_step = subset, stack, next_step
+        self.subset, self.stack, self.next_step = subset, check_count("stack", stack), next_step
         self.pictures = shown(subset, pictures).arrays
         self.episodes = subset.choose(episodes)
         lengths = subset.read("length", self.episodes)
@@ -123,19 +134,18 @@ class StepSource:
         return table.gather(np.array([step - first]), self.stack, self.next_step)
 
 
-@checked
 def stream(
     subset: Subset,
     *,
-    batch_size: Count | None = None,
+    batch_size: int | None = None,
     episodes: Sequence[int] | None = None,
     pictures: Views = None,
-    stack: Count = 3,
+    stack: int = 3,
     next_step: bool = False,
     shuffle: bool = True,
-    seed: Seed = 0,
-    epoch: Seed = 0,
-    buffer: Count = 32,
+    seed: int = 0,
+    epoch: int = 0,
+    buffer: int = 32,
     rank: int = 0,
     world: int = 1,
     worker: int = 0,
@@ -156,6 +166,11 @@ def stream(
     Raises:
       DmcvbError: a number that is too small or not whole, or fewer episodes than ranks.
     """
+    counts = {"stack": stack, "buffer": buffer, "batch_size": 1 if batch_size is None else batch_size}
+    for name, value in counts.items():
+        check_count(name, value)
+    for name, value in {"seed": seed, "epoch": epoch}.items():
+        check_count(name, value, least=0)
     names = shown(subset, pictures).arrays
     order = subset.choose(episodes)
     if shuffle:

@@ -4,6 +4,8 @@ The file holds everything: pictures as WebP sheets, curves as 16-bit integers, a
 that the release does not store are painted while the file is written.
 """
 
+from __future__ import annotations
+
 import base64
 import hashlib
 import io
@@ -26,7 +28,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
-from dmcvb_gen.options import Count, checked
+from dmcvb_gen.loaders.sampler import check_count
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
@@ -64,15 +66,14 @@ class Written:
     stride: int
 
 
-@checked
 def view(
     path: str,
     out: str | Path | None = None,
     *,
     only: Sequence[str] = (),
-    episodes: Count | None = None,
+    episodes: int | None = None,
     size: int | None = None,
-    max_bytes: Count = MAX_BYTES,
+    max_bytes: int = MAX_BYTES,
     storage_options: dict | None = None,
     progress: ProgressCallback = ignore,
 ) -> Written:
@@ -95,6 +96,9 @@ def view(
     """
     if not out and is_url(path):
         raise StoreError(f"{shown_place(path)} is a URL: say with --out where to write the file")
+    for name, value in {"episodes": episodes, "max_bytes": max_bytes}.items():
+        if value is not None:
+            check_count(name, value)
     target = local_path(out) if out else None
     release = open_for_reading(path, storage_options)
     names = [name for name in release.select(list(only)) if name in release]
