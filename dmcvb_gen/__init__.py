@@ -74,7 +74,7 @@ def evaluate(policy: Any, where: str, **options: Any) -> Score:
     policy gets and gives, and for all options.
 
     Raises:
-      DmcvbError: no such task or setting, or actions that have another shape, are no numbers or leave [-1, 1].
+      DmcvbError: no such task or setting, or actions that have another shape, are no numbers or leave their bounds.
     """
     from dmcvb_gen.benchmarks.evaluate import evaluate as run
 

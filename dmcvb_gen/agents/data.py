@@ -180,7 +180,7 @@ class TrainingData:
 
     Attributes:
       state: (row, state) float32, normalized.
-      action: (row, action) float32. reward, discount: (row,) float32.
+      action: (row, action) float32 in [-1, 1], whatever the task's bounds. reward, discount: (row,) float32.
       start, end: (row,) long, first and last row of the row's episode.
       normalization: normalization of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.

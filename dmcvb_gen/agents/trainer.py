@@ -44,8 +44,7 @@ class Budget:
 
     Attributes:
       name: e.g. "quick". note: printed wherever a score stands. scores: True if its scores mean anything.
-      pixel_steps: Adam steps of a policy that trains its own encoder on pictures.
-      pretrain_steps: Adam steps of a pre-trained encoder. frozen_steps: of a policy on a frozen encoder.
+      pixel_steps: Adam steps of an encoder, and of a policy that sees pictures, on its own or on a frozen encoder.
       state_steps: Adam steps of an agent that sees states.
       readout_steps: Adam steps of each decoder on a frozen encoder; 0: no inspection.
       evaluations: online evaluations, evenly over a policy's training. Of several the best one counts, as in the paper,
@@ -71,8 +70,6 @@ class Budget:
 
     name: str
     pixel_steps: int = 400_000
-    pretrain_steps: int = 400_000
-    frozen_steps: int = 400_000
     state_steps: int = 400_000
     readout_steps: int = 400_000
     evaluations: int = 20
@@ -105,7 +102,7 @@ class Budget:
         """The same with every training `factor` times as long, and a name that says so."""
         if factor == 1:
             return self
-        kinds = ("pixel_steps", "pretrain_steps", "frozen_steps", "state_steps", "readout_steps")
+        kinds = ("pixel_steps", "state_steps", "readout_steps")
         steps = {name: max(1, round(getattr(self, name) * factor)) for name in kinds}
         name = f"{self.name} x{factor:g}"
         return replace(self, name=name, note=f"{name}: {factor:g} times the steps of {self.note}", **steps)

@@ -265,9 +265,7 @@ def policy_steps(budget: Budget, agent: Agent) -> int:
     """Adam steps of a cell's policy; those of a user's own agent are not known."""
     if agent.own:
         return 0
-    if agent.sees_state:
-        return budget.state_steps
-    return budget.frozen_steps if agent.pretrain else budget.pixel_steps
+    return budget.state_steps if agent.sees_state else budget.pixel_steps
 
 
 class CellRun:
@@ -352,7 +350,7 @@ class CellRun:
         torch.manual_seed(budget.seed)
         encoder = make_encoder(agent, data.sizes, architecture=budget.network)
         learner = make_pretrainer(agent, encoder, data.sizes, budget.network).to(budget.device)
-        steps, label = budget.pretrain_steps, f"{agent.pretrain} encoder of {self.cell.task}"
+        steps, label = budget.pixel_steps, f"{agent.pretrain} encoder of {self.cell.task}"
         curve = self._fit(learner, data, steps, budget.shifts(steps, len(data)), label)
         with replacing(self.path(".safetensors")) as path:
             save_file({name: value.cpu().contiguous() for name, value in encoder.state_dict().items()}, str(path))
@@ -696,7 +694,7 @@ def planned_steps(budget: Budget, cells: Sequence[Cell]) -> int:
     encoders = {cell.encoder for cell in cells} - {None}
     decoders = sum(2 * budget.readout_steps for cell in cells if not (cell.agent.sees_state or cell.agent.own))
     policies = sum(policy_steps(budget, cell.agent) for cell in cells)
-    return policies + decoders + len(encoders) * budget.pretrain_steps
+    return policies + decoders + len(encoders) * budget.pixel_steps
 
 
 def default_workers(device: str) -> int:

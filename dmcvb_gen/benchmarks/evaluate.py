@@ -362,7 +362,8 @@ def evaluate(
 
     Args:
       policy: takes {"pixels": (episode, stack x view x 3, size, size) uint8, "state": (episode, state) float32} and
-        gives (episode, action) in [-1, 1], as a numpy array or anything that numpy can read.
+        gives (episode, action) in the task's bounds, [-1, 1] for most, as a numpy array or anything that numpy can
+        read.
       where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible".
       episodes: number of episodes, each run once.
       seed: seed of starts and distractors; `validate` has 0. Each setting has starts of its own.
@@ -379,8 +380,8 @@ def evaluate(
       A `Score`: mean, stderr and returns; of mazes also success and speed.
 
     Raises:
-      DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave [-1, 1],
-        or observations of another kind than the policy's.
+      DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave their
+        bounds, or observations of another kind than the policy's.
     """
     stack = _own_value(policy, "stack", stack, 3)
     pixels = _own_value(policy, "pixels", pixels, True)

@@ -53,16 +53,24 @@ DEFAULT_EPISODES = 100
 DEFAULT_SIZE = 64
 """Pixels a side if a rollout is not told another size."""
 
-# Encoders and policies take as many steps as BC does end to end, so that agents are compared at equal updates; a policy
-# on a frozen encoder costs a seventh of an update, as its latents are computed once.
+SHORT = dict(
+    readout_steps=500,
+    evaluations=1,
+    batch_size=64,
+    network=PATCHES,
+    shift_from=10.0,
+    frozen_shift=False,
+    decay=True,
+)
+"""What the budgets for a CPU share. A policy on a frozen encoder costs them a seventh of an update, as its latents are
+computed once.
+"""
 BUDGETS = {
     budget.name: budget
     for budget in (
         Budget(
             "smoke",
             pixel_steps=3,
-            pretrain_steps=3,
-            frozen_steps=3,
             state_steps=3,
             readout_steps=2,
             evaluations=1,
@@ -77,38 +85,22 @@ BUDGETS = {
         Budget(
             "brief",
             pixel_steps=5_000,
-            pretrain_steps=5_000,
-            frozen_steps=5_000,
             state_steps=10_000,
-            readout_steps=500,
-            evaluations=1,
-            batch_size=64,
-            network=PATCHES,
             rate=2.0,
-            shift_from=10.0,
-            frozen_shift=False,
-            decay=True,
             note="brief: a small network of 4x4 patches and frame differences, 0.3 % of the paper's samples (2.5 % of "
             "states), random shifts only from ten passes over the data on, twice the rate, falling; scores are not "
             "comparable with the paper's",
+            **SHORT,
         ),
         Budget(
             "quick",
             pixel_steps=16_000,
-            pretrain_steps=16_000,
-            frozen_steps=16_000,
             state_steps=40_000,
-            readout_steps=500,
-            evaluations=1,
-            batch_size=64,
-            network=PATCHES,
-            shift_from=10.0,
-            frozen_shift=False,
-            decay=True,
             muon=True,
             note="quick: a small network of 4x4 patches and frame differences, 1 % of the paper's samples (10 % of "
             "states), Muon instead of Adam, a falling rate, random shifts only from ten passes over the data on; "
             "scores are not comparable with the paper's",
+            **SHORT,
         ),
         Budget("paper", note="paper: 400k steps, batch 256, 30 episodes every 20k steps, as published"),
     )

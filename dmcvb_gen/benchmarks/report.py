@@ -27,7 +27,6 @@ import numpy as np
 import torch
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.trainer import Budget
@@ -61,7 +60,7 @@ CHECKS = {
     "shapes": "arrays have their shapes and types",
     "lengths": "lengths, discounts and ends agree",
     "finite": "all values are finite",
-    "actions": "actions lie in [-1, 1]",
+    "actions": "actions lie in their bounds",
     "returns": "returns are the sums of the rewards, in range, and as the policies' files say",
     "duplicates": "no two episodes are the same",
     "states": "physics states give the stored states",
@@ -85,8 +84,6 @@ SAMPLES = 2_000
 FEWEST = 3
 """Cells below which a rank correlation says nothing."""
 DPI = 110
-FEW_RETURNS = 20
-"""Fewer episodes are drawn as a mark each: bars would look like a distribution."""
 
 
 # -- the validation ---------------------------------------------------------------------------------
@@ -226,7 +223,7 @@ def validate(
     planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
     facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
     facts |= {"seconds": time.perf_counter() - started}
-    page = write_report(Path(out), facts, chosen, shown)
+    page = write_report(Path(out), facts, shown)
     there, asked = (facts["episodes"][name] for name in ("there", "asked"))
     json_file = page.with_suffix(".json")
     return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), page, json_file)
@@ -298,13 +295,13 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
 # -- facts ------------------------------------------------------------------------------------------
 
 
-def write_report(folder: Path, facts: Mapping[str, Any], release: Release, results: Results) -> Path:
+def write_report(folder: Path, facts: Mapping[str, Any], results: Results) -> Path:
     """Write report.html, .md and .json into a folder; gives the path of the page."""
     page = folder / "report.html"
     write_json(page.with_suffix(".json"), facts)
     write_text(page.with_suffix(".md"), render_tables(facts))
     good = [(cell, result) for cell, result in results if "error" not in result]
-    write_text(page, render_page(facts, release, good, folder))
+    write_text(page, render_page(facts, good, folder))
     return page
 
 
@@ -360,7 +357,7 @@ def compare(cell: Cell, results: Results) -> dict[str, Any]:
     times" -40) the difference stands.
 
     Returns:
-      share, paper_share: shares of the reference's score, ours and the paper's; None if there is none.
+      share: share of the reference's score; None if there is none.
       difference: from the reference's score; None if there is none.
       reference: words for what it refers to.
     """
@@ -369,15 +366,11 @@ def compare(cell: Cell, results: Results) -> dict[str, Any]:
     like = [other for other in scores if (other.benchmark, other.task) == (cell.benchmark, cell.task)]
     found = [scores[other] for other in like if benchmark.is_reference(other, cell)]
     shares = get_task(cell.task).return_range[0] >= 0
-    ours = paper = difference = None
+    share = difference = None
     if found:
         difference = scores[cell] - found[0]
-        ours = scores[cell] / found[0] if shares and found[0] > 0 else None
-    published = benchmark.paper_score(cell)
-    if shares and published:
-        whole = paper_score(cell.task, cell.policy_label, cell.setting, "bc(state)")
-        paper = published[0] / whole[0] if whole else None
-    return {"share": ours, "paper_share": paper, "difference": difference, "reference": benchmark.reference(cell)}
+        share = scores[cell] / found[0] if shares and found[0] > 0 else None
+    return {"share": share, "difference": difference, "reference": benchmark.reference(cell)}
 
 
 def comparison(budget: Budget, results: Results) -> dict[str, list[dict[str, Any]]]:
@@ -430,7 +423,7 @@ def rank_correlation(returns: Sequence[np.ndarray], paper: Sequence[float], seed
 # -- the page ---------------------------------------------------------------------------------------
 
 
-def render_page(facts: Mapping[str, Any], release: Release, good: Results, folder: Path) -> str:
+def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
     """The page of a report, self-contained.
 
     Args:
@@ -439,10 +432,7 @@ def render_page(facts: Mapping[str, Any], release: Release, good: Results, folde
     name = facts["budget"]["name"]
     return _template("report.html.jinja", autoescape=True).render(
         **_tables(facts),
-        figures={
-            "returns": [figure_url(figure) for figure in return_figures(release)],
-            "curves": [figure_url(figure) for figure in curve_figures(good, name)],
-        },
+        curves=[figure_url(figure) for figure in curve_figures(good, name)],
         rollouts=_sheets(good, folder, "rollout"),
         decoders=_sheets(good, folder, "decoder"),
         inspection=_inspection(good, name),
@@ -571,8 +561,8 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[str]:
-    """An entry of a score table: mean and standard error with the budget, further lines, and the paper's."""
-    score, paper = result["score"], result["paper"]
+    """An entry of a score table: mean and standard error with the budget, and further lines."""
+    score = result["score"]
     lines = [f"{_number(score['mean'])} ± {_number(score['stderr'])} [{budget['name']}]"]
     if result["share"] is not None and budget["scores"]:
         lines.append(f"{100 * result['share']:.0f} % of {result['reference']}")
@@ -582,9 +572,6 @@ def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[s
     lines += _goal_lines(score)
     if result["labels"]["encoder"]:
         lines.append(f"encoder: {result['labels']['encoder']}")
-    if paper and budget["scores"]:  # noise is never set beside the paper's numbers
-        share = f", {100 * result['paper_share']:.0f} %" if result["paper_share"] is not None else ""
-        lines.append(f"paper {paper['mean']:.0f} ± {paper['stderr']:.0f}{share}")
     return lines
 
 
@@ -712,31 +699,6 @@ def figure_url(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     return data_url(buffer.getvalue())
-
-
-def return_figures(release: Release) -> Iterator[Figure]:
-    """A histogram of each subset's returns, the paper's quartiles and range as a box under it."""
-    for name, returns in known_returns(release).items():
-        figure = Figure(figsize=(4, 2.4), layout="constrained")
-        axis, subset, few = figure.add_subplot(), release.subsets[name], len(returns) < FEW_RETURNS
-        if few:
-            axis.plot(returns, np.full(len(returns), 0.5), "|", color="#4477aa", markersize=14, markeredgewidth=2)
-            axis.set_ylim(-0.25, 1)
-        else:
-            axis.hist(returns, bins=30, color="#4477aa")
-            axis.yaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.set_title(name.replace("/", "\n", 1), fontsize=9)
-        axis.set(xlabel="return", ylabel="a mark an episode" if few else "episodes")
-        paper = paper_returns(subset.task, subset.level) if comparable(subset) else None
-        if paper:
-            low = -0.12 * axis.get_ylim()[1]
-            axis.plot([paper["min"], paper["max"]], [low, low], color="#cc6677", linewidth=1)
-            axis.plot([paper["p25"], paper["p75"]], [low, low], color="#cc6677", linewidth=6, solid_capstyle="butt")
-            axis.plot([paper["median"]], [low], "|", color="black", markersize=9)
-            axis.set_yticks([tick for tick in axis.get_yticks() if tick >= 0])
-        if few:
-            axis.set_yticks([])
-        yield figure
 
 
 def curve_figures(results: Results, budget: str) -> Iterator[Figure]:

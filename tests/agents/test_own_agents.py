@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from dm_control import suite
 
 import dmcvb_gen
 from dmcvb_gen import own_code
@@ -91,6 +92,15 @@ def test_wrong_actions_are_one_line_with_the_step_and_what_was_expected(actions,
     with pytest.raises(DmcvbError, match=told) as error:
         dmcvb_gen.evaluate(lambda observation: actions, "walker-walk/none", episodes=2, max_steps=2, pixels=False)
     assert len(str(error.value).splitlines()) == 1
+
+
+def test_actions_lie_in_a_tasks_own_bounds():
+    """dm_control's quadruped takes -1, -1, -0.8 to 1, 1.1, 0.8 at each leg."""
+    spec, options = suite.load("quadruped", "walk").action_spec(), dict(episodes=2, max_steps=2, pixels=False)
+    for action in (spec.minimum, spec.maximum):
+        dmcvb_gen.evaluate(lambda _, action=action: np.stack([action] * 2), "quadruped-walk/none", **options)
+    with pytest.raises(DmcvbError, match=r"is 1.01; expected \[-1, 1\], clip it"):
+        dmcvb_gen.evaluate(lambda _: np.stack([spec.maximum + 0.01] * 2), "quadruped-walk/none", **options)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -102,6 +102,8 @@ def test_an_evaluation_unlike_the_policys_data_is_refused_or_said(walkers, caplo
     (tmp_path / "clips" / "val" / "one").mkdir(parents=True)
     Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(tmp_path / "clips" / "val" / "one" / "0.png")
     dmcvb_gen.evaluate(agent, "walker-walk/dynamic", backgrounds=str(tmp_path / "clips"), **options)
-    dmcvb_gen.evaluate(agent, "walker-walk/dynamic", samples=1, **options)
-    videos, samples = caplog.messages
-    assert "has backgrounds" in videos and "has renderer" in samples and "'samples': 1" in samples
+    drawn = {"renderer": {"name": "opengl", "samples": 4}}
+    elsewhere = dataclasses.replace(agent, evaluation=agent.evaluation | drawn)
+    dmcvb_gen.evaluate(elsewhere, "walker-walk/dynamic", renderer="native", **options)
+    videos, renderer = caplog.messages
+    assert "has backgrounds" in videos and "has renderer" in renderer and "opengl" in renderer
