@@ -5,7 +5,6 @@ Pages run in the order of the site, in one folder, with one bucket. A single pag
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
@@ -19,6 +18,7 @@ import pytest
 import yaml
 
 from dmcvb_gen.cli import COMMANDS
+from dmcvb_gen.generate.shipped import load_shipped
 from dmcvb_gen.version import __version__
 
 ROOT = Path(__file__).parent.parent
@@ -147,6 +147,6 @@ def test_the_citation_has_the_project_s_own_facts():
     assert (cited["version"], cited["license"]) == (__version__, project["license"])
     assert cited["repository-code"] == project["urls"]["Repository"]
     assert cited["preferred-citation"]["url"] == project["urls"]["Paper"]
-    digest = json.loads((ROOT / "dataset_cards/dmcvb-v1/manifest.json").read_text())["digest"]
+    digest = load_shipped("dmcvb-v1").digest
     assert digest in (ROOT / "README.md").read_text()
     assert f"sha256:{digest}" in [identifier["value"] for identifier in cited["identifiers"]]

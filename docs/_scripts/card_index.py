@@ -1,7 +1,7 @@
 """Writes dataset_cards/README.md, the index of all cards, from the manifests beside them.
 
 python docs/_scripts/card_index.py
-python docs/_scripts/card_index.py --check    # exit code 1 where the index is not what the cards say
+python docs/_scripts/card_index.py --check    # exit code 1 if the index differs from the cards
 """
 
 from __future__ import annotations
@@ -11,22 +11,21 @@ import sys
 from pathlib import Path
 
 from dmcvb_gen.dataset.manifest import MANIFEST, Manifest
+from dmcvb_gen.files import sha256_file
 
 CARDS = Path(__file__).parents[2] / "dataset_cards"
 HEAD = """# Data set cards
 
 Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
-description, a contact sheet, the report's tables where it was validated, and its manifest with the digest of every
-subset; any part of a release is made from its manifest alone, and compared with the digests. `files.tar.xz` has a
-digest for every file. A manifest that is in the package too (`dmcvb-gen list` shows which) has one for every shard and
-is found by its name:
+description, a contact sheet, the report's tables if it was validated, and its manifest. The digest of a release is the
+SHA-256 of its manifest. The package has the digests of every shard by the release's name, so any part is made on your
+machine and compared:
 
 ```text
 dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --range 0:3 --out data/part
-dmcvb-gen regenerate --manifest dataset_cards/NAME/files.tar.xz --only 'SUBSET' --out FOLDER
 ```
 
-| release | version | subsets | episodes | tasks | root digest |
+| release | version | subsets | episodes | tasks | digest |
 |---|---|---|---|---|---|
 """
 
@@ -40,7 +39,7 @@ def row(folder: Path) -> str:
     report = f" ([report]({folder.name}/report.md))" if (folder / "report.md").exists() else ""
     return (
         f"| [{manifest.name}]({folder.name}/README.md){report} | {manifest.version} | {len(manifest.subsets)} "
-        f"| {episodes:,} | {tasks} ({', '.join(families)}) | `{(manifest.digest or '')[:16]}` |\n"
+        f"| {episodes:,} | {tasks} ({', '.join(families)}) | `{sha256_file(folder / MANIFEST)[:16]}` |\n"
     )
 
 
