@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import logging
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
@@ -52,6 +53,7 @@ class ZarrFiles(Store):
         path = f"{self.prefix}/{key}" if self.prefix else key
         data = await asyncio.to_thread(self.store.read_range, path, start, end - start)
         if len(data) == file.bytes and hashlib.sha256(data).hexdigest() != file.sha256:
+            _quiet()
             raise StoreError(
                 f"{self.store.place}/{path} is damaged: it does not have its SHA-256; regenerate or fetch it"
             )
@@ -69,6 +71,11 @@ class ZarrFiles(Store):
         raise NotImplementedError("arrays are read by their records alone")
 
     set = delete = list = list_prefix = list_dir = _not_offered  # type: ignore[assignment]
+
+
+def _quiet() -> None:
+    """Let Zarr's other reads end unheard: after an error, asyncio would print each as a task that was destroyed."""
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
 
 
 def _range(part: ByteRequest | None, size: int) -> tuple[int, int]:

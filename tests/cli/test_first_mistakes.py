@@ -171,7 +171,6 @@ def test_a_url_where_a_folder_is_needed_says_how_to_get_one(tmp_path):
     assert "s3://bucket/demo is a URL; give a local one, a folder or file" in run(
         "fetch", "file:x", "--out", "s3://bucket/demo", code=2
     )
-    assert "did you mean s3://bucket/demo" in run("paint", "s3:/bucket/demo", code=2)
 
 
 def test_a_manifest_is_always_compared_so_check_is_refused_at_once(small_release, tmp_path):
