@@ -87,6 +87,8 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
     if name not in allowed(variable):
         raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={name}")
     module, _, function = name.partition(":")
+    if module == "__main__":
+        raise DmcvbError(f"{kind} {name} lies in the script that runs; put it into a module that workers can import")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:

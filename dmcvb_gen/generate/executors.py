@@ -14,6 +14,7 @@ from dmcvb_gen.generate.works import Work
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.parallel.memory import free_memory
+from dmcvb_gen.tasks import check_in_workers
 from dmcvb_gen.text import format_bytes
 
 PROCESS_BYTES = 1 << 30
@@ -39,6 +40,8 @@ def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCal
     check_memory(works, workers)
     kept = "finished shards are saved: rerun the same command (fewer --episodes-per-shard need less memory)"
     alone = workers == 1 or len(works) <= 1 and isinstance(workers, int)
+    for task_id in set() if alone else {setting.record.task for work in works for setting in work.settings}:
+        check_in_workers(task_id)
     with open_pool(workers, tick=progress, kept=kept, needs=needs_of(works), most=max(len(works), 1)) as pool:
         for number, work in enumerate(works):
             pool.submit(number, run_work, work, usable_cores() if alone else 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -53,6 +53,11 @@ class Simulation:
     def returns(self) -> np.ndarray:
         """(episode,) float64: sum of the stored rewards."""
         return self.reward.astype(np.float64).sum(axis=1)
+
+    def part(self, places: slice) -> Simulation:
+        """Some of the episodes, as views."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Simulation(**{name: part if name == "seconds" else part[places] for name, part in values.items()})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """By the store's names."""
@@ -138,16 +143,33 @@ def simulate(
     out.seed[:] = [episode_seed(seed, names, int(i)) for i in chosen]
     if goal_pairs is not None:
         out.goal_pair[:] = chosen // (episodes_per_goal or 1)
+    most = task.most_at_once or max(1, len(chosen))
+    for first in range(0, len(chosen), most):
+        places = slice(first, first + most)
+        cells = None if goal_pairs is None else [goal_pairs[k] for k in out.goal_pair[places].tolist()]
+        _run(task, policies, starts[places], noise[places], cells, deterministic, threads, out.part(places))
+    return out
+
+
+def _run(
+    task: Task,
+    policies: Sequence[Policy],
+    starts: Sequence[np.random.Generator],
+    noise: Sequence[np.random.Generator],
+    cells: Sequence[tuple] | None,
+    deterministic: bool,
+    threads: int,
+    out: Simulation,
+) -> None:
+    """Simulate the episodes of `out` side by side, and fill it; see `simulate`."""
     started = time.perf_counter()
-    batch = task.batch(len(chosen), threads)
-    pairs = None if goal_pairs is None else [goal_pairs[k] for k in out.goal_pair.tolist()]
+    batch = task.batch(len(starts), threads)
     try:
-        state = batch.reset(starts) if pairs is None else batch.reset_fixed(starts, pairs)
+        state = batch.reset(starts) if cells is None else batch.reset_fixed(starts, cells)
         out.seconds["physics"] += time.perf_counter() - started
         _step_to_the_end(batch, state, policies, noise, deterministic, out)
     except EpisodeError as error:
-        raise error.of_episode(int(chosen[error.place])) from error
-    return out
+        raise error.of_episode(int(out.episodes[error.place])) from error
 
 
 class Replay(Policy):

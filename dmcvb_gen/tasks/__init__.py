@@ -40,6 +40,15 @@ def register_task(task_id: str, make: Callable[[], Task]) -> None:
     REGISTRY[task_id] = make
 
 
+def check_in_workers(task_id: str) -> None:
+    """Raises DmcvbError for a task that worker processes do not know."""
+    if task_id in REGISTRY and task_id not in LOCOMOTION_TASKS:
+        raise DmcvbError(
+            f"task {task_id} is registered in this process alone; use workers=1, name it <module>:<function>, or give "
+            f"your package an entry point {ENTRY_POINTS}"
+        )
+
+
 def task_ids() -> tuple[str, ...]:
     """The names of the tasks that are written for a batch, mazes included."""
     return LOCOMOTION_TASKS + ANT_MAZE_TASKS
@@ -93,6 +102,7 @@ __all__ = [
     "StepResult",
     "Task",
     "all_task_ids",
+    "check_in_workers",
     "get_task",
     "register_task",
     "suite_ids",

@@ -119,6 +119,8 @@ class Task(abc.ABC):
     """Fields of the state that a physics state alone does not give."""
     replayed: bool = False
     """True if a stored episode is checked by replaying its actions from its start, False if by single steps."""
+    most_at_once: int | None = None
+    """Episodes that are simulated side by side at most, for their memory; None: any number."""
     physics_spec: int = PHYSICS_SPEC
     """The `mjtState` bits that each row of the stored `physics` begins with."""
 

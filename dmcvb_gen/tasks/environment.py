@@ -53,6 +53,7 @@ class EnvironmentTask(Task):
 
     physics_spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
     replayed = True
+    most_at_once = 8  # an environment holds a model and its data: 12 MB for most of the suite, 80 for the dog
 
     def __init__(self, id: str, make: Callable[[], Any], domain: str = ""):
         self.id, self._make, self._idle = id, make, list[Any]()

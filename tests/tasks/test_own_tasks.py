@@ -137,6 +137,7 @@ def test_what_dm_control_does_is_what_is_stored(make):
 @named([*EQUAL, *SEEDED])
 def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(make):
     task, other = EnvironmentTask("t", make), EnvironmentTask("t", make)
+    task.most_at_once = 3
     many = rolled(task, [2, 0, 1, 3])
     again = rolled(other, [3])
     replayed = replay(task, many.action[3, : many.length[3]], 3, SEED, NAMES)

@@ -14,12 +14,13 @@ from dm_control import suite
 from hypothesis import given
 from hypothesis import strategies as st
 
+import dmcvb_gen
 from dmcvb_gen.arithmetic import to_unit
 from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.own_code import TASKS as ALLOWED
-from dmcvb_gen.own_code import allow
+from dmcvb_gen.own_code import allow, find_function
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, REGISTRY, get_task, register_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
@@ -228,10 +229,17 @@ def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_withou
     assert CliRunner().invoke(main, ["verify", str(tmp_path / "r")]).exit_code == 3
 
 
-def test_a_third_party_registers_a_task():
+def test_a_third_party_registers_a_task_that_workers_do_not_know(tmp_path, monkeypatch):
+    monkeypatch.setenv(ALLOWED, "__main__:task")
     register_task("cartpole-mine", lambda: EnvironmentTask("cartpole-mine", lambda: suite.load("cartpole", "balance")))
     try:
         assert get_task("cartpole-mine").state_size == 5
+        with pytest.raises(DmcvbError, match="cartpole-mine is registered in this process alone; use workers=1"):
+            dmcvb_gen.rollout(
+                "cartpole-mine", levels="random", episodes=2, episodes_per_shard=1, workers=2, out=tmp_path
+            )
+        with pytest.raises(DmcvbError, match="put it into a module that workers can import"):
+            find_function("__main__:task", ALLOWED, "task")
         with pytest.raises(DmcvbError, match="there is a task 'cartpole-mine' already"):
             register_task("cartpole-mine", lambda: None)
         get_task.cache_clear()
