@@ -100,8 +100,7 @@ class Progress:
     step: int
     evaluation: Evaluation
     seconds: float
-    steps_per_second: float
-    updates_per_second: float = 0.0
+    updates_per_second: float
 
 
 class Stopped(DmcvbError):
@@ -297,8 +296,7 @@ class Run:
         evaluation, _ = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
         self._write_checkpoint(policy, evaluation)
         self._log.add(self.step, evaluation, self.seconds, updates, metrics)
-        seconds = max(self.seconds, 1e-9)
-        self._report(Progress(self.step, evaluation, self.seconds, self.step / seconds, updates / seconds))
+        self._report(Progress(self.step, evaluation, self.seconds, updates / max(self.seconds, 1e-9)))
         self._began = time.time()
 
     def evaluation_episodes(self) -> int:

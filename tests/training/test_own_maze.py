@@ -85,7 +85,8 @@ def test_one_bar_counts_training_evaluations_and_selection(in_folder, quick_sele
     episode, rows = 600, [int(step) for step in np.genfromtxt(run.folder / "progress.csv", delimiter=",")[1:, 0]]
     measured = bar.counted.count(behaviour.SELECTION_EPISODES * episode)
     evaluated = [n for n in bar.counted if n % episode == 0 and n < behaviour.SELECTION_EPISODES * episode]
-    assert run.selection.picks and measured >= len(run.selection.picks) and len(evaluated) == len(rows) == 7
+    paths = {pick.path for picks in run.selection.picks.values() for pick in picks}
+    assert paths and measured >= len(paths) and len(evaluated) == len(rows) == 7
     assert sum(n for n in bar.counted if n % episode) == run.steps == 448
     assert bar.n == bar.total == sum(bar.counted)
 
