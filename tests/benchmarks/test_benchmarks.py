@@ -185,7 +185,7 @@ def test_the_one_command_that_b3_names_makes_one_release_that_has_its_data(tmp_p
     assert (program, command) == ("dmcvb-gen", "rollout")
     planned = []
 
-    def stop(recipe, *_):
+    def stop(recipe, *_, **__):
         planned.extend(expand(recipe))
         raise click.Abort()
 
