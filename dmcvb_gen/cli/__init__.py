@@ -60,8 +60,6 @@ COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in comma
 """Command -> ("module:attribute", short help)."""
 
 
-ALIASES = {"questions": "claims"}
-"""Earlier name of a command -> its name."""
 RESUMING = frozenset({"rollout", "cluster", "paint", "repaint", "validate", "publish", "fetch", "export", "import"})
 """Commands that keep what they finished, and go on from there when they are run again."""
 
