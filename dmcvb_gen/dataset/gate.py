@@ -24,7 +24,6 @@ from dmcvb_gen.dataset.manifest import (
     RECIPE_BYTES,
     RECIPES,
     RECORDS,
-    ArraySpec,
     Copy,
     FileRecord,
     Layer,
@@ -32,7 +31,6 @@ from dmcvb_gen.dataset.manifest import (
     ListedLayer,
     Manifest,
     Resolved,
-    ShardFile,
     ShardRecord,
     SubsetRecord,
     check_record,
@@ -45,6 +43,7 @@ from dmcvb_gen.dataset.manifest import (
     record_bytes_limit,
     record_path,
 )
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.spec import select
@@ -309,8 +308,6 @@ class Release:
 
     def _subset(self, record: SubsetRecord) -> Any:
         """A subset in the form that this class of releases gives."""
-        from dmcvb_gen.dataset.reader import Subset
-
         return Subset(self, record)
 
     def select(self, patterns: Sequence[str] = ()) -> list[str]:
@@ -435,15 +432,3 @@ def read_records(store: Store, layer: Layer, known: Mapping[int, ShardRecord] | 
     with ThreadPoolExecutor(READERS) as pool:
         found |= dict(zip(new, pool.map(read, new), strict=True))
     return dict(sorted(found.items()))
-
-
-def array_files(
-    shards: Mapping[int, ShardRecord], layer: Layer, spec: ArraySpec, here: Collection[int]
-) -> dict[str, ShardFile]:
-    """Key below an array's folder ("c/3/0/0") -> its file, of the shards that are here."""
-    prefix = f"{layer.group}/{spec.stored_name}/"
-    found = {}
-    for number, record in shards.items():
-        if number in here and (file := record.files.get(spec.name)):
-            found[layer.file_path(spec, number).removeprefix(prefix)] = file
-    return found

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, cast
 
 import numpy as np
 import zarr
 
-from dmcvb_gen.dataset.gate import Release, array_files
-from dmcvb_gen.dataset.manifest import ArraySpec, Layer, SubsetRecord
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ShardFile, ShardRecord, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
@@ -117,11 +116,11 @@ class Subset:
     """One subset of a release, read-only.
 
     Attributes:
-      release: the release that it belongs to.
+      release: the `gate.Release` that it belongs to.
       record: its entry in the manifest.
     """
 
-    def __init__(self, release: Release, record: SubsetRecord):
+    def __init__(self, release: Any, record: SubsetRecord):
         self.release, self.record = release, record
 
     def read_as(self, kind: Callable[..., Any], *options: Any) -> Any:
@@ -216,7 +215,7 @@ class Subset:
         if name not in self._opened:
             layer, spec = self._layer_of(name)
             prefix = f"{layer.group}/{spec.stored_name}"
-            files = array_files(self.release.records(layer.name), layer, spec, self.release.here(layer.name))
+            files = _array_files(self.release.records(layer.name), layer, spec, self.release.here(layer.name))
             chunks = ZarrFiles(self.release.store, prefix, files)
             place, cure = (
                 f"{self.release.place}/{prefix}",
@@ -389,3 +388,15 @@ def _ranges(indices: np.ndarray) -> str:
     breaks = np.flatnonzero(np.diff(indices) != 1)
     starts, ends = np.r_[0, breaks + 1], np.r_[breaks, len(indices) - 1]
     return ", ".join(f"{indices[a]}..{indices[b]}" for a, b in zip(starts, ends, strict=True))
+
+
+def _array_files(
+    shards: Mapping[int, ShardRecord], layer: Layer, spec: ArraySpec, here: Collection[int]
+) -> dict[str, ShardFile]:
+    """Key below an array's folder ("c/3/0/0") -> its file, of the shards that are here."""
+    prefix = f"{layer.group}/{spec.stored_name}/"
+    found = {}
+    for number, record in shards.items():
+        if number in here and (file := record.files.get(spec.name)):
+            found[layer.file_path(spec, number).removeprefix(prefix)] = file
+    return found
