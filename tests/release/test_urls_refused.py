@@ -75,9 +75,9 @@ def _export(root):
 def _report(root):
     from dmcvb_gen.benchmarks.plan import BUDGETS
     from dmcvb_gen.benchmarks.report import claim_folder
-    from dmcvb_gen.dataset import open_release
+    from dmcvb_gen.dataset.gate import Release
 
-    claim_folder(URL, open_release(root), BUDGETS["smoke"], training=True)
+    claim_folder(URL, Release.open(root), BUDGETS["smoke"], training=True)
 
 
 def _train(root):
