@@ -15,6 +15,8 @@ from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.tasks.base import Task
 
+Views = Sequence[str] | None
+"""Names of views; None: all of the task's."""
 MIN_SIZE, MAX_SIZE = 8, 1024
 """Pixels a side that a renderer accepts."""
 
@@ -44,11 +46,7 @@ class Renderer(abc.ABC):
 
     @abc.abstractmethod
     def render(
-        self,
-        physics: np.ndarray,
-        exogenous: DistractorState,
-        views: Sequence[str] | None = None,
-        hide_goal: bool = False,
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> np.ndarray:
         """Paint frames.
 
@@ -63,17 +61,13 @@ class Renderer(abc.ABC):
         """
 
     def render_pair(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None = None
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """The frames as `render` paints them, and the same with `hide_goal`."""
         return self.render(physics, exogenous, views), self.render(physics, exogenous, views, hide_goal=True)
 
     def render_labels(
-        self,
-        physics: np.ndarray,
-        exogenous: DistractorState,
-        views: Sequence[str] | None = None,
-        hide_goal: bool = False,
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> dict[str, np.ndarray]:
         """Depth and segmentation of frames, arguments as `render`.
 
@@ -134,7 +128,7 @@ def check_size(size: int) -> None:
         )
 
 
-def check_frames(task: Task, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None) -> list[int]:
+def check_frames(task: Task, physics: np.ndarray, exogenous: DistractorState, views: Views) -> list[int]:
     """Return the indices of the requested views; raise if frames and labels do not belong together."""
     if physics.ndim != 2 or physics.shape[1] != task.physics_size or len(physics) != len(exogenous):
         raise ValueError(f"physics {physics.shape} and {len(exogenous)} labels are not frames of {task.id}")

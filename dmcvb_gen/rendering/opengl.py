@@ -13,7 +13,6 @@ import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
@@ -23,7 +22,15 @@ from PIL import Image
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, geom_materials, moved_lamps
+from dmcvb_gen.rendering.base import (
+    Renderer,
+    Views,
+    check_frames,
+    check_size,
+    empty_labels,
+    geom_materials,
+    moved_lamps,
+)
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
@@ -94,12 +101,11 @@ class OpenglRenderer(Renderer):
         self._samples = int(self._model.vis.quality.offsamples)
         skies = np.flatnonzero(self._model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(skies[0]) if len(skies) else -1
-        self._own_sky: tuple[int, np.ndarray] | None = None
         if self._sky >= 0:
             address = int(self._model.tex_adr[self._sky])
             height, width = int(self._model.tex_height[self._sky]), int(self._model.tex_width[self._sky])
             self._sky_range = slice(address, address + height * width * int(self._model.tex_nchannel[self._sky]))
-            self._own_sky = (height, self._model.tex_data[self._sky_range].copy())
+            self._own_sky = height, self._model.tex_data[self._sky_range].copy()
         self._floors = np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         for geom in self._floors:
             material = self._model.geom_matid[geom]
@@ -113,7 +119,6 @@ class OpenglRenderer(Renderer):
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
         self._option = mujoco.MjvOption()
-        self._perturb = mujoco.MjvPerturb()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._shown: tuple[int, int] = (-1, -1)
@@ -127,11 +132,7 @@ class OpenglRenderer(Renderer):
         }
 
     def render(
-        self,
-        physics: np.ndarray,
-        exogenous: DistractorState,
-        views: Sequence[str] | None = None,
-        hide_goal: bool = False,
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> np.ndarray:
         indices = check_frames(self.task, physics, exogenous, views)
         out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
@@ -146,11 +147,7 @@ class OpenglRenderer(Renderer):
         return out
 
     def render_labels(
-        self,
-        physics: np.ndarray,
-        exogenous: DistractorState,
-        views: Sequence[str] | None = None,
-        hide_goal: bool = False,
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
@@ -213,7 +210,7 @@ class OpenglRenderer(Renderer):
             )
         if self._sky < 0 or (video, frame) == self._shown:
             return
-        if video < 0 and self._own_sky:
+        if video < 0:
             height, pixels = self._own_sky
             self._model.tex_height[self._sky] = height
             self._model.tex_data[self._sky_range] = pixels
@@ -231,15 +228,8 @@ class OpenglRenderer(Renderer):
         self._data.cam_xpos[camera] = positions[view]
         self._data.cam_xmat[camera] = rotations[view].ravel()
         self._camera.fixedcamid = camera
-        mujoco.mjv_updateScene(
-            self._model,
-            self._data,
-            self._option,
-            self._perturb,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL,
-            self._scene,
-        )
+        shown = (self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
+        mujoco.mjv_updateScene(self._model, self._data, *shown)
         if self._scene.ngeom >= MAX_GEOMS:
             raise RenderingError(f"{self.task.id} has more than {MAX_GEOMS:,} shapes, which 'opengl' cannot draw")
         rectangle = mujoco.MjrRect(0, 0, self.size, self.size)

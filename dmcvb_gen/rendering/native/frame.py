@@ -33,7 +33,10 @@ ALL, NO_GOAL, NOTHING_MOVING = 0, 1, 2
 """Which geoms are drawn."""
 
 
-class FrameTable(NamedTuple):
+# What numba keeps on disk names these three classes: old code that names another one cannot be read at its old line.
+
+
+class Frames(NamedTuple):
     """Data that differ from frame to frame, with a leading frame axis; positions in the world, meters."""
 
     center: np.ndarray  # (frame, geom, 3)

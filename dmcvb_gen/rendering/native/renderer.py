@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import metadata
 from typing import Any
 
@@ -12,9 +12,9 @@ import numpy as np
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, moved_lamps
+from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, empty_labels, moved_lamps
 from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.frame import FrameTable, SceneConstants, labeler, make_scratch, painter
+from dmcvb_gen.rendering.native.frame import Frames, SceneConstants, labeler, make_scratch, painter
 from dmcvb_gen.rendering.native.layout import call
 from dmcvb_gen.rendering.native.scene import (
     BOX,
@@ -90,22 +90,18 @@ class NativeRenderer(Renderer):
         }
 
     def render(
-        self,
-        physics: np.ndarray,
-        exogenous: DistractorState,
-        views: Sequence[str] | None = None,
-        hide_goal: bool = False,
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> np.ndarray:
         return self._paint(physics, exogenous, views, not hide_goal, hide_goal)[int(hide_goal)]
 
     def render_pair(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None = None
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Renderer`; the second ones are painted again only where the goal is."""
         return self._paint(physics, exogenous, views, True, True)
 
     def _paint(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Sequence[str] | None, shown: bool, hidden: bool
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views, shown: bool, hidden: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Frames with and without the goal; none if they are not asked for."""
         indices = check_frames(self.task, physics, exogenous, views)
@@ -122,16 +118,11 @@ class NativeRenderer(Renderer):
         return out[0], out[1]
 
     def render_labels(
-        self,
-        physics: np.ndarray,
-        exogenous: DistractorState,
-        views: Sequence[str] | None = None,
-        hide_goal: bool = False,
+        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> dict[str, np.ndarray]:
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
-        shape = (len(physics), len(indices), self.size, self.size)
-        depth, segmentation = np.empty(shape, np.float32), np.empty(shape, np.int16)
+        depth, segmentation = empty_labels(len(physics), len(indices), self.size)
         numbers = np.append(self._scene.geoms, -1).astype(np.int16)
         for rows, poses in self._parts(physics, exogenous):
             if hide_goal:
@@ -158,7 +149,7 @@ class NativeRenderer(Renderer):
             yield rows, self._kinematics(physics[rows])
             first += len(rows)
 
-    def _frames(self, poses: dict[str, np.ndarray], exogenous: DistractorState, view: int) -> FrameTable:
+    def _frames(self, poses: dict[str, np.ndarray], exogenous: DistractorState, view: int) -> Frames:
         scene, count = self._scene, len(exogenous)
         backgrounds = zip(exogenous.background_video.tolist(), exogenous.background_frame.tolist(), strict=True)
         sky = [self._textures.background(*key) if key[0] >= 0 else scene.sky for key in backgrounds]
@@ -170,7 +161,7 @@ class NativeRenderer(Renderer):
             lamp[..., :3], lamp[..., 3:] = place[:, scene.lamps], direction[:, scene.lamps]
             lamp[..., :3] -= self._far_away[:, None] * lamp[..., 3:]
         center, turn = _poses(scene, poses)
-        return FrameTable(
+        return Frames(
             center=center,
             turn=turn,
             eye=np.ascontiguousarray(exogenous.camera_position[:, view], np.float64),
@@ -205,15 +196,9 @@ class NativeRenderer(Renderer):
         """The constant arguments of a view; with `centers` all samples lie in the middle of their pixels."""
         scene, angle = self._scene, self._angles[view]
         step = 2 * math.tan(angle / 2) / self.size
-        constants = np.concatenate(
-            [
-                [step, scene.near, scene.far, scene.mirror, scene.reflectance],
-                scene.headlight,
-                scene.shine[0],
-                scene.lines,
-                [scene.grid.shape[1], scene.horizon],
-            ]
-        )
+        lens = [step, scene.near, scene.far, scene.mirror, scene.reflectance]
+        plane = [*scene.lines, scene.grid.shape[1], scene.horizon]
+        constants = np.concatenate([lens, scene.headlight, scene.shine[0], plane])
         return SceneConstants(
             looks=self._records,
             constants=constants,

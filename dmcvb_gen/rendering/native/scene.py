@@ -127,25 +127,15 @@ def scene_of(task: Task) -> Scene:
     kind = np.concatenate([model.geom_type[geoms], model.site_type[sites], np.full(len(cords), CAPSULE)])
     width = np.stack([model.tendon_width[tendons], np.ones(len(cords)), np.ones(len(cords))], axis=1)
     size = np.concatenate([model.geom_size[geoms], model.site_size[sites], width]).astype(np.float64)
-    alpha = np.where(
-        (material >= 0) & (rgba == _OWN_COLOR).all(axis=1), _of_materials(model.mat_rgba, material)[:, 3], 0
-    )
-    alpha = np.where((material >= 0) & (rgba == _OWN_COLOR).all(axis=1), alpha, rgba[:, 3])
+    by_material = (material >= 0) & (rgba == _OWN_COLOR).all(axis=1)
+    alpha = np.where(by_material, _of_materials(model.mat_rgba, material)[:, 3], rgba[:, 3])
     seen = np.flatnonzero(alpha > 0)
     numbers = np.concatenate([geoms, np.full(len(sites) + len(cords), -1)])
-    moving = [
-        _moves(model, model.geom_bodyid[geoms]),
-        _moves(model, model.site_bodyid[sites]),
-        np.ones(len(cords), bool),
-    ]
+    bodies = np.concatenate([model.geom_bodyid[geoms], model.site_bodyid[sites]])
+    moving = np.concatenate([_moves(model, bodies), np.ones(len(cords), bool)])
     ends = np.array([[one, two] for _, one, two in cords], np.int64).reshape(-1, 2)
-    geoms, kind, size, material, rgba = (
-        numbers[seen],
-        kind[seen].astype(np.int64),
-        size[seen],
-        material[seen],
-        rgba[seen],
-    )
+    geoms, kind, size = numbers[seen], kind[seen].astype(np.int64), size[seen]
+    material, rgba = material[seen], rgba[seen]
     first, second = len(numbers) - len(sites) - len(cords), len(numbers) - len(cords)
     sites, ends = sites[seen[(seen >= first) & (seen < second)] - first], ends[seen[seen >= second] - second]
     _refuse_what_is_not_painted(task, material, kind, size, alpha[seen])
@@ -165,7 +155,7 @@ def scene_of(task: Task) -> Scene:
         rgba=rgba,
         kind=kind,
         size=size,
-        moving=np.concatenate(moving)[seen] | bool(task.model_entries),
+        moving=moving[seen] | bool(task.model_entries),
         goal=np.isin(geoms, task.goal_geoms),
         mirror=mirror,
         reflectance=float(shiny[mirror]) if mirror >= 0 else 0.0,
