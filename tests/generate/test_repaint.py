@@ -108,7 +108,6 @@ def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, n
     assert depth.shape == geoms.shape == (501, 24, 24) and depth.dtype == np.float32
     assert depth.max() > 1 and ((geoms >= 0) == (depth > 0)).mean() > 0.99 and len(np.unique(geoms)) > 3
     assert verify(tmp_path / "r").sound
-    assert Regeneration(tmp_path / "r").check().sound
 
 
 @pytest.mark.parametrize(
@@ -147,7 +146,7 @@ def test_labels_of_hidden_goals_do_not_show_them(small_mazes, tmp_path):
     assert seen == {"visible": True, "hidden": False, "fixed": False}
 
 
-def test_labels_have_the_views_that_the_subset_has(tmp_path):
+def test_modalities_have_the_views_of_the_task(tmp_path):
     asked = ["--level=random", "--goal=visible", "--episodes=2", "--max-steps=3", "--size=16", "--no-pixels"]
     for command in (
         ["rollout", "ant-maze-empty7x7", *asked, "--out", str(tmp_path / "few views")],
@@ -159,7 +158,7 @@ def test_labels_have_the_views_that_the_subset_has(tmp_path):
     assert f"dmcvb-gen preview '{tmp_path / 'new labels'}'" in result.output
     [subset] = Release.open(tmp_path / "new labels").subsets.values()
     depth = {name for name in subset.arrays if name.startswith("depth")}
-    assert depth == {"depth/egocentric", "depth/top"} and verify(tmp_path / "new labels").sound
+    assert depth == {f"depth/{view}" for view in subset.record.views} and verify(tmp_path / "new labels").sound
     assert all(subset.read(name).any() for name in depth)
 
 
