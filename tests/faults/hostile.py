@@ -631,9 +631,7 @@ class _Guard:
 
 def serve() -> None:
     """Take cases from standard input, a line each: its kind and its files."""
-    from dmcvb_gen.storage import base
 
-    base.PAUSE = 0  # what is damaged for good is fetched anew several times
     sys.dont_write_bytecode = True
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
