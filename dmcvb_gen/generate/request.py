@@ -139,7 +139,7 @@ def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
 
 def _renderer(given: Mapping[str, Any], recipe: Recipe, tasks: Sequence[str]) -> dict[str, Any]:
     """The renderer that was asked for, else the recipe's; of tasks alone the first one that is not native, if any."""
-    from dmcvb_gen.rendering import default_renderer
+    from dmcvb_gen.generate.renderer_choice import default_renderer
     from dmcvb_gen.tasks import get_task
 
     old = recipe.renderer.backend

@@ -78,18 +78,10 @@ def available_renderers() -> dict[str, str | None]:
     return {name: None if name == "native" else renderer_class(name).unavailable() for name in RENDERERS}
 
 
-def default_renderer(task: Task) -> str:
-    """See `choice.default_renderer`, which imports both renderers."""
-    from dmcvb_gen.rendering import choice
-
-    return choice.default_renderer(task)
-
-
 __all__ = [
     "RENDERERS",
     "Renderer",
     "available_renderers",
-    "default_renderer",
     "make_renderer",
     "renderer_class",
 ]

@@ -182,7 +182,7 @@ def two_rings(folder):
         (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), "checks_only trains nothing"),
         (lambda out: dmcvb_gen.validate(out, checks_only=True, profile="paper"), "--profile has no effect"),
         (lambda out: dmcvb_gen.validate(out, agents="bc,state-bc"), "no release"),
-        (lambda out: dmcvb_gen.validate(out, scale=float("inf")), "^scale is inf: input should be a finite number"),
+        (lambda out: dmcvb_gen.validate(out, scale=float("inf")), "^scale is inf: input should be "),
         (
             lambda out: dmcvb_gen.fetch("file:publ", out, episode_range="0:2"),
             r"^episode_range is '0:2': input should be a valid tuple",

@@ -47,7 +47,7 @@ def assert_refused(result, options, cure):
     "arguments, cure",
     [
         ([WALKER, "--goal", "hidden"], "--goal is for mazes"),
-        ([MAZE, "--distractor", "dynamic"], "mazes vary in style; ask for --goal"),
+        ([MAZE, "--distractor", "dynamic"], "no effect in mazes, which vary in style; ask for --goal"),
         ([WALKER, "--backgrounds", "builtin"], "--distractor static or dynamic"),
         ([MAZE, "--backgrounds", "builtin"], "no subset shows videos"),
         ([WALKER, "--split", "val"], "--distractor static or dynamic"),

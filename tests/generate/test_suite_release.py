@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.loaders.envs import DistractedEnv
-from dmcvb_gen.rendering import default_renderer
 from dmcvb_gen.tasks import get_task
 from tests.tasks.test_tasks import SUITE
 from tests.test_whole_way import run

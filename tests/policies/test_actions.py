@@ -18,7 +18,7 @@ def test_recipes_take_mean_actions_unless_told_to_draw_and_manifests_say_so(tmp_
     def planned(**fields):
         subset = dict(tasks=task, levels=["expert", "random"], settings=setting, episodes=1) | fields
         recipe = make_recipe({"name": "actions", "subsets": [subset]})
-        return [record.deterministic for record in make_plan(recipe, tmp_path / "r").manifest.subsets]
+        return [record.deterministic for record in make_plan(recipe, tmp_path / "r").release.manifest.subsets]
 
     assert planned() == [True, False]
     assert planned(deterministic=False) == [False, False]

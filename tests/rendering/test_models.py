@@ -12,7 +12,9 @@ import pytest
 
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering import choice, default_renderer, make_renderer, opengl
+from dmcvb_gen.generate import renderer_choice as choice
+from dmcvb_gen.generate.renderer_choice import default_renderer
+from dmcvb_gen.rendering import make_renderer, opengl
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
 from tests.rendering.test_rendering import needs_opengl

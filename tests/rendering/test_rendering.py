@@ -7,7 +7,8 @@ import pytest
 
 from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.errors import DmcvbError, RenderingError, UnknownNameError
-from dmcvb_gen.rendering import available_renderers, default_renderer, make_renderer
+from dmcvb_gen.generate.renderer_choice import default_renderer
+from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task

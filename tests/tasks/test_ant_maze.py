@@ -364,7 +364,7 @@ def test_fixed_pairs():
     assert len(set(pairs)) == 5 and all(start != goal for start, goal in pairs)
     cells = len(layout.free)
     assert len(set(fixed_pairs(layout, cells * (cells - 1), 0))) == cells * (cells - 1)
-    with pytest.raises(LayoutError, match="fixed-goals"):
+    with pytest.raises(LayoutError, match="fixed goals"):
         fixed_pairs(layout, cells * (cells - 1) + 1, 0)
     task = get_task("ant-maze-easy7x7b")
     for count in (1, 2, 4):
