@@ -39,6 +39,7 @@ def subset(bucket):
     return dmcvb_gen.open(store.place, options)[NAME]
 
 
+@pytest.mark.slow
 def test_loader_workers_read_a_bucket_after_their_parent_has(subset, small_release):
     stored = dmcvb_gen.open(small_release)[NAME]
     np.testing.assert_array_equal(subset.read("pixels", [0]), stored.read("pixels", [0]))
@@ -54,6 +55,7 @@ def test_loader_workers_read_a_bucket_after_their_parent_has(subset, small_relea
             np.testing.assert_array_equal(values[:500], stored.episode(episode)["state"][:500])
 
 
+@pytest.mark.slow
 def test_a_lost_object_is_an_error_and_an_altered_one_too(bucket, subset, tmp_path):
     store, options = bucket
     [path] = [
