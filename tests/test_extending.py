@@ -55,6 +55,7 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
     assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
 
 
+@pytest.mark.slow_cases("small_mazes", "small_release")
 @pytest.mark.parametrize("family", ["small_release", "small_mazes"])
 def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request, tmp_path):
     load("modality")
@@ -78,6 +79,7 @@ def validated(release, tmp_path, *options) -> dict:
     return json.loads((tmp_path / "report" / "report.json").read_text())
 
 
+@pytest.mark.slow_cases("small_mazes-*/visible", "small_release-*/none")
 @pytest.mark.parametrize("family, only", [("small_release", "*/none"), ("small_mazes", "*/visible")])
 def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family, only, request, tmp_path):
     load("agent")
@@ -87,6 +89,7 @@ def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family,
     assert all(result["curve"][-1]["loss"] > 0 for result in report["results"])
 
 
+@pytest.mark.slow_cases("small_mazes", "small_release")
 @pytest.mark.parametrize("family", ["small_release", "small_mazes"])
 def test_a_benchmark_of_your_own_has_its_table_in_the_report(family, request, tmp_path):
     load("benchmark")

@@ -18,6 +18,7 @@ def taker():
         yield taker
 
 
+@pytest.mark.slow_cases("manifest")
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_files_are_refused_in_a_line_or_do_no_harm(taker, kind):
     outcome = run_kind(taker, kind, EXAMPLES)

@@ -64,6 +64,7 @@ def test_it_is_described_sound_and_made_again(made, tmp_path):
     run("card", tmp_path / "carded", "--check")
 
 
+@pytest.mark.slow_cases("mazes")
 def test_it_travels_light_and_is_painted_on_arrival(made, tmp_path):
     folder = made[2]
     run("publish", folder, f"file://{tmp_path}/there", "--no-pixels")
@@ -123,6 +124,7 @@ def test_its_exported_folders_are_imported_again(made, tmp_path):
         )
 
 
+@pytest.mark.slow_cases("locomotion", "mazes")
 def test_agents_train_on_it_and_are_scored(made, tmp_path):
     task, settings, folder = made
     benchmarks = ["--benchmark", "b1", *(["--benchmark", "b3"] if "fixed" in settings else [])]

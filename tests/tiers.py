@@ -1,4 +1,4 @@
-"""Pytest plugin of the two tiers of tests: it measures each test's processor time and names slow tests without a mark.
+"""Pytest plugin of the three tiers of tests: it measures their processor time and names slow tests without a mark.
 
 `bash scripts/test.sh` runs the tests without `@pytest.mark.slow` and gives `--cpu-limit 2.5`: tests without the mark
 whose own time is over 2.5 seconds are listed at the end. None fails by it, because machines differ in speed. A test's
@@ -38,10 +38,10 @@ def compiled() -> set[tuple[str, int]]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `slow.txt` lists, single cases of a parametrized test among them."""
-    listed = set((Path(__file__).parent / "slow.txt").read_text().splitlines())
+    """Mark the single cases of a parametrized test that its `slow_cases` names; what is full is slow, too."""
     for item in items:
-        if item.nodeid in listed:
+        named = [case for mark in item.iter_markers("slow_cases") for case in mark.args]
+        if item.get_closest_marker("full") or (named and item.callspec.id in named):  # type: ignore[attr-defined]
             item.add_marker(pytest.mark.slow)
 
 

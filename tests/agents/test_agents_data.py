@@ -274,6 +274,7 @@ def without_time(point):
     return {name: value for name, value in point.items() if name != "seconds"}
 
 
+@pytest.mark.slow_cases("changed2-pixel_learner", "changed3-pixel_learner")
 @pytest.mark.parametrize(
     "changed, make_learner",
     [({}, state_learner), ({"decay": True}, state_learner), ({}, pixel_learner), ({"muon": True}, pixel_learner)],

@@ -256,6 +256,7 @@ def seeing(data):
 """
 
 
+@pytest.mark.slow_cases("small_mazes")
 @pytest.mark.parametrize("kind", ["small_release", "small_mazes"])
 def test_what_an_agent_learns_from_is_what_it_sees_when_it_is_scored(kind, request, tmp_path, monkeypatch):
     (tmp_path / f"seeing_{kind}.py").write_text(SEEING)

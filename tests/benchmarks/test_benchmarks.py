@@ -373,6 +373,7 @@ def without_time(point):
 SMOKE = BUDGETS["smoke"]
 
 
+@pytest.mark.slow
 def test_cells_in_processes_give_what_cells_in_this_one_give(small_release, tmp_path):
     cells = plan_benchmark("b1", Release.open(small_release), ["state-bc"])[0][:1]
     scores = []
@@ -389,6 +390,7 @@ def test_a_cell_that_cannot_run_does_not_stop_the_others(small_release, tmp_path
     assert "--dino-weights" in results["dino+bc"]["error"] and results["state-bc"]["score"]["mean"] >= 0
 
 
+@pytest.mark.slow
 def test_processes_train_each_encoder_before_its_cells(small_release, tmp_path):
     cells = [c for c in plan_benchmark("b1", Release.open(small_release), ["state-bc", "id+bc"])[0]]
     cells = [c for c in cells if c.setting in ("none", "static") and c.policy_label == cells[0].policy_label]

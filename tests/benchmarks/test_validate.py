@@ -82,6 +82,7 @@ def found(folder):
     }
 
 
+@pytest.mark.slow_cases("small_mazes", "small_release")
 @pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
 def test_subsets_are_checked_side_by_side_and_only_those_asked_for(whole, tmp_path, request):
     folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")
@@ -174,6 +175,7 @@ def test_a_message_stays_in_its_cell_of_a_markdown_table(report):
     assert found[:4] == ["files", "x|y", "0", ""] and found[4].split() == message.split()
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_where_it_stopped(report):
     arguments, out, _ = report
     files = sorted((out / "cells").glob("*.json"))
@@ -185,6 +187,7 @@ def test_the_same_command_goes_on_where_it_stopped(report):
     assert after[0] != before[0] and after[1:] == before[1:]
 
 
+@pytest.mark.slow
 def test_a_page_holds_so_many_pictures_and_says_where_the_others_are(report, monkeypatch):
     monkeypatch.setattr("dmcvb_gen.benchmarks.report.SHEETS", 1)
     arguments, out, _ = report
@@ -287,6 +290,7 @@ def test_a_damaged_release_is_reported_beside_the_scores_of_before(scored, small
     assert agents_of(out) == ["state-bc"]
 
 
+@pytest.mark.slow
 def test_subsets_left_out_by_only_are_called_so_and_not_missing(small_release, tmp_path):
     result = run(
         *("validate", small_release, "--only", "walker-walk/random/none", "--agents", "state-bc", "--threads", 1),
@@ -320,6 +324,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_damaged_release_ends_with_1_names_the_place_and_is_not_trained_on(copy, tmp_path):
     rewrite(copy, NAME, set_rows("state", 1, (123, 4), np.nan))
     result = run("validate", copy, "--agents", "state-bc", "--out", tmp_path / "out")
@@ -336,6 +341,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_any_work(release, tmp
     assert result.exit_code == 2 and "choose another --out" in result.output
 
 
+@pytest.mark.slow
 def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
     part = tmp_path / "part"
     shutil.copytree(small_release, part)
@@ -351,6 +357,7 @@ def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
     assert "Incomplete: 5 of 9 episodes" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_imported_data_are_checked_trained_on_and_evaluated_by_our_renderer(small_release, tmp_path):
     exported = run(
         *("export", small_release, "--only", "walker-walk/random/dynamic", "--to", "rlds", "--out", tmp_path / "rlds")
@@ -404,6 +411,7 @@ def test_a_flipped_byte_fails_by_its_digest(copy):
     assert found(copy) == {("files", None, None)}
 
 
+@pytest.mark.slow_cases("small_mazes", "small_release")
 @pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
 def test_returns_that_cannot_be_read_cost_no_report(whole, request, tmp_path):
     folder = shutil.copytree(request.getfixturevalue(whole), tmp_path / "damaged")

@@ -37,6 +37,7 @@ def test_help_names_every_command():
     assert all(name in output for name in COMMANDS)
 
 
+@pytest.mark.slow
 def test_rollout_info_preview_verify_one_after_the_other(tmp_path):
     out = tmp_path / "demo"
     made = run(*SMALL, "--level", "expert", "--distractor", "dynamic", "--out", out, "--json")
@@ -88,6 +89,7 @@ def test_list_says_what_is_here():
     assert "walker-walk" in run("list").output
 
 
+@pytest.mark.slow
 def test_mixed_takes_its_policies_in_turn(tmp_path):
     result = run(
         "rollout",
@@ -255,6 +257,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 def test_glfw_looks_for_its_library_without_a_process_that_ctrl_c_would_make_print(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYGLFW_LIBRARY")}
     command = [sys.executable, "-c", PROCESSES, str(tmp_path / "out")]

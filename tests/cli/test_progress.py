@@ -51,6 +51,7 @@ def errors_of(words):
     return result.stderr
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
 @pytest.mark.parametrize("task", TASKS)
 def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, task):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0)
@@ -73,6 +74,7 @@ def test_a_log_gets_nothing_of_a_quick_command(request, tmp_path, release):
     assert "%|" not in errors_of(["publish", request.getfixturevalue(release), f"file:{tmp_path}"])
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
 @pytest.mark.parametrize("task", TASKS)
 def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, task):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0)
@@ -128,6 +130,7 @@ def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
     assert expected[1] == pytest.approx(3 * views * first, abs=3)
 
 
+@pytest.mark.slow
 def test_a_terminal_gets_a_bar(small_release):
     import pty
     import termios

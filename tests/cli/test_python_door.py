@@ -80,6 +80,7 @@ def test_functions_are_typed_and_documented(name):
     assert "Raises:" in function.__doc__
 
 
+@pytest.mark.slow_cases("locomotion", "maze", "suite")
 def test_a_whole_release_goes_through_python(family):
     folder, release = family
     assert not release.shortfalls
@@ -121,6 +122,7 @@ def test_shipped_recipes_and_manifests_by_name(tmp_path):
         dmcvb_gen.regenerate(manifest="quickstrat", out=tmp_path / "x", progress=False)
 
 
+@pytest.mark.slow_cases("locomotion", "maze")
 def test_every_file_and_folder_may_be_a_path(family, tmp_path, monkeypatch):
     """Runs and reports are written as JSON, which has no paths."""
     folder, _ = family

@@ -25,6 +25,7 @@ def plans(folder):
     yield ["rollout", "ant-maze-medium7x7a", *common, folder / "m"]
 
 
+@pytest.mark.slow
 def test_tables_fit_80_columns_and_cut_no_word(small_release, small_mazes, tmp_path):
     evaluate = ["evaluate-behaviour", "walker-walk", "ant-maze-medium7x7a", "--level", "random", "--episodes", 2]
     words = {

@@ -58,7 +58,7 @@ def one_writer_of_metadata(monkeypatch):
     monkeypatch.setattr(writer, "READERS", 1)  # writes in one order, so that each has a number
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("name", TABLE)
 def test_a_killed_command_leaves_the_older_release_and_is_simply_run_again(tmp_path, name):
     strike_everywhere(tmp_path, name)
@@ -208,7 +208,7 @@ MISTAKES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_the_crash_table_notices(tmp_path, monkeypatch, mistake):
     make, row = MISTAKES[mistake]

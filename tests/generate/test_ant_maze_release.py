@@ -36,6 +36,7 @@ def maze_release(tmp_path_factory):
     return folder, roll_out(maze_recipe(), folder)
 
 
+@pytest.mark.slow
 def test_a_maze_release_is_sound_and_the_same_with_two_workers(maze_release, tmp_path):
     folder, manifest = maze_release
     result = verify(folder)
@@ -60,6 +61,7 @@ def test_all_views_with_and_without_the_goal(maze_release):
     assert (episode["reward"] <= 0).all() and (episode["reward"] >= -2).all()
 
 
+@pytest.mark.slow
 def test_an_episode_that_ends_early_costs_nothing_past_its_end(tmp_path):
     """Bytes follow the length: chunks past the end are not written."""
     subset = Release.open(_fixed_release(tmp_path, seed=2)).subsets["ant-maze-tiny/random/fixed"]
@@ -82,6 +84,7 @@ def _fixed_release(tmp_path, seed=0):
     return folder
 
 
+@pytest.mark.slow
 def test_fixed_goals(tmp_path):
     subset = Release.open(_fixed_release(tmp_path))["ant-maze-tiny/random/fixed"]
     np.testing.assert_array_equal(subset.read("goal_pair"), [0, 0, 1, 1])
@@ -105,6 +108,7 @@ def frames(task, seed, count):
     return physics, sample_distractors(task, DistractorSetting(), physics[:, None], generators)[:, 0]
 
 
+@pytest.mark.slow_cases("opengl")
 @pytest.mark.parametrize("name", ["native", "opengl"])
 def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
     reason = available_renderers()[name]
@@ -126,6 +130,7 @@ def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
     assert seen_anywhere > 10  # pictures that need no second rendering
 
 
+@pytest.mark.slow_cases("opengl")
 @pytest.mark.parametrize("name", ["opengl"])
 def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(name):
     reason = available_renderers()[name]
@@ -163,6 +168,7 @@ def filled(physics, length):
     return np.take_along_axis(physics, rows[..., None], axis=1)
 
 
+@pytest.mark.slow
 def test_renderers_agree_on_mazes():
     """native's pictures are near OpenGL's in every view and style."""
     reason = available_renderers()["opengl"]

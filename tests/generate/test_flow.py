@@ -52,6 +52,7 @@ def flow_by_rays(task, before, after, eye, next_eye, view, pixels):
     return np.array(flows), np.array(geoms)
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7-none")
 @pytest.mark.parametrize(
     ("task_id", "setting"), [("walker-walk", "dynamic"), ("humanoid-walk", "none"), ("ant-maze-empty7x7", "none")]
 )

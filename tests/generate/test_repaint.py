@@ -58,6 +58,7 @@ def test_a_repainted_subset_has_the_records_of_a_rolled_out_one(small_release, d
     assert repaint(request, 2, ticks.append).digest == ours.digest and len(ticks) > 1
 
 
+@pytest.mark.slow
 def test_a_stopped_repaint_leaves_no_process_and_goes_on_to_a_clean_folder(small_release, tmp_path):
     out, patterns = tmp_path / "r", ["*/*/none", "*/*/dynamic"]
     words = ["repaint", str(small_release), "--out", str(out), "--size", "48", "--workers", "2"]
@@ -135,6 +136,7 @@ def test_wrong_labels_are_found(request, source, only, name, tmp_path):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(available_renderers()["opengl"] is not None, reason="no EGL here")
 def test_labels_of_hidden_goals_do_not_show_them(small_mazes, tmp_path):
     repaint(Repainting(small_mazes, tmp_path / "r", size=24, labels=["segmentation"]))
@@ -162,6 +164,7 @@ def test_modalities_have_the_views_of_the_task(tmp_path):
     assert all(subset.read(name).any() for name in depth)
 
 
+@pytest.mark.slow
 def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "native")
@@ -231,6 +234,7 @@ def test_a_damaged_source_is_not_painted(small_release, tmp_path):
 MAZE = {"tasks": "ant-maze-empty7x7", "levels": "random", "settings": ["visible", "hidden"], "episodes": 2}
 
 
+@pytest.mark.slow
 def test_a_maze_repainted_for_evaluation_is_what_its_rollout_would_be(tmp_path):
     recipe = {"subsets": [MAZE | {"max_steps": 3}], "size": 8}
     roll_out(small_recipe(**recipe), tmp_path / "train")

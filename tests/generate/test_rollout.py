@@ -136,6 +136,7 @@ def test_killed_again_and_again_it_goes_on_and_ends_with_the_same_bytes(tmp_path
     assert Release.open(tmp_path / "whole").digest == Release.open(broken).digest
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
 def test_opengl_in_this_process_ends_without_a_word_of_its_own(tmp_path):
     options = ["--renderer", "opengl", "--episodes", "1", "--max-steps", "2", "--size", "16", "--workers", "1"]
@@ -307,6 +308,7 @@ def test_a_recipe_is_narrowed_to_what_has_the_asked_names():
         narrow(load_recipe("dmcvb-v1"), ["walker-walk"], (), ["visible"])
 
 
+@pytest.mark.slow_cases("content1-not YAML")
 @pytest.mark.parametrize(
     ("content", "why"),
     [

@@ -35,7 +35,7 @@ OURS = {name: value for name, value in os.environ.items() if name != "OPENBLAS_C
 PAINTER = "native" if "native" in RENDERERS else "-"
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.full,
     pytest.mark.skipif(not shutil.which("qemu-x86_64"), reason="no qemu-x86_64: apt-get install qemu-user"),
 ]
 

@@ -109,6 +109,7 @@ def run(site, *arguments):
     return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=site.parent)
 
 
+@pytest.mark.slow
 def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
     site = site_of(READING, wheel, tmp_path / "site")
     assert not (site / "mujoco").exists() and not (site / "torch").exists() and not (site / "gymnasium").exists()
@@ -127,6 +128,7 @@ def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
     assert refused.returncode == 2 and "pip install" in refused.stderr and "Traceback" not in refused.stderr
 
 
+@pytest.mark.slow
 def test_the_core_makes_and_shows_data_without_any_extra(tmp_path):
     code = f"""
 import sys

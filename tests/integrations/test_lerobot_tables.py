@@ -78,6 +78,7 @@ def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):
         export(release, "npz", tmp_path / "x", merge=True)
 
 
+@pytest.mark.slow
 def test_videos_have_a_frame_a_step(stored, tmp_path):
     name = "ant-maze-tiny/random/hidden"
     [folder] = export(str(stored[name].folder), "lerobot", tmp_path, [name], video=True)

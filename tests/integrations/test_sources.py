@@ -33,6 +33,7 @@ def test_readers_stack_the_right_pictures(stored):
             np.testing.assert_array_equal(two, stack_channels(values["pixels"][5:6][:, [2, 0]]))
 
 
+@pytest.mark.slow_cases("npz", "replay-buffer")
 @pytest.mark.parametrize("to", ["hdf5", "npz", "replay-buffer"])
 def test_files_have_the_right_pictures(stored, tmp_path, to):
     for name, one in stored.items():

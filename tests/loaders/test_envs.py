@@ -53,6 +53,7 @@ def test_importing_the_package_is_enough_and_loads_no_simulator():
     assert found == ["True", "False", "False"]
 
 
+@pytest.mark.slow_cases("dmcvb_gen/walker-walk-dynamic-v0")
 @pytest.mark.parametrize("name", [f"dmcvb_gen/{task}-{s}-v0" for task, s in zip(TASKS, SETTINGS[::-1], strict=True)])
 def test_gymnasiums_checker_passes(name):
     env = gymnasium.make(name, render_mode="rgb_array", **SMALL)
@@ -187,6 +188,7 @@ def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     assert DistractedEnv(maze, "fixed", goal_pair=3, views=views, **SMALL).reset(seed=0)[1] == {"goal_pair": 3}
 
 
+@pytest.mark.slow_cases("walker-walk-dynamic")
 @pytest.mark.parametrize("name", ["walker-walk-dynamic", "ant-maze-empty7x7-hidden"])
 def test_the_data_layout_stacks_frames_as_the_readers_do(name):
     plain, env = gymnasium.make(f"dmcvb_gen/{name}-v0", **SMALL), gymnasium.make(f"dmcvb_gen/{name}-v0", **SMALL)

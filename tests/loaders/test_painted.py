@@ -36,6 +36,7 @@ def distracted(release):
     return next(subset for name, subset in release.subsets.items() if name.endswith(("/dynamic", "/hidden")))
 
 
+@pytest.mark.slow_cases("maze-light", "maze-painted")
 @pytest.mark.parametrize("which", ["light", "painted"])
 def test_pictures_painted_on_reading_are_the_stored_ones(made, which):
     stored = dmcvb_gen.open(str(made / "painted"))
@@ -173,6 +174,7 @@ def test_each_data_set_shows_the_epoch_that_it_was_given(made, kind):
         assert np.array_equal(pictures(subset.torch(kind, epoch=2, **options)), wanted[1])
 
 
+@pytest.mark.slow_cases("maze")
 def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
     subset = distracted(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample"))
     streams = [subset.torch("stream", batch_size=4, shuffle=False, buffer=1, epoch=epoch) for epoch in (1, 2)]

@@ -180,6 +180,7 @@ def test_loader_workers_share_the_episodes(subset):
     assert keys(DataLoader(data, batch_size=None, num_workers=2)) != loaded
 
 
+@pytest.mark.slow_cases("spawn")
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_persistent_workers_see_the_epoch(subset, context):
     data = subset.torch("stream", batch_size=100, pictures=(), seed=3, buffer=1)
@@ -247,6 +248,7 @@ def test_ranks_get_equally_many_batches_of_episodes_that_differ_in_length(subset
         next(stream(uneven, rank=2, world=2))
 
 
+@pytest.mark.slow
 def test_random_steps_work_in_loader_workers_and_survive_pickling(subset):
     data = pickle.loads(pickle.dumps(subset.torch("steps")))
     generator = torch.Generator().manual_seed(0)

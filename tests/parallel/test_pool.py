@@ -110,6 +110,7 @@ def test_an_error_that_does_not_survive_pickling_is_told_with_where_it_was(work,
     assert "in fail_oddly" in "".join(caught.value.__notes__)
 
 
+@pytest.mark.slow_cases("2")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_next_piece_of_work_begins_while_a_result_is_on_its_way(workers):
     found = dict(run_all(send, range(4), workers))
@@ -156,6 +157,7 @@ def test_what_is_handed_out_is_bounded():
         assert len(list(results)) == 49
 
 
+@pytest.mark.slow
 def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
     found = [result for _, result in run_all(threads, [1, 2], 2, threads=1)]
     assert {count for count, _ in found} == {1}

@@ -108,6 +108,7 @@ def code(task, tmp_path, monkeypatch):
     return name
 
 
+@pytest.mark.slow_cases("maze")
 def test_data_of_a_function_are_verified_regenerated_and_marked(task, code, tmp_path, monkeypatch):
     release = goes_the_whole_way(task, f"{code}:noisy", tmp_path / "r")
     [subset] = release.subsets.values()
@@ -133,6 +134,7 @@ def test_names_that_may_run_are_listed_as_people_list_them(code, monkeypatch):
         find_function("", BEHAVIOURS, "behaviour")
 
 
+@pytest.mark.slow_cases("maze")
 def test_a_functions_noise_comes_from_each_episodes_own_stream(task, code, tmp_path, monkeypatch):
     done("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--out", tmp_path / "a")
     alone = [*TINY, "--episodes-per-shard", "1", "--behaviour", f"{code}:noisy", "--out", tmp_path / "b"]
@@ -267,6 +269,7 @@ def test_what_is_not_a_plain_mlp_on_the_tasks_own_spaces_is_refused_and_named(
     assert not (tmp_path / "p.safetensors").exists()
 
 
+@pytest.mark.slow_cases("maze")
 def test_data_of_an_sb3_zip_regenerate_bit_for_bit(task, tmp_path):
     model(SAC, task, **SB3["sac"][1]).save(tmp_path / "model.zip")
     release = goes_the_whole_way(task, tmp_path / "model.zip", tmp_path / "r")
@@ -342,6 +345,7 @@ def test_what_torch_puts_before_names_and_cleanrls_own_ending_are_read(wrapper, 
     np.testing.assert_allclose(load_policy(tmp_path / "p.safetensors").act(seen, None, True), theirs, atol=1e-5)
 
 
+@pytest.mark.slow_cases("maze-CleanRlPpo", "maze-CleanRlSac")
 @pytest.mark.parametrize("kind", [CleanRlSac, CleanRlPpo])
 def test_a_cleanrl_state_dict_acts_as_cleanrl_does_and_regenerates(task, kind, tmp_path):
     torch.manual_seed(0)

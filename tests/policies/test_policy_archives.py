@@ -22,6 +22,7 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache" / "dmcvb-gen" / "policies"
 
 
+@pytest.mark.slow
 def test_every_policy_of_the_list_comes_out_with_its_digest(cache):
     for name, digest in bundled_digests().items():
         assert bundled_file(name) == cache / name and sha256_file(cache / name) == digest

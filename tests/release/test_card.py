@@ -98,6 +98,7 @@ def rows_of(folder):
     return datasets.load_dataset(str(folder), cache_dir=str(folder.parent / "cache"))["train"]
 
 
+@pytest.mark.slow_cases("False", "True")
 @pytest.mark.parametrize("light", [False, True])
 def test_the_hubs_loader_reads_the_episodes_with_their_first_frames(small_release, small_mazes, tmp_path, light):
     for source in (small_release, small_mazes):
@@ -221,6 +222,7 @@ def test_no_release_no_card(tmp_path):
         write_card(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_card_of_the_overhead_view_alone_shows_it(small_mazes, tmp_path):
     publish(small_mazes, f"file:{tmp_path / 'there'}", pixels=False)
     command = ["fetch", f"file:{tmp_path / 'there'}", "--paint", "--views", "overhead"]

@@ -252,6 +252,7 @@ def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):
         export(small_release, "hdf5", tmp_path)
 
 
+@pytest.mark.slow
 def test_workers_write_what_one_process_writes(small_release, small_mazes, tmp_path, monkeypatch):
     """To a relative folder, which minari takes for one of its own."""
     monkeypatch.chdir(tmp_path)

@@ -140,6 +140,7 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
         ]
 
 
+@pytest.mark.slow
 def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maze_release, tmp_path):
     for folder in (small_release, maze_release):
         whole = view(str(folder), tmp_path / "whole.html", episodes=1, size=16)

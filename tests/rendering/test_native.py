@@ -44,6 +44,16 @@ def pair(task_id: str, setting_name: str):
     return task, *pictures
 
 
+@pytest.mark.slow_cases(
+    "ant-maze-medium7x7a-none",
+    "cheetah-run-dynamic",
+    "cheetah-run-none",
+    "cheetah-run-static",
+    "humanoid-walk-dynamic",
+    "humanoid-walk-none",
+    "humanoid-walk-static",
+    "walker-walk-dynamic",
+)
 @needs_opengl
 @pytest.mark.parametrize(("task_id", "setting_name"), [*CASES, *((task, "static") for task in LOCOMOTION_TASKS)])
 def test_every_view_is_as_close_to_opengl_as_eyes_see(task_id, setting_name):
@@ -75,6 +85,7 @@ def test_larger_pictures_are_as_close():
     assert np.abs(pictures[0] - pictures[1]).mean() < 1.5
 
 
+@pytest.mark.slow_cases("ant-maze-medium7x7a-8")
 @pytest.mark.parametrize("size", [8, 9, 65, 1024])
 @pytest.mark.parametrize("task_id", ["walker-walk", MAZE])
 def test_sizes(task_id, size):
@@ -162,6 +173,7 @@ def test_what_it_does_not_paint_is_refused():
         make_renderer("native", get_task("walker-walk"), 64, samples=2)
 
 
+@pytest.mark.slow
 def test_another_process_reads_what_this_one_compiled():
     task, setting, physics, labels = frames_of("walker-walk", "none", 2)
     renderer_of("native", task, setting).render(physics, labels)

@@ -152,6 +152,7 @@ def test_depth_and_segmentation_of_the_renderers_agree(task_id):
     assert len(ratio) > 20 and np.median(np.abs(ratio - 1)) < 0.02
 
 
+@pytest.mark.slow_cases("cheetah-run", "humanoid-walk")
 @needs_opengl
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_opengl_without_distractors_is_dm_controls_picture(task_id):

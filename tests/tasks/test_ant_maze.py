@@ -93,6 +93,7 @@ WALKER_FIELDS = (
 )
 
 
+@pytest.mark.slow_cases("easy7x7c-1-extreme-150", "medium7x7a-0-random-150")
 @pytest.mark.parametrize(
     ("layout", "seed", "kind", "steps"),
     [("medium7x7a", 0, "random", 150), ("easy7x7c", 1, "extreme", 150), ("empty7x7", 2, "zero", 60)],
@@ -151,6 +152,7 @@ def test_agrees_with_dm_control(layout, seed, kind, steps):
     assert largest <= 1e-12
 
 
+@pytest.mark.slow
 def test_touch_ends_the_episode_where_dm_control_says_so():
     """An ant thrown at the goal ends at the same control step as dm_control's, whatever the moment of the touch."""
     task = get_task("ant-maze-empty7x7")
@@ -489,6 +491,14 @@ def descend(layout, field, start, step=0.05):
     return np.array(path)
 
 
+@pytest.mark.slow_cases(
+    "ant-maze-easy7x7a",
+    "ant-maze-easy7x7b",
+    "ant-maze-empty7x7",
+    "ant-maze-medium7x7a",
+    "ant-maze-medium7x7b",
+    "ant-maze-medium7x7c",
+)
 @pytest.mark.parametrize("task_id", ANT_MAZE_TASKS)
 def test_distance_falls_along_the_shortest_path(task_id):
     layout = get_task(task_id).layout

@@ -59,6 +59,7 @@ def test_running_speed_counts_every_step_of_every_episode():
     assert running_speed(get_task("walker-walk"), None) is None
 
 
+@pytest.mark.slow
 def test_paths_of_a_maze_are_painted(tmp_path):
     arguments = ("ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2, "--pictures", tmp_path / "p")
     assert "rms m/s" in evaluated(*arguments)
@@ -83,6 +84,7 @@ def evaluated(*arguments):
     return result.output
 
 
+@pytest.mark.slow
 def test_one_command_sets_every_bundled_level_beside_the_paper():
     rows = json.loads(evaluated("--episodes", 2, "--json"))
     asked = [
@@ -120,6 +122,7 @@ def test_a_folder_without_picks_says_what_to_run(tmp_path):
     assert result.exit_code == 2 and "select-checkpoints" in result.output
 
 
+@pytest.mark.slow_cases("cartpole-swingup")
 @pytest.mark.parametrize("task", ["cartpole-swingup", "finger-spin"])
 def test_a_task_without_a_setting_of_its_own_goes_from_nothing_to_data(tmp_path, task):
     cut = {"warmup_steps": 24, "simulations": 4, "batch_size": 16, "compile": False}

@@ -113,6 +113,7 @@ def test_places_are_drawn_on_the_floor():
     assert np.isfinite(headings(layout, drawn[:, :2], drawn[:, 2:], AHEAD)).all()
 
 
+@pytest.mark.slow
 def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
     run = open_run(tmp_path / "run", config(), False)
@@ -154,6 +155,7 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
     assert run.evaluation_episodes() == 60  # however long none was
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 1)
     rare = dict(evaluate_every=10_000)
@@ -164,6 +166,7 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):
     assert all(np.array_equal(ends[0][name], value) for name, value in ends[1].items())
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_another_walker(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
     open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000), False).train()

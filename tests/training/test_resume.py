@@ -88,6 +88,7 @@ def assert_same_run(first, second):
     assert curves[0] == curves[1]
 
 
+@pytest.mark.slow_cases("guided", "mpo", "sac")
 @pytest.mark.parametrize("algorithm", TINY)
 def test_a_stopped_and_resumed_run_is_an_uninterrupted_one_to_the_bit(tmp_path, algorithm):
     fields = dict(algorithm=algorithm, every=80 if algorithm == "guided" else 40)  # mazes: long evaluations
@@ -105,6 +106,7 @@ def test_what_is_learned_does_not_depend_on_how_often_it_is_evaluated(tmp_path):
     assert all(np.array_equal(value, other.weights[key]) for key, value in one.weights.items())
 
 
+@pytest.mark.slow
 def test_observed_touch_of_an_ant_survives_the_interruption(tmp_path):
     """Touch sensors do not follow from the physics state alone."""
     fields = dict(task="ant-maze-empty7x7", settings=TINY["sac"] | {"train_episode_steps": 100}, every=1000)
@@ -125,6 +127,7 @@ runs.open_run(sys.argv[1], runs.RunConfig(**json.loads(sys.argv[2])), True).trai
 """
 
 
+@pytest.mark.slow_cases("sac")
 @pytest.mark.parametrize("algorithm", ["sac", "guided"])
 def test_a_killed_run_resumes_to_the_same_bits(tmp_path, algorithm):
     fields = json.dumps(vars(config(algorithm, steps=100_000)))
@@ -225,6 +228,7 @@ def largest_file(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+@pytest.mark.slow_cases("sac")
 @pytest.mark.parametrize("algorithm", ["sac", "mpo"])
 def test_a_disk_that_fills_up_while_saving_leaves_the_previous_state(tmp_path, algorithm):
     run = train(tmp_path / "run", algorithm=algorithm, steps=80)
@@ -270,6 +274,7 @@ def test_a_run_that_is_made_longer_keeps_its_replay_buffer_in_order(rounds):
     assert same.arrays["reward"].tolist() == filled(6, (0, rounds)).arrays["reward"].tolist()
 
 
+@pytest.mark.slow_cases("guided")
 @pytest.mark.parametrize("algorithm", ["sac", "guided"])
 def test_a_run_whose_saved_state_is_gone_keeps_its_checkpoints(tmp_path, algorithm, monkeypatch):
     train(tmp_path / "run", algorithm=algorithm)
@@ -281,6 +286,7 @@ def test_a_run_whose_saved_state_is_gone_keeps_its_checkpoints(tmp_path, algorit
     assert sorted((tmp_path / "run" / "checkpoints").iterdir()) == kept != []
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_when_what_it_started_from_is_gone(tmp_path):
     train(tmp_path / "first")
     source = {"init_from": str(tmp_path / "first")}
@@ -312,6 +318,7 @@ def test_a_run_looks_again_when_it_is_alone(tmp_path):
         late.train()
 
 
+@pytest.mark.slow_cases("90-mpo", "90-sac", "None-sac")
 @pytest.mark.parametrize("algorithm", ["sac", "mpo"])
 @pytest.mark.parametrize("steps", [None, 90])
 def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(algorithm, steps, tmp_path):
@@ -360,6 +367,7 @@ def test_the_command_of_a_maze_with_a_reward_of_its_own_names_all_of_it(tmp_path
         assert words in command and shlex.split(command)[2] in ("--layout", name)
 
 
+@pytest.mark.slow
 def test_a_run_of_which_nothing_is_saved_yet_begins_at_step_0_and_says_so(tmp_path):
     whole, again = (train(tmp_path / name, steps=80) for name in ("whole", "run"))
     for rest in ("resume", "checkpoints"):  # as a run that was killed before it saved anything

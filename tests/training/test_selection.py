@@ -249,6 +249,7 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             }
 
 
+@pytest.mark.slow
 def test_a_short_run_may_be_told_where_a_longer_one_ends(run_folder):
     found = select_checkpoints(run_folder, episodes=2, converged=10.0)
     assert found.convergence.value == 10.0 and "9.5" in found.reasons["expert"]

@@ -116,6 +116,7 @@ def test_a_terminal_transition_does_not_look_ahead(bins):
     torch.testing.assert_close(first, second)
 
 
+@pytest.mark.slow_cases("51")
 @pytest.mark.parametrize("bins", [0, 51])
 def test_the_critics_fit_a_known_value(bins):
     sac, batch = learner(learning_rate=3e-3, bins=bins), batch_of()
@@ -196,6 +197,7 @@ def test_steps_that_follow_are_summed_as_far_as_an_episode_goes_on(data):
         assert batch["next_observation"][i, 0] == at * simulations + k + 0.5
 
 
+@pytest.mark.slow
 def test_an_annealed_policy_is_paid_less_for_its_entropy():
     entropies, temperatures = [], []
     for anneal_after in (0, 10):
@@ -416,6 +418,7 @@ def test_a_policy_that_does_not_fit_begins_no_run(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
 @pytest.mark.parametrize("task_id", ["walker-walk", "ant-maze-empty7x7"])
 def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp_path, monkeypatch, task_id):
     """Counted from outside: agent steps that evaluations were asked to simulate, for those that were trained."""
