@@ -43,6 +43,10 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
       DmcvbError: an unknown name, a value that is wrong, or an option that would have no effect.
     """
     given |= {name: as_names(given[name]) for name in ("levels", "distractors", "goals") if name in given}
+    if "distractors" in given:
+        from dmcvb_gen.distractors.registry import typed_setting  # which needs MuJoCo
+
+        given["distractors"] = tuple(map(typed_setting, given["distractors"]))
     tasks = tuple(task_id_of(task) for task in tasks)
     allow(tasks)  # a person typed these names, so their code may run
     if not tasks and not recipe:
