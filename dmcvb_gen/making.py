@@ -223,13 +223,15 @@ def repaint(
     Raises:
       DmcvbError: nothing fits, a shard is damaged, or `out` cannot be used.
     """
+    from dmcvb_gen.distractors.registry import typed_setting
     from dmcvb_gen.generate.repaint import Repainting
     from dmcvb_gen.generate.repaint import repaint as run
     from dmcvb_gen.generate.request import background_source
     from dmcvb_gen.loaders.release import open_for_reading
 
     videos = None if backgrounds is None else background_source(backgrounds)
-    look = (distractor, size, renderer, samples, videos, split, as_names(labels), name)
+    setting = None if distractor is None else typed_setting(distractor)
+    look = (setting, size, renderer, samples, videos, split, as_names(labels), name)
     with progress_bar(progress, " frames") as bar:
         run(Repainting(release, out, as_names(only), *look), workers, bar)
     return open_for_reading(str(out))
