@@ -32,7 +32,13 @@ from dmcvb_gen.training.run import Run, RunConfig, Stopped, open_run
 from dmcvb_gen.training.run_log import COLUMNS, read_rows
 from dmcvb_gen.training.sac import ReplayBuffer
 
-torch.set_num_threads(1)
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As many threads as in the processes that are killed: sums of several differ in their last bits."""
+    torch.set_num_threads(1)
+
+
 TINY = {
     "sac": dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4),
     "guided": dict(batch_size=16, simulations=4, train_episode_steps=20, half_life=100, layers=2),
