@@ -557,7 +557,7 @@ def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, reques
 def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(whole, request, tmp_path):
     release = Release.open(request.getfixturevalue(whole))
     cell = plan_benchmark("b1", release, ["bc"])[0][0]
-    run = CellRun(release.root, tmp_path, SMOKE, cell)
+    run = CellRun(release.path, tmp_path, SMOKE, cell)
     data, network = run.data(), SMOKE.network
     encoder = make_encoder(cell.agent, data.sizes, None, network)
     readouts = {

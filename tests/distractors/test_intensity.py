@@ -135,7 +135,7 @@ def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
     run("rollout", task_id, *short, "--distractor", "static_0.35")
     run("rollout", task_id, *short, "--distractor", "dynamic_camera0.5-background3")
     names = [f"{task_id}/random/static_0.35", f"{task_id}/random/dynamic_camera0.5-background3"]
-    assert list(Release.open(folder).subsets) == names
+    assert list(Release.open(folder).subsets) == sorted(names)
     assert json.loads(run("verify", folder, "--json"))["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
     few = ["--profile", "smoke", "--agents", "state-bc,bc", "--workers", 1, "--out", tmp_path / "report"]
