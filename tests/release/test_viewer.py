@@ -149,7 +149,7 @@ def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maz
         with pytest.raises(StoreError, match="do not fit"):
             view(str(folder), tmp_path / "none.html", max_bytes=1000)
     for option in (dict(max_bytes=0), dict(episodes=0), dict(episodes=-1), dict(episodes=1.5)):
-        with pytest.raises(DmcvbError, match=f"{next(iter(option))} is .*; give a whole number, at least 1"):
+        with pytest.raises(DmcvbError, match=f"{next(iter(option))} is .*; give a whole number of at least 1"):
             view(str(small_release), tmp_path / "none.html", **option)
 
 
