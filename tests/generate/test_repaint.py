@@ -71,8 +71,8 @@ def test_a_stopped_repaint_leaves_no_process_and_goes_on_to_a_clean_folder(small
         start_new_session=True,
     )
     try:
-        while process.poll() is None and not any(path.is_file() for path in out.glob("**/c/**/*")):
-            time.sleep(0.01)  # until a shard is being written: the other setting of its job is still to come
+        while process.poll() is None and not any(path.is_file() for path in out.glob("**/pixels/c/**/*")):
+            time.sleep(0.01)  # until images are being written: the other setting of its work is still to come
         assert process.poll() is None and len(session(process.pid)) >= 3
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=60)
