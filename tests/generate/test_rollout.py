@@ -154,7 +154,7 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path):
         start_new_session=True,
     )
     deadline = time.time() + 120
-    while not list((tmp_path / "r").glob("records/**/*.json")) and time.time() < deadline:
+    while not list((tmp_path / "r").glob("records/**/labels/*.json")) and time.time() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
