@@ -441,7 +441,7 @@ def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
             for result in facts["results"]
         ],
         seconds=facts["seconds"],
-        settings=list({**facts["budget"], **facts["versions"]}.items()),
+        settings=list(((facts["budget"] if facts["cells_planned"] else {}) | facts["versions"]).items()),
     )
 
 

@@ -71,8 +71,9 @@ def info(path, options, as_json):
     if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
         click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {quoted(shown(path))}")
     if facts["digest"]:
-        compared = "" if facts["compared"] else " (not compared with one from elsewhere)"
-        click.echo(f"digest {facts['digest']}{compared}")
+        click.echo(f"digest {facts['digest']}")
+        if not facts["compared"]:
+            click.echo("The digest was not compared; give the one that you expect: RELEASE@sha256:DIGEST")
 
 
 @click.command()
