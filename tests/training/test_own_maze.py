@@ -60,7 +60,7 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
         assert "***" not in done.output  # messages have the maze's name, not its rows
     release = dmcvb_gen.open(str(in_folder / "ring"))
     assert sorted(name.split("/")[1] for name in release) == ["expert", "medium"]
-    assert [release[name].group["length"].shape for name in release] == [(20,), (20,)]
+    assert [release[name].array("length").shape for name in release] == [(20,), (20,)]
 
 
 @pytest.mark.slow
