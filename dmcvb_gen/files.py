@@ -8,7 +8,6 @@ left by a killed process.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import functools
 import hashlib
 import json
@@ -19,6 +18,11 @@ from collections.abc import Iterator
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows: nothing is locked, so what killed processes left stays
+    fcntl = None  # type: ignore[assignment]
 
 PARTIAL = ".partial"
 """Ending of files in the making."""
@@ -56,6 +60,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 def _lock(handle: int) -> bool:
     """Lock an open file or folder for this process; False if another one has locked it, or the disk knows no locks."""
+    if fcntl is None:
+        return False
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -79,7 +85,7 @@ def flush_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
     try:
         yield handle
     finally:
@@ -184,8 +190,9 @@ def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
     """
     made = Path(tempfile.mkdtemp(dir=parent, prefix=f".{name}.", suffix=PARTIAL))
     try:
-        with _opened(made) as handle:
-            _lock(handle)
+        with contextlib.ExitStack() as stack:
+            if fcntl is not None:  # Windows opens no folders
+                _lock(stack.enter_context(_opened(made)))
             yield made
     finally:
         shutil.rmtree(made, ignore_errors=True)

@@ -13,7 +13,8 @@ import sys
 for name in ("fcntl", "resource", "pwd", "grp", "termios"):
     sys.modules[name] = None  # what imports it fails, as on Windows
 import os
-for name in ("fork", "getuid", "sysconf", "sysconf_names", "sched_getaffinity", "killpg", "setsid"):
+calls = ("fork", "getuid", "sysconf", "sysconf_names", "sched_getaffinity", "killpg", "setsid")
+for name in (*calls, "O_NOFOLLOW", "O_NONBLOCK"):
     if hasattr(os, name):
         delattr(os, name)
 import importlib, pkgutil
