@@ -562,7 +562,7 @@ def build_manifest(
         for name in subset.layers:
             needed[name] = max(needed.get(name, 0), layers[name].shards_for(subset.episodes))
     made = {name: LayerList(shards=lists[name][:count]) for name, count in sorted(needed.items())}
-    used = list({recipe.sha256: recipe for recipe, _ in whole}.values())
+    used = _without_needless(whole)
     newest = max(used, key=lambda recipe: (_version_key(recipe.version), recipe.name, recipe.sha256))
     inputs = {file.path: file for recipe in used for file in recipe.inputs}
     manifest = Manifest(
@@ -580,6 +580,40 @@ def build_manifest(
         subsets=tuple(subsets[name] for name in sorted(subsets)),
     )
     return manifest, made
+
+
+def _without_needless(whole: Iterable[tuple[Resolved, SubsetRecord]]) -> list[Resolved]:
+    """The recipes of whole subsets, without those that others make needless: asking for less changes no manifest."""
+    asked: dict[str, tuple[Resolved, list[SubsetRecord]]] = {}
+    for recipe, subset in whole:
+        asked.setdefault(recipe.sha256, (recipe, []))[1].append(subset)
+    for digest, (recipe, subsets) in sorted(asked.items()):
+        covering = [
+            subset
+            for other, theirs in (given for sha256, given in asked.items() if sha256 != digest)
+            if _described(other) == _described(recipe)
+            for subset in theirs
+        ]
+        if all(any(_covers(subset, asked_for) for subset in covering) for asked_for in subsets):
+            del asked[digest]
+    return [recipe for recipe, _ in asked.values()]
+
+
+def _covers(one: SubsetRecord, other: SubsetRecord) -> bool:
+    return one.name == other.name and merged_subset(one, other) == one
+
+
+def _described(recipe: Resolved) -> tuple[Any, ...]:
+    """What must be equal for one recipe to stand for another; one that `paint` made names no policies."""
+    return (
+        bool(recipe.recipe),
+        recipe.name,
+        recipe.version,
+        recipe.license,
+        recipe.authors,
+        recipe.description,
+        recipe.derived,
+    )
 
 
 def _facts(layer: Layer) -> dict[str, Any]:

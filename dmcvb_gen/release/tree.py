@@ -15,6 +15,7 @@ from dmcvb_gen.dataset.manifest import (
     RECIPES,
     FileRecord,
     LayerList,
+    ListedLayer,
     Manifest,
     canonical_json,
     list_path,
@@ -73,9 +74,11 @@ def described_files(release: Release, names: Collection[str]) -> tuple[FileRecor
 
 
 def list_files(release: Release, layers: Collection[str]) -> tuple[FileRecord, ...]:
-    """The lists of layers, of a finished release."""
+    """The lists of layers, of a finished release; images that only this copy has are in no list yet."""
     found = {}
     for name in layers:
+        if not isinstance(release.layers[name], ListedLayer):
+            continue
         records = release.records(name)
         text = canonical_json(LayerList(shards=tuple(records[number] for number in sorted(records))))
         found[list_path(sha256_bytes(text))] = text

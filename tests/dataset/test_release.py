@@ -105,6 +105,14 @@ def test_growing_keeps_every_file_and_the_older_manifest(store):
     assert len(second[NAME]) == 5 and oracle.check(store.folder)
 
 
+@pytest.mark.parametrize("counts", [(5, 2), (2, 5), (2, 3, 5, 1)])
+def test_asking_for_less_changes_no_manifest(store, tmp_path, counts):
+    largest = made_up.make(open_store(tmp_path / "largest"), made_up.recipe(5))
+    for count in counts:
+        release = made_up.make(store, made_up.recipe(count))
+    assert release.digest == largest.digest and len(release.manifest.recipes) == 1
+
+
 def test_images_are_added_as_further_layers(store):
     light = made_up.make(store, made_up.recipe(3, images=False))
     with pytest.raises(StoreError, match="paint"):

@@ -15,6 +15,7 @@ from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.dataset.writer import finish_copy
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.paint import Wanted, paint_release
+from dmcvb_gen.release.verify import check_files
 from tests.conftest import maze_recipe, roll_out, small_recipe
 
 SHORT = {"tasks": "walker-walk", "levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 6}
@@ -129,6 +130,7 @@ def test_a_copy_gains_images_of_another_size_and_keeps_its_digest(made, tmp_path
     assert arrays == (["at24/pixels_hidden_goal/top"] if maze else ["at24/pixels"])
     assert done.release[name].read(arrays[0]).shape[2:] == (24, 24, 3)
     assert done.release.digest == digest and Release.open(tmp_path / "copy")[name].read(arrays[0]).any()
+    assert not check_files(tmp_path / "copy")
 
 
 @pytest.mark.parametrize("words, cure", [
