@@ -519,7 +519,9 @@ def merged_layers(recipes: Iterable[Resolved]) -> dict[str, Layer]:
 
 
 def _difference(one: Layer, other: Layer) -> str:
-    for field in ("episodes_per_shard", "rows", "group", "kind", "source", "arrays"):
+    if one.arrays != other.arrays:
+        return f"{one.name} has {_arrays(one, other)}, asked for {_arrays(other, one)}; {_cure(other)}"
+    for field in ("episodes_per_shard", "rows", "group", "kind", "source"):
         first, second = getattr(one, field), getattr(other, field)
         if first != second:
             return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
@@ -527,6 +529,18 @@ def _difference(one: Layer, other: Layer) -> str:
     field = next(key for key in keys if one.makes.get(key) != other.makes.get(key))
     first, second = one.makes.get(field), other.makes.get(field)
     return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+
+
+def _arrays(one: Layer, other: Layer) -> str:
+    """The arrays of a layer that another one lacks or has in another form."""
+    mine = [spec for spec in one.arrays if spec not in other.arrays]
+    return ", ".join(f"{spec.name} of {spec.dtype} {list(spec.shape)}" for spec in mine) or "no others"
+
+
+def _cure(layer: Layer) -> str:
+    shape = layer.arrays[0].shape
+    paint = f"add these images with `paint --size {shape[0]}`, or " if layer.kind == "images" and shape else ""
+    return f"{paint}choose another --out"
 
 
 def _short(value: Any) -> str:
