@@ -27,7 +27,7 @@ from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backg
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.files import replacing
 from dmcvb_gen.generate.inputs import video_source
-from dmcvb_gen.generate.recipe import RendererChoice
+from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
@@ -122,8 +122,7 @@ def protocol(
 def renderer_choice(subset: Subset) -> dict[str, Any]:
     """Name and samples of the renderer: the data's own, or the default one if the record names none of ours."""
     if subset.record.imported or not subset.record.renderer:
-        default = RendererChoice()
-        return {"name": default.backend, "samples": default.samples}
+        return {"name": NATIVE, "samples": None}
     return {"name": subset.record.renderer["name"], "samples": subset.record.renderer.get("samples")}
 
 
@@ -144,7 +143,7 @@ class EvaluationScene:
     setting: str
     pictures: Pictures
     size: int = 64
-    renderer: str = RendererChoice().backend
+    renderer: str = NATIVE
     samples: int | None = None
     backgrounds: str = "builtin"
     split: str = SPLIT
@@ -394,7 +393,7 @@ def evaluate(
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
     seen = getattr(policy, "evaluation", {}) or {}
-    drawn = seen.get("renderer") or {"name": RendererChoice().backend, "samples": None}
+    drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
     if renderer in (None, drawn["name"]):
         samples = drawn["samples"] if samples is None else samples
     shown = dict(renderer=renderer or drawn["name"], samples=samples, backgrounds=backgrounds, split=split)

@@ -42,6 +42,8 @@ from dmcvb_gen.tasks.base import Task
 
 DEFAULT_EPISODES_PER_SHARD = {LOCOMOTION: 50, ANT_MAZE: 10}
 """Episodes a shard: what a worker holds in memory and what a crash can cost."""
+NATIVE = "native"
+"""The renderer of the package itself, which draws the same bits everywhere."""
 MAX_STEPS = 5000
 """Longest episode that a recipe may ask for; a shard is held in memory."""
 
@@ -58,9 +60,12 @@ Names = Annotated[tuple[str, ...], pydantic.BeforeValidator(_as_tuple), pydantic
 
 
 class RendererChoice(_Model):
-    """Which renderer paints: backend "native" or "opengl"; samples a pixel (None: the renderer's default)."""
+    """Which renderer paints: backend "native" or "opengl"; samples a pixel (None: the renderer's default).
 
-    backend: str = "native"
+    A recipe that names no backend gets it when it is resolved (`resolve.with_renderer`).
+    """
+
+    backend: str | None = None
     samples: Literal[1, 2, 4, 8] | None = None
 
 

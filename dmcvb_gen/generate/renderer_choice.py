@@ -9,6 +9,7 @@ import numpy as np
 
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.rendering.native import NativeRenderer
 from dmcvb_gen.rendering.opengl import OpenglRenderer
@@ -40,13 +41,13 @@ def default_renderer(task: Task) -> str:
         _log.warning("%s is rendered by opengl: %s", name, error)
         return "opengl"
     if not is_own(task.id):
-        return "native"
+        return NATIVE
     if reason := OpenglRenderer.unavailable():
         _log.warning("%s is rendered by native, and nobody compared it with MuJoCo's own renderer: %s", name, reason)
-        return "native"
+        return NATIVE
     mean, block = disagreement(task)
     if mean <= LARGEST_MEAN and block <= LARGEST_BLOCK:
-        return "native"
+        return NATIVE
     _log.warning(
         f"{name} is rendered by opengl: native's pictures are {mean:.1f} grey levels off on average (at most "
         f"{LARGEST_MEAN:g} are allowed) and {block:.0f} in a block of {BLOCK} x {BLOCK} (at most {LARGEST_BLOCK:g})"

@@ -66,7 +66,7 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
             made = narrow(made, tasks, given.get("levels", ()), settings)
     else:
         made = _recipe_of(tasks, given.get("levels") or ("expert",), settings)
-    changes |= _renderer(given, made, () if recipe else tasks)
+    changes |= _renderer(given, made)
     made = override(made, **changes) if changes else made
     check_options_used(made, given)
     if given.get("sample") and is_own(str(given.get("behaviour") or "")):
@@ -141,18 +141,13 @@ def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
     return found
 
 
-def _renderer(given: Mapping[str, Any], recipe: Recipe, tasks: Sequence[str]) -> dict[str, Any]:
-    """The renderer that was asked for, else the recipe's; of tasks alone the first one that is not native, if any."""
-    from dmcvb_gen.generate.renderer_choice import default_renderer
-    from dmcvb_gen.tasks import get_task
-
-    old = recipe.renderer.backend
-    for name in (default_renderer(get_task(task)) for task in tasks):
-        old = name if old == "native" else old
-    backend = given.get("renderer", old)
-    kept = recipe.renderer.samples if backend == recipe.renderer.backend else None
+def _renderer(given: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
+    """The renderer that was asked for; another one than the recipe's has its own number of samples."""
+    old = recipe.renderer
+    backend = given.get("renderer", old.backend)
+    kept = old.samples if backend == old.backend else None
     chosen = {"backend": backend, "samples": given.get("samples", kept)}
-    return {} if chosen == recipe.renderer.model_dump() else {"renderer": chosen}
+    return {} if chosen == old.model_dump() else {"renderer": chosen}
 
 
 def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[str]) -> Recipe:

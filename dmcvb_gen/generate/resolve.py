@@ -36,8 +36,9 @@ from dmcvb_gen.errors import BackgroundError, RecipeError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.inputs import BUILTIN
 from dmcvb_gen.generate.modalities import get_modality
-from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD, Recipe, SubsetRequest, expand
+from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD, NATIVE, Recipe, SubsetRequest, expand
 from dmcvb_gen.generate.render import check_renderer, renderer_for
+from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.own_code import is_own, source_digest
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE
@@ -71,8 +72,8 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
     Raises:
       DmcvbError: a name, a policy, the videos or the renderer cannot be used.
     """
-    check_renderer(recipe.renderer.backend)
     requests = expand(recipe)
+    recipe = with_renderer(recipe, requests, there)
     sets: dict[str, list[SubsetRequest]] = {}
     for request in requests:
         sets.setdefault(set_name(request, recipe.trajectories), []).append(request)
@@ -114,6 +115,24 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
         subsets=tuple(subsets),
     )
     return Resolution(resolved, files)
+
+
+def with_renderer(recipe: Recipe, requests: Iterable[SubsetRequest], there: Release | None) -> Recipe:
+    """The recipe with a renderer: its own, else that of a release that was begun, else what draws its tasks best.
+
+    Raises:
+      RenderingError: that renderer cannot start here.
+    """
+    tasks = dict.fromkeys(request.task for request in requests)
+    backend = recipe.renderer.backend
+    if backend is None and there is not None:
+        begun = (record for record in there.manifest.subsets if record.task in tasks and not record.imported)
+        backend = next((record.renderer["name"] for record in begun), None)
+    if backend is None:
+        chosen = [default_renderer(get_task(task)) for task in tasks]
+        backend = next((name for name in chosen if name != NATIVE), NATIVE)
+    check_renderer(backend)
+    return recipe.model_copy(update={"renderer": recipe.renderer.model_copy(update={"backend": backend})})
 
 
 def set_name(request: SubsetRequest, trajectories: str) -> str:

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.generate import resolve
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, run_plan, start
 from dmcvb_gen.generate.progress import progress_of
@@ -89,6 +90,20 @@ def test_two_who_make_the_same_shards_end_in_one_release(whole, tmp_path):
     start(plan)
     list(run_works(plan.works[:3]))
     assert run_plan(plan, 1).release.digest == whole.digest  # the first three are made a second time
+
+
+def test_parts_and_repeated_begins_obey_the_renderer_of_the_begun_release(tmp_path, monkeypatch):
+    """Slurm's array begins in every task; another machine, without OpenGL, would choose otherwise."""
+    words = ["walker-walk", "--level", "random", "--episodes", 1, "--max-steps", 3, "--out", tmp_path / "r"]
+    asked = []
+    monkeypatch.setattr(resolve, "default_renderer", lambda task: asked.append(task.id) or "native")
+    begun = json.loads(run("cluster", "begin", *words, "--json"))
+    assert asked == ["walker-walk"]
+    monkeypatch.setattr(resolve, "default_renderer", lambda task: pytest.fail("a part asks for a renderer"))
+    for command in (["begin", *words], ["part", tmp_path / "r", "1/1"], ["finish", tmp_path / "r"]):
+        run("cluster", *command)
+    assert begun["shards"] == 1 and len(list((tmp_path / "r" / "recipes").iterdir())) == 1
+    assert [record.renderer["name"] for record in Release.open(tmp_path / "r").manifest.subsets] == ["native"]
 
 
 @pytest.mark.parametrize("words, cure", [
