@@ -5,7 +5,7 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import (
@@ -42,6 +42,7 @@ def rollout(
     episodes: Count | None = None,
     steps: Count | None = None,
     max_steps: Count | None = None,
+    action_repeat: Literal[1, 2, 4] | None = None,
     episode_range: Span | None = None,
     seed: Seed | None = None,
     size: int | None = None,
@@ -76,7 +77,8 @@ def rollout(
       goals: Mazes: visible, hidden, fixed, or fixed3 for 3 fixed pairs of start and goal. [default: visible]
       episodes: Episodes per subset; fixed goals share them. [default: 20]
       steps: Steps per subset, instead of --episodes.
-      max_steps: Longest episode, in steps. [default: 500, mazes 600]
+      max_steps: Longest episode, in steps. [default: 500, mazes 600, at action repeat 2]
+      action_repeat: Control steps for which an action is held. [default: 2]
       episode_range (RANGE): Generate only the shards with episodes A to B - 1.
       seed: Random seed of the release. [default: 0]
       size: Width and height of the images, in pixels. [default: 64]

@@ -549,7 +549,7 @@ def _load_encoder(path: Path, encoder: nn.Module) -> None:
 
 def data_score(subset: Subset, data: TrainingData) -> Score:
     """The score of training data, in the measures that policies are scored in."""
-    task = get_task(subset.task)
+    task = get_task(subset.task).at(subset.record.action_repeat)
     success = speed = None
     part = task.state_slices.get("target_vector")
     if part is not None:

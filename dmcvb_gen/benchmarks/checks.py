@@ -96,7 +96,9 @@ def check_policy_returns(subset: Subset) -> Iterator[Issue]:
 
 def comparable(subset: Subset) -> bool:
     """Return True if returns belong to episodes like those of the policies' evaluation and of the paper's tables."""
-    return subset.setting != FIXED and subset.record.max_steps == get_task(subset.task).max_steps
+    return subset.setting != FIXED and (
+        subset.record.max_steps == get_task(subset.task).at(subset.record.action_repeat).max_steps
+    )
 
 
 def check_paper_returns(subset: Subset) -> Iterator[Issue]:

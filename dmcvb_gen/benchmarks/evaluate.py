@@ -33,8 +33,7 @@ from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import LEVELS, SPLITS, GoalMode, SubsetSpec, parse_setting
-from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 
 if TYPE_CHECKING:
     from dmcvb_gen.agents.catalog import Agent
@@ -110,7 +109,8 @@ def protocol(
     Raises:
       BackgroundError: there are no `val` videos.
     """
-    facts: dict[str, Any] = {"steps": evaluation_steps(get_task(subset.task), max_steps), "goals": pair}
+    task = get_task(subset.task).at(subset.record.action_repeat)
+    facts: dict[str, Any] = {"steps": evaluation_steps(task, max_steps), "goals": pair}
     if pictures:
         facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
         if subset.record.distractor.kind != "none":
@@ -137,6 +137,7 @@ class EvaluationScene:
       renderer, samples: its name; samples a pixel, None for the renderer's default.
       backgrounds: "builtin" or a folder of videos.
       split: "val" shows videos and maze styles that are in no data, "train" those of the data.
+      action_repeat: control steps for which an action is held.
     """
 
     task: str
@@ -147,13 +148,16 @@ class EvaluationScene:
     samples: int | None = None
     backgrounds: str = "builtin"
     split: str = SPLIT
+    action_repeat: int = ACTION_REPEAT
 
     @classmethod
     def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
         """Return the scene of a subset; `backgrounds`: the videos' folder, if it is not where the manifest says."""
         choice, source = renderer_choice(subset), video_source(subset.release.path, subset.record, backgrounds)
         pictures, size = training_pictures(subset), subset.record.size
-        return cls(subset.task, subset.setting, pictures, size, choice["name"], choice["samples"], source)
+        shown = dict(pictures=pictures, size=size, renderer=choice["name"], samples=choice["samples"])
+        repeat = subset.record.action_repeat
+        return cls(subset.task, subset.setting, **shown, backgrounds=source, action_repeat=repeat)
 
     @classmethod
     def parse(cls, where: str, **options: Any) -> EvaluationScene:
@@ -210,7 +214,7 @@ class Evaluator:
         shots: int = 8,
     ):
         scene = EvaluationScene.of(where, backgrounds) if isinstance(where, Subset) else where
-        self.scene, self.task = scene, get_task(scene.task)
+        self.scene, self.task = scene, get_task(scene.task).at(scene.action_repeat)
         self.setting = parse_setting(scene.task, scene.setting)[0]
         self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
         self.steps = evaluation_steps(self.task, max_steps)

@@ -44,7 +44,7 @@ from dmcvb_gen.spec import (
     subset_name,
     task_folder,
 )
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
 FIXED_GOALS = 5
 """Fixed (start, goal) pairs a layout, as the paper made them."""
@@ -321,12 +321,13 @@ class SubsetFinder:
 
     def _shape(self, task: str) -> str:
         """Options that give new subsets the images' size and the time limit of what there is of a task."""
-        shapes = {(r.size, r.max_steps) for r in self._records.values() if r.task == task}
+        shapes = {(r.size, r.max_steps, r.action_repeat) for r in self._records.values() if r.task == task}
         if len(shapes) != 1:
             return ""
-        size, limit = shapes.pop()
+        size, limit, repeat = shapes.pop()
         options = f" --size {size}" if size != DEFAULT_SIZE else ""
-        return options + (f" --max-steps {limit}" if limit != get_task(task).max_steps else "")
+        options += f" --action-repeat {repeat}" if repeat != ACTION_REPEAT else ""
+        return options + (f" --max-steps {limit}" if limit != get_task(task).at(repeat).max_steps else "")
 
 
 # -- fixed goals of a maze --------------------------------------------------------------------------

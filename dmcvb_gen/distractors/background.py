@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
-from dmcvb_gen.tasks.base import ACTION_REPEAT
 
 TICKS_A_FRAME = 10
 """Control steps between two frames of the video."""
@@ -24,20 +23,24 @@ def ping_pong(start: int, direction: int, moves: np.ndarray, length: int) -> np.
 
 
 def background_walk(
-    lengths: Sequence[int], setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
+    lengths: Sequence[int],
+    setting: DistractorSetting,
+    ticks: np.ndarray,
+    generators: Sequence[np.random.Generator],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw videos, start frames and directions.
 
     Args:
       lengths: frames of each video; the first `setting.videos` of them are in play.
+      ticks: (frame,) int, control steps before each frame.
 
     Returns:
       video and frame, each (episode, frame) int16.
     """
     in_play = len(lengths) if setting.videos is None else min(setting.videos, len(lengths))
-    video = np.empty((len(generators), frames), np.int16)
-    index = np.empty((len(generators), frames), np.int16)
-    moves = ACTION_REPEAT * np.arange(frames) // TICKS_A_FRAME if setting.kind == "dynamic" else np.zeros(frames, int)
+    video = np.empty((len(generators), len(ticks)), np.int16)
+    index = np.empty((len(generators), len(ticks)), np.int16)
+    moves = ticks // TICKS_A_FRAME if setting.kind == "dynamic" else np.zeros_like(ticks)
     for episode, rng in enumerate(generators):
         chosen = int(rng.integers(in_play))
         start, direction = int(rng.integers(lengths[chosen])), int(rng.integers(2)) * 2 - 1
@@ -56,8 +59,8 @@ class Background(Distractor):
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         if scene.backgrounds is None:
             raise ValueError(f"distractor {scene.setting.name!r} needs backgrounds")
-        lengths = scene.backgrounds.lengths
-        self._video, self._index = background_walk(lengths, scene.setting, scene.frames, generators)
+        lengths, ticks = scene.backgrounds.lengths, scene.task.action_repeat * np.arange(scene.frames)
+        self._video, self._index = background_walk(lengths, scene.setting, ticks, generators)
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         return {"background_video": self._video[:, frames], "background_frame": self._index[:, frames]}

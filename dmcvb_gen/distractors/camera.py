@@ -82,13 +82,20 @@ def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
 
 
 def camera_walk(
-    bounds: CameraRange, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
+    bounds: CameraRange,
+    setting: DistractorSetting,
+    frames: int,
+    generators: Sequence[np.random.Generator],
+    repeat: int = ACTION_REPEAT,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the camera's walk, relative to the agent.
 
     Place and roll start uniform in their ranges, speeds uniform below their limits in a random direction. Where
     a range ends, the camera stops pushing outwards, as in the Distracting Control Suite: it slides along the end
     and leaves it with the next step inwards. Static cameras start like dynamic ones of the same streams.
+
+    Args:
+      repeat: control steps, and so ticks, a frame.
 
     Returns:
       offset (episode, frame, 3) meters from the centre of mass, roll (episode, frame) radians. A longer
@@ -108,7 +115,7 @@ def camera_walk(
     share = np.stack([rng.random(2) for rng in generators])  # of the top speeds
     velocity = heading / arithmetic.norm(heading, axis=1, keepdims=True) * share[:, :1] * MAX_SPEED * unit
     roll_velocity = (2 * share[:, 1] - 1) * limit
-    ticks = ACTION_REPEAT * (frames - 1)
+    ticks = repeat * (frames - 1)
     # The coordinate comes first from here on, and calls are few: of a loop over ticks they are what takes the time.
     noise = np.stack([arithmetic.normal(rng, (ticks, 4)).T for rng in generators], axis=-1)  # (4, tick, episode)
     pushes, twists = VELOCITY_STD * unit * noise[:3], ROLL_VELOCITY_STD * scale * noise[3]
@@ -121,8 +128,8 @@ def camera_walk(
         roll_velocity = np.clip(roll_velocity + twists[tick], -limit, limit)
         rolled = np.clip(roll + roll_velocity, -bounds.roll, bounds.roll)
         roll, roll_velocity = rolled, rolled - roll
-        if (tick + 1) % ACTION_REPEAT == 0:
-            frame = (tick + 1) // ACTION_REPEAT
+        if (tick + 1) % repeat == 0:
+            frame = (tick + 1) // repeat
             offsets[:, frame], rolls[:, frame] = position.T, roll
     return offsets, rolls
 
@@ -184,7 +191,7 @@ class Camera(Distractor):
         self._task, model, camera = scene.task, scene.task.model, camera_ids(scene.task)[0]
         offset = np.asarray(model.cam_poscom0[camera])
         bounds = camera_range(offset, scene.setting)
-        self._offset, roll = camera_walk(bounds, scene.setting, scene.frames, generators)
+        self._offset, roll = camera_walk(bounds, scene.setting, scene.frames, generators, scene.task.action_repeat)
         target = nominal_target(offset, model.cam_mat0[camera].reshape(3, 3))
         self._quaternion = quaternions(look_at(self._offset - target, roll))
 

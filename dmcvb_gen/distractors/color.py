@@ -10,7 +10,7 @@ from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.spec import ALL_PARTS, CUE
-from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
+from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import seen_materials
 
 STEP_STD = 0.03
@@ -18,12 +18,17 @@ STEP_STD = 0.03
 
 
 def color_walk(
-    own: np.ndarray, setting: DistractorSetting, frames: int, generators: Sequence[np.random.Generator]
+    own: np.ndarray,
+    setting: DistractorSetting,
+    frames: int,
+    generators: Sequence[np.random.Generator],
+    repeat: int,
 ) -> np.ndarray:
     """Draw the colors of all materials.
 
     Args:
       own: (material, 3) the model's colors.
+      repeat: control steps, and so ticks, a frame.
 
     Returns:
       (episode, frame, material, 3) in [0, 1], never farther than s from the model's own.
@@ -36,12 +41,12 @@ def color_walk(
     out[:] = color[:, None]
     if setting.kind != "dynamic":
         return out
-    ticks = ACTION_REPEAT * (frames - 1)
+    ticks = repeat * (frames - 1)
     noise = np.stack([arithmetic.normal(rng, (ticks, *own.shape)) for rng in generators], axis=1)
     for tick in range(ticks):
         color = np.clip(color + STEP_STD * scale * noise[tick], low, high)
-        if (tick + 1) % ACTION_REPEAT == 0:
-            out[:, (tick + 1) // ACTION_REPEAT] = color
+        if (tick + 1) % repeat == 0:
+            out[:, (tick + 1) // repeat] = color
     return out
 
 
@@ -62,7 +67,7 @@ class Color(Distractor):
         own = scene.task.material_colors
         if not any(scene.setting.varies(part) for part in ALL_PARTS if part not in (self.stream, CUE)):
             check_colors_are_seen(scene.task)
-        self._colors = color_walk(own, scene.setting, scene.frames, generators)
+        self._colors = color_walk(own, scene.setting, scene.frames, generators, scene.task.action_repeat)
         unseen = np.setdiff1d(np.arange(len(own)), seen_materials(scene.task.model))
         self._colors[:, :, unseen] = own[unseen]  # a label that nobody sees would only cost bytes
 

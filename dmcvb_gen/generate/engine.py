@@ -168,7 +168,7 @@ def _plain(spec: ArraySpec) -> str:
 
 def simulated_episodes(work: Work, record: SubsetRecord, threads: int, clock: _Clock) -> Episodes:
     """Simulate the episodes of a shard."""
-    task, makes = get_task(record.task), work.trajectories.makes
+    task, makes = get_task(record.task).at(record.action_repeat), work.trajectories.makes
     pairs = None
     if makes["fixed_goals"]:
         per_goal = makes["episodes_per_goal"]

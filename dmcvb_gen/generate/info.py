@@ -12,8 +12,8 @@ from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds, is_maze
 from dmcvb_gen.version import __version__
 
-PAPER_STEPS = {False: 500, True: 600}
-"""Agent steps at the time limit of the paper's data: locomotion, mazes."""
+PAPER_STEPS = {False: 1000, True: 1200}
+"""Control steps at the time limit of the paper's data: locomotion, mazes."""
 
 
 def return_statistics(returns: np.ndarray) -> dict[str, float]:
@@ -51,7 +51,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 images=any(layer.kind == "images" for layer in subset.layers),
                 renderer=subset.record.renderer.get("name"),
                 returns=return_statistics(subset.returns),
-                other_length=subset.record.max_steps != PAPER_STEPS[is_maze(subset.task)],
+                other_length=subset.record.max_steps * subset.record.action_repeat != PAPER_STEPS[is_maze(subset.task)],
                 paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
             )
         )

@@ -101,6 +101,7 @@ class Recipe(_Model):
     Attributes:
       seed: seed of every random stream.
       size: pixels a side.
+      action_repeat: control steps for which an action is held; release's recipes leave out 2.
       trajectories: "shared": the settings of a task and level show the same episodes; "independent": each its own.
       backgrounds: "builtin" or a folder of videos.
       split: which videos (and maze styles): "train" for data, "val" for evaluation.
@@ -113,11 +114,17 @@ class Recipe(_Model):
     authors: tuple[str, ...] = ()
     seed: int = pydantic.Field(default=0, ge=0)
     size: int = 64
+    action_repeat: Literal[1, 2, 4] = 2
     renderer: RendererChoice = RendererChoice()
     trajectories: Literal["shared", "independent"] = "shared"
     backgrounds: str = "builtin"
     split: Literal["train", "val"] = "train"
     subsets: tuple[SubsetPattern, ...] = pydantic.Field(min_length=1)
+
+    @pydantic.model_serializer(mode="wrap")
+    def _without_usual_repeat(self, write: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes of DMC-VB's action repeat stay as they were before others could be had, and so their digests."""
+        return {name: value for name, value in write(self).items() if (name, value) != ("action_repeat", 2)}
 
 
 class SubsetRequest(_Model):
@@ -156,7 +163,7 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     requests: dict[str, SubsetRequest] = {}
     for pattern in recipe.subsets:
         for task_id in pattern.tasks:
-            task = get_task(task_id)
+            task = get_task(task_id).at(recipe.action_repeat)
             for level in pattern.levels:
                 for setting in pattern.settings:
                     spec = SubsetSpec.parse(task_id, level, setting)

@@ -120,7 +120,7 @@ def distractor_state_of(
       backgrounds: the videos, None if the distractor shows none.
       action: (episode, row, action), taken at each row; cues follow the one before a frame.
     """
-    task = get_task(record.task)
+    task = get_task(record.task).at(record.action_repeat)
     rows = int(length.max()) + 1
     after = np.arange(rows)[None] > length[:, None]
     padded = physics[:, :rows].copy()

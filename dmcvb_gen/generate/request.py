@@ -20,11 +20,12 @@ from dmcvb_gen.spec import (
     is_maze,
     task_folder,
 )
+from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.text import as_names
 
 EPISODES = 20
 """Default number of episodes of a subset."""
-_SAME_NAME = ("episodes", "steps", "max_steps", "episodes_per_shard", "seed", "size", "split")
+_SAME_NAME = ("episodes", "steps", "max_steps", "action_repeat", "episodes_per_shard", "seed", "size", "split")
 RECIPE_OPTIONS = {*_SAME_NAME, "levels", "distractors", "goals", "sample", "renderer", "samples", "backgrounds"}
 RECIPE_OPTIONS |= {"behaviour", "independent"}
 """Options that say what to make, not where or how."""
@@ -65,7 +66,8 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
         if tasks or given.get("levels") or settings:
             made = narrow(made, tasks, given.get("levels", ()), settings)
     else:
-        made = _recipe_of(tasks, given.get("levels") or ("expert",), settings)
+        repeat = given.get("action_repeat", ACTION_REPEAT)
+        made = _recipe_of(tasks, given.get("levels") or ("expert",), settings, repeat)
     changes |= _renderer(given, made)
     made = override(made, **changes) if changes else made
     check_options_used(made, given)
@@ -150,7 +152,7 @@ def _renderer(given: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
     return {} if chosen == old.model_dump() else {"renderer": chosen}
 
 
-def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[str]) -> Recipe:
+def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[str], repeat: int) -> Recipe:
     """The recipe of tasks of one family, with the counts that `override` then changes."""
     for level in levels:
         Level.parse(level)
@@ -161,7 +163,8 @@ def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[s
         if True in mazes:
             raise RecipeError("--distractor has no effect in mazes, which vary in style; ask for --goal visible")
         raise RecipeError(f"{tasks[0]} has no goal {strange[0]}; --goal is for mazes, ask for --distractor")
-    name = "-".join(dict.fromkeys([*map(task_folder, tasks), *levels]))[:80].rstrip("-.")
+    words = [*map(task_folder, tasks), *levels, *([f"repeat{repeat}"] if repeat != ACTION_REPEAT else [])]
+    name = "-".join(dict.fromkeys(words))[:80].rstrip("-.")
     pattern: dict[str, Any] = {"tasks": list(tasks), "levels": list(levels)}
     pattern |= {"settings": list(settings) or [VISIBLE if True in mazes else "none"], "episodes": EPISODES}
     return make_recipe({"name": name, "subsets": [pattern]}, "command line")

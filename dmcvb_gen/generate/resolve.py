@@ -12,6 +12,7 @@ is said before hours are spent.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,9 +45,11 @@ from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import SPLITS, is_maze
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,7 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
                 )
             layers |= {layer.name: layer for layer in made[1:]}
             subsets.append(record.model_copy(update={"layers": tuple(layer.name for layer in made)}))
+    _tell_of_held_actions(recipe, subsets)
     resolved = Resolved(
         name=recipe.name,
         version=recipe.version,
@@ -268,7 +272,7 @@ def _above(record: SubsetRecord, labels: Layer, spec: Any, makes: dict[str, Any]
 
 def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> SubsetRecord:
     """A subset's entry in the manifest, without the facts of its renderer and its layers."""
-    task = get_task(request.task)
+    task = get_task(request.task).at(recipe.action_repeat)
     goals = request.episodes_per_goal and request.episodes // request.episodes_per_goal
     if goals:
         fixed_pairs(as_maze(task).layout, goals, recipe.seed)
@@ -288,13 +292,26 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
         views=tuple(task.views),
         hidden_goal=bool(task.goal_geoms) and request.spec.hides_goal,
         max_steps=request.max_steps,
-        seconds_per_step=2 * task.control_timestep,
+        action_repeat=recipe.action_repeat,
+        seconds_per_step=task.seconds_per_step,
         fixed_goals=goals,
         episodes_per_goal=request.episodes_per_goal,
         split=recipe.split,
         joints=tuple(model.joint(number).name for number in range(model.njnt)),
         actuators=tuple(model.actuator(number).name for number in range(model.nu)),
     )
+
+
+def _tell_of_held_actions(recipe: Recipe, subsets: Iterable[SubsetRecord]) -> None:
+    """Log a line for policies that act more rarely than in their training."""
+    headers = {policy.name: policy.header for record in subsets for policy in record.policies}
+    for name, header in headers.items():
+        trained = header.get("action_repeat", ACTION_REPEAT)
+        if header.get("algorithm") != OWN_CODE and trained < recipe.action_repeat:
+            _log.warning(
+                f"{name} was trained at action repeat {trained}, and its actions are held for {recipe.action_repeat} "
+                "control steps; expect lower returns"
+            )
 
 
 def _policy_record(path: Path, task: Task) -> PolicyRecord:

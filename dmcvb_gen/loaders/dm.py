@@ -28,7 +28,7 @@ class DmEnv(dm_env.Environment):
         return dm_env.restart(observation)
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """One agent step (two control steps); after the last one, a new episode starts whatever the action."""
+        """One agent step; after the last one, a new episode starts whatever the action."""
         if not self._running:
             return self.reset()
         observation, reward, terminated, truncated, _ = self._env.step(action)

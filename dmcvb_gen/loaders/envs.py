@@ -37,7 +37,7 @@ from dmcvb_gen.spec import (
     SubsetSpec,
     is_maze,
 )
-from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
+from dmcvb_gen.tasks import Task, get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.text import as_names
 
@@ -65,6 +65,7 @@ class Scene:
       own_videos: digest of the videos of the data, if these are not the built-in ones; then give `backgrounds`.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
       modalities: names of modalities that observations have too, e.g. "depth" and "parts"; see `generate.modalities`.
+      action_repeat: control steps for which an action is held; give that of the data.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
       fixed_goals: number of pairs of start and goal under "fixed"; an episode takes the next one.
       goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
@@ -83,6 +84,7 @@ class Scene:
     own_videos: str | None = None
     views: str | Sequence[str] | None = None
     modalities: str | Sequence[str] = ()
+    action_repeat: Literal[1, 2, 4] = 2
     max_steps: Count | None = None
     goal: Literal["visible", "hidden"] | None = None
     fixed_goals: Count = FIXED_GOALS
@@ -166,7 +168,8 @@ class _Stage:
         if count < 1:
             raise DmcvbError(f"num_envs is {count}; give at least 1")
         spec = scene.spec()
-        self.task, self.count, self.size, self.split = get_task(scene.task), count, scene.size, scene.split
+        self.task, self.count = get_task(scene.task).at(scene.action_repeat), count
+        self.size, self.split = scene.size, scene.split
         self.setting = spec.distractor
         hide = scene.goal == HIDDEN if scene.goal else spec.hides_goal
         self.pictures = Pictures(self.task.views, hide).select(scene.views)
@@ -295,8 +298,8 @@ class DistractedEnv(gymnasium.Env):
     """One episode at a time.
 
     Observations are {"pixels": (size, size, 3 * views) uint8, "state": (state,) float32}; an action (action,) in
-    the task's bounds, [-1, 1] for most, is held for two control steps, whose rewards are summed (an episode earns at
-    most 1000). The seed of `reset` decides initial states, distractors and all episodes after it.
+    the task's bounds, [-1, 1] for most, is held for `action_repeat` control steps, whose rewards are summed (an episode
+    earns at most 1000). The seed of `reset` decides initial states, distractors and all episodes after it.
 
     Args:
       task: its name, see `Scene`.
@@ -316,7 +319,7 @@ class DistractedEnv(gymnasium.Env):
         self._stage = _Stage(1, _scene(task, distractor, options))
         self.task, self.render_mode = self._stage.task, render_mode
         self.observation_space, self.action_space = self._stage.spaces()
-        self.metadata = self.metadata | {"render_fps": round(1 / (ACTION_REPEAT * self.task.control_timestep))}
+        self.metadata = self.metadata | {"render_fps": round(1 / self.task.seconds_per_step)}
         self._seed: int | None = None
         self._ended = False
         self._pixels: np.ndarray | None = None

@@ -37,6 +37,7 @@ def lazy_dataset(subset: Subset, episodes: np.ndarray) -> xarray.Dataset:
         "level": record.level,
         "setting": record.setting,
         "views": list(record.views),
+        "action_repeat": record.action_repeat,
         "seconds_per_step": record.seconds_per_step,
     }
     data = xarray.Dataset(variables, attrs=attributes).isel(episode=episodes)

@@ -8,7 +8,7 @@ from dmcvb_gen import arithmetic
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import Evaluation
 from dmcvb_gen.policies.simulate import Simulation, simulate
-from dmcvb_gen.tasks.base import ACTION_REPEAT, Task
+from dmcvb_gen.tasks.base import Task
 
 FRESH = "selection"
 """Streams of the episodes that decide which checkpoint is picked: a training's evaluations see none of them."""
@@ -65,7 +65,7 @@ def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, ta
       distance: (episode,) to the goal at the start in a straight line, meters.
       length: (episode,) agent steps. reached: (episode,) bool.
     """
-    seconds = length * ACTION_REPEAT * task.control_timestep
+    seconds = length * task.seconds_per_step
     return float((distance / seconds)[reached].mean()) if reached.any() else None
 
 
@@ -89,7 +89,7 @@ def running_speed(task: Task, simulation: Simulation) -> float | None:
         return None
     moved = np.diff(simulation.state[..., part].astype(np.float64), axis=1)
     taken = np.arange(moved.shape[1]) < simulation.length[:, None]
-    return float(np.sqrt((moved[taken] ** 2).sum(axis=1).mean()) / (ACTION_REPEAT * task.control_timestep))
+    return float(np.sqrt((moved[taken] ** 2).sum(axis=1).mean()) / task.seconds_per_step)
 
 
 def walked_paths(task: Task, simulation: Simulation, count: int = 10) -> list[tuple[np.ndarray, np.ndarray]]:

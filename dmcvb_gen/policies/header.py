@@ -67,7 +67,8 @@ class PolicyHeader(_Model):
       task: the task's id.
       observation: the name of what it sees, `task.observation`.
       algorithm: algorithm that trained it, e.g. "sac"; `origin` says it in words.
-      agent_step: environment steps (at action repeat 2) it was trained for.
+      agent_step: environment steps (at its action repeat) it was trained for.
+      action_repeat: control steps that its actions were held in training; files leave out 2.
       hidden: widths of the hidden layers.
       layer_norm: True if each hidden layer is normalized before its activation.
       distribution: "squashed_gaussian": tanh(mean + std * noise); "gaussian": clipped to [-1, 1];
@@ -88,6 +89,7 @@ class PolicyHeader(_Model):
     action_size: Width
     algorithm: str
     agent_step: int = pydantic.Field(ge=0)
+    action_repeat: Literal[1, 2, 4] = 2
     level: str | None = None
     hidden: Annotated[tuple[Width, ...], pydantic.Field(max_length=MAX_LAYERS)]
     way: Annotated[tuple[Width, ...] | None, pydantic.Field(max_length=MAX_LAYERS)] = None
@@ -99,6 +101,11 @@ class PolicyHeader(_Model):
     evaluation: Evaluation | None = None
     training: dict[str, Any] = {}
     command: str = ""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _without_usual_repeat(self, write: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Headers of DMC-VB's action repeat stay as they were before others could be had."""
+        return {name: value for name, value in write(self).items() if (name, value) != ("action_repeat", 2)}
 
     @property
     def origin(self) -> str:

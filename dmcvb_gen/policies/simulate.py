@@ -73,16 +73,24 @@ def _actions(
     active: np.ndarray,
     task: Task,
     deterministic: bool,
+    step: int,
+    before: np.ndarray,
 ) -> np.ndarray:
     """Actions of a batch of episodes, each from its own policy; zeros once an episode is over.
+
+    A policy that was trained at a larger action repeat than the task's is asked in every second or fourth step alone.
+
+    Args:
+      step: number of the agent step. before: (size, action), the actions of the step before.
 
     Returns:
       (size, action) float32, in the task's own bounds.
     """
-    actions = np.zeros((len(observations), task.action_size), np.float32)
+    actions = np.where(active[:, None], before, np.float32(0))
     for index in np.unique(assigned).tolist():
         rows = np.flatnonzero(active & (assigned == index))
-        if len(rows):
+        held = max(1, (policies[index].trained_at or 1) // task.action_repeat)
+        if len(rows) and step % held == 0:
             streams = [generators[int(row)] for row in rows]
             given = policies[index].act(observations[rows], streams, deterministic)
             actions[rows] = task.from_unit(given) if policies[index].unit else given
@@ -210,6 +218,7 @@ def _step_to_the_end(
     limit = out.state.shape[1] - 1
     active = np.ones(len(state), bool)
     over = np.zeros(len(state), bool)
+    actions = np.zeros((len(state), batch.task.action_size), np.float32)
     for step in range(limit + 1):
         out.state[active, step] = state[active]
         out.physics[active, step] = batch.physics()[active]
@@ -218,7 +227,8 @@ def _step_to_the_end(
             break
         started = time.perf_counter()
         seen = batch.behaviour_observation()
-        actions = _actions(policies, out.behaviour, noise, seen, active, batch.task, deterministic)
+        given = (seen, active, batch.task, deterministic, step, actions)
+        actions = _actions(policies, out.behaviour, noise, *given)
         acted = time.perf_counter()
         result = batch.step(actions, active)
         out.seconds["policy"] += acted - started

@@ -5,6 +5,7 @@ Everything in a card comes from the manifest and the data. `check_card` writes a
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import re
@@ -21,11 +22,12 @@ from PIL import Image
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
 from dmcvb_gen.dataset.writer import read_provenance
-from dmcvb_gen.distractors import background, camera, color, cue, light, shake
+from dmcvb_gen.distractors import background, camera, color, cue, light, load_backgrounds, shake
 from dmcvb_gen.distractors.base import KINDS, DistractorSetting
 from dmcvb_gen.distractors.registry import distractors_of
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.info import describe_release
+from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.policies.header import OWN_CODE, origin_of
@@ -47,6 +49,7 @@ from dmcvb_gen.release.templates import fill
 from dmcvb_gen.spec import CUE, FIXED, LIGHT, SHAKE
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import open_store
+from dmcvb_gen.tasks import ACTION_REPEAT
 from dmcvb_gen.text import pluralize
 
 README, CROISSANT = "README.md", "croissant.json"
@@ -381,6 +384,7 @@ def _limits(release: Release) -> list[str]:
         limits.append("Not complete: only a part of the recipe's shards is here.")
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
+    limits += _lacking_videos(release)
     policies = {policy.digest: policy for record in manifest.subsets for policy in record.policies}.values()
     own = [policy for policy in policies if policy.header.get("algorithm") == OWN_CODE]
     limits += [
@@ -396,6 +400,10 @@ def _limits(release: Release) -> list[str]:
     if small:
         which = "All" if len(small) == len(steps) else f"{len(small)} of {len(steps)}"
         limits.append(f"{which} subsets have fewer steps than the paper's million.")
+    repeats = sorted({record.action_repeat for record in manifest.subsets})
+    if repeats != [ACTION_REPEAT]:
+        held = " or ".join(map(str, repeats))
+        limits.append(f"An action is held for {held} control steps, in DMC-VB for {ACTION_REPEAT}.")
     seconds = {record.seconds_per_step for record in manifest.subsets}
     limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
     if is_imported(release):
@@ -403,6 +411,19 @@ def _limits(release: Release) -> list[str]:
     else:
         limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")
     return limits
+
+
+def _lacking_videos(release: Release) -> list[str]:
+    """A sentence for each number of background videos that a setting names and that is more than there are."""
+    found: dict[str, None] = {}
+    for record in release.manifest.subsets:
+        if not record.backgrounds or not record.distractor.videos:
+            continue
+        with contextlib.suppress(BackgroundError):  # a folder of videos that is elsewhere now
+            there = len(load_backgrounds(video_source(release.place, record), record.split))
+            if there < record.distractor.videos:
+                found[f"{record.distractor.videos} background videos are asked for, and {there} are there."] = None
+    return list(found)
 
 
 # -- pictures -------------------------------------------------------------------------------------

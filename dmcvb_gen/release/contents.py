@@ -59,7 +59,7 @@ def _sample(count: int, wanted: int) -> np.ndarray:
 
 def check_values(subset: Subset) -> Iterator[Issue]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
-    task = get_task(subset.task)
+    task = get_task(subset.task).at(subset.record.action_repeat)
     for spec in trajectory_arrays(EpisodeShape.of(task)):
         if spec.name == "physics" and subset.record.imported:
             continue
@@ -107,7 +107,7 @@ def check_values(subset: Subset) -> Iterator[Issue]:
 
 def check_physics(subset: Subset) -> Iterator[Issue]:
     """Sampled steps simulated again: state, reward and next physics state are the stored ones."""
-    task = get_task(subset.task)
+    task = get_task(subset.task).at(subset.record.action_repeat)
     known = np.ones(task.state_size, bool)
     for name in task.unstored_fields:
         known[task.state_slices[name]] = False
@@ -145,7 +145,7 @@ def check_replays(subset: Subset) -> Iterator[Issue]:
     On another processor a last bit may differ, and grow from step to step: what follows is not compared. A difference
     that comes at once is a finding.
     """
-    task, makes = get_task(subset.task), subset.trajectories.makes
+    task, makes = get_task(subset.task).at(subset.record.action_repeat), subset.trajectories.makes
     for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
         episode, length = int(subset.episodes[index]), int(subset.lengths[index])
         values = subset.episode(episode, ["state", "action", "reward", "physics"])

@@ -31,7 +31,7 @@ from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec, subset_name
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
 ORIGIN = "DMC-VB (Ortiz et al., NeurIPS 2024), TFDS folders"
@@ -234,7 +234,7 @@ def _record(
         views=views,
         hidden_goal=hidden,
         max_steps=_time_limit(places, of),
-        seconds_per_step=ACTION_REPEAT * of.control_timestep,
+        seconds_per_step=of.seconds_per_step,
         joints=tuple(of.model.joint(number).name for number in range(of.model.njnt)),
         actuators=tuple(of.model.actuator(number).name for number in range(of.model.nu)),
         fixed_goals=goals if pairs else None,

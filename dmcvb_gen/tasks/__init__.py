@@ -15,7 +15,7 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
-from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
+from dmcvb_gen.tasks.base import ACTION_REPEAT, ACTION_REPEATS, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
 from dmcvb_gen.tasks.own import own_task
 from dmcvb_gen.tasks.suite import REFUSED, suite_ids, suite_task
@@ -95,6 +95,7 @@ def get_task(task_id: str) -> Task:
 
 __all__ = [
     "ACTION_REPEAT",
+    "ACTION_REPEATS",
     "ANT_MAZE_TASKS",
     "LOCOMOTION_TASKS",
     "PHYSICS_SPEC",

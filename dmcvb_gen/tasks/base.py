@@ -4,13 +4,15 @@ A `Task` is the description (one per task id, shared freely). `Task.batch` makes
 side by side. Those of DMC-VB's own tasks are each a `PhysicsBatch`: one `mujoco.batch.Batch`, stepped together. Every
 other task is stepped by dm_control (see `environment`). Tasks know nothing of pixels.
 
-One agent step is `ACTION_REPEAT` control steps with the same action; their rewards are summed
-(paper, section 3.2). Step t of an episode holds the state before action t and the reward that it earned.
+One agent step is `Task.action_repeat` control steps with the same action; their rewards are summed, each times the
+discounts before it, and their discounts multiplied, as an action repeat wrapper does. Step t of an episode holds the
+state before action t and the reward that it earned.
 """
 
 from __future__ import annotations
 
 import abc
+import copy
 import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +28,9 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.spec import LOCOMOTION
 
 ACTION_REPEAT = 2
-"""Control steps an agent step (paper, section 3.2)."""
+"""Control steps an agent step (paper, section 3.2), unless a recipe says otherwise."""
+ACTION_REPEATS = (1, 2, 4)
+"""What recipes may ask for."""
 
 PHYSICS_SPEC = int(
     mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -45,7 +49,7 @@ class StepResult:
 
     Attributes:
       state: (size, state) float64, the states after the step.
-      reward: (size,) float64, summed over the control steps.
+      reward: (size,) float64, summed over the control steps, each times the discounts before it.
       terminated: (size,) bool, the task ended by itself (never by the time limit).
       truncated: (size,) bool, the task cut the episode off: what follows would have had a value.
       discount: (size,) float64, the product of the control steps' discounts; 0 where the task ended.
@@ -92,6 +96,7 @@ class Task(abc.ABC):
       state_fields: name -> size of each part of the state, in the state's order.
       max_steps: agent steps at which the time limit ends an episode of data.
       evaluation_steps: the same for the online evaluation of agents.
+      action_repeat: control steps an agent step; see `at`.
       substeps: physics steps a control step.
       views: the names of the pictures made of each frame; ("pixels",) for a task with one.
       return_range: (lowest, highest) return an episode of data can have.
@@ -105,6 +110,7 @@ class Task(abc.ABC):
     state_fields: Mapping[str, int]
     max_steps: int
     evaluation_steps: int
+    action_repeat: int = ACTION_REPEAT
     substeps: int
     views: tuple[str, ...] = ("pixels",)
     return_range: tuple[float, float] = (0.0, 1000.0)
@@ -216,8 +222,25 @@ class Task(abc.ABC):
 
     @property
     def control_timestep(self) -> float:
-        """Seconds a control step; an agent step takes `ACTION_REPEAT` of them."""
+        """Seconds a control step."""
         return self.substeps * self.model.opt.timestep
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Seconds an agent step."""
+        return self.action_repeat * self.control_timestep
+
+    def at(self, action_repeat: int) -> Task:
+        """This task at an action repeat; its time limits last as long, in other numbers of agent steps."""
+        if action_repeat == self.action_repeat:
+            return self
+        made = self.__dict__.setdefault("_at", {})
+        if action_repeat not in made:
+            made[action_repeat] = other = copy.copy(self)
+            other.action_repeat = action_repeat
+            for name in ("max_steps", "evaluation_steps"):
+                setattr(other, name, math.ceil(getattr(self, name) * self.action_repeat / action_repeat))
+        return made[action_repeat]
 
     @abc.abstractmethod
     def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
@@ -267,8 +290,8 @@ class EpisodeBatch(abc.ABC):
           active: (size,) bool, the simulations to step; the others stay as they are and earn nothing.
             All by default.
 
-        An episode that terminates at its first control step is frozen for the second: its state stays
-        what it was at the end and it earns nothing more (as an action-repeat wrapper that breaks).
+        An episode that terminates at a control step is frozen for the rest: its state stays what it was at the end and
+        it earns nothing more (as an action repeat wrapper that breaks).
 
         Raises:
           EpisodeError: a simulation diverged, or a user's own task failed or gave what is no finite number.
@@ -368,7 +391,7 @@ class PhysicsBatch(EpisodeBatch):
         reward = np.zeros(self.size)
         terminated = np.zeros(self.size, bool)
         stepped = np.flatnonzero(moving)
-        for _ in range(ACTION_REPEAT):
+        for _ in range(self.task.action_repeat):
             if not moving.any():
                 break
             self._advance(None if moving.all() else np.flatnonzero(moving))

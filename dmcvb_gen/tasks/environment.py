@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.tasks.base import ACTION_REPEAT, EpisodeBatch, EpisodeError, StepResult, Task, diverged, field_owner
+from dmcvb_gen.tasks.base import EpisodeBatch, EpisodeError, StepResult, Task, diverged, field_owner
 from dmcvb_gen.tasks.randomness import held_states, seed_task, seeded, watched
 
 DEFAULT_STEPS = 500
@@ -65,11 +65,13 @@ class EnvironmentTask(Task):
             environment = self.make_environment(PROBE_SEEDS[0])
             _check_environment(id, environment)
             self._low, self._high = _bounds(id, environment)
-            limit = environment._step_limit / ACTION_REPEAT
+            self._control_steps = environment._step_limit
             self.substeps, self._control_timestep = environment._n_sub_steps, environment.control_timestep()
-        self.max_steps = math.ceil(limit - 1e-6) if math.isfinite(limit) else DEFAULT_STEPS
-        self.evaluation_steps = self.max_steps
-        self.return_range = (-math.inf, math.inf) if domain in ("", "lqr") else (0.0, 2.0 * self.max_steps)
+        if not math.isfinite(self._control_steps):
+            self._control_steps = DEFAULT_STEPS * self.action_repeat
+        self._set_limits()
+        most = float(self.action_repeat * self.max_steps)
+        self.return_range = (-math.inf, math.inf) if domain in ("", "lqr") else (0.0, most)
         self._examine(environment)
 
     @contextlib.contextmanager
@@ -115,6 +117,14 @@ class EnvironmentTask(Task):
     @property
     def control_timestep(self) -> float:
         return self._control_timestep
+
+    def at(self, action_repeat: int) -> Task:
+        other = super().at(action_repeat)
+        other._set_limits()  # an odd number of control steps
+        return other
+
+    def _set_limits(self) -> None:
+        self.max_steps = self.evaluation_steps = math.ceil(self._control_steps / self.action_repeat - 1e-6)
 
     def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
         return EnvironmentBatch(self, size)
@@ -335,11 +345,11 @@ class _Episode:
         """Reward and discount of an agent step."""
         total, discount = 0.0, 1.0
         with self._told():
-            for _ in range(ACTION_REPEAT):
+            for _ in range(self.task.action_repeat):
                 found = self.environment.step(action.copy())
                 if found.first():
                     raise self.error("it began another episode within a step; end an episode with a last TimeStep")
-                total += float(found.reward)  # numpy would make NaN of None
+                total += discount * float(found.reward)  # numpy would make NaN of None
                 discount *= float(found.discount)
                 if found.last():
                     self.terminated, self.truncated = found.discount == 0, found.discount != 0

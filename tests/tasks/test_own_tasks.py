@@ -13,7 +13,6 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.simulate import replay, simulate
 from dmcvb_gen.seeding import episode_stream
-from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.tasks.cameras import Kinematics, nominal_cameras
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from tests.tasks import hostile_tasks as h
@@ -114,9 +113,10 @@ def check_episode(task, made, place, environment):
         assert (environment.action_spec().minimum <= action).all() and (
             action <= environment.action_spec().maximum
         ).all()
-        for _ in range(ACTION_REPEAT):
+        for _ in range(task.action_repeat):
             step = environment.step(action.astype(float))
-            reward, discount, last = reward + step.reward, discount * step.discount, step.last()
+            reward, last = reward + discount * step.reward, step.last()
+            discount *= step.discount
             if last:
                 break
         assert made.reward[place, row] == np.float32(reward) and made.discount[place, row] == np.float32(discount)
@@ -126,6 +126,7 @@ def check_episode(task, made, place, environment):
 @named(EQUAL)
 def test_what_dm_control_does_is_what_is_stored(make):
     task = EnvironmentTask("t", make)
+    check_episode(task.at(1), rolled(task.at(1), [2]), 0, make())
     together, alone = rolled(task, [0, 1]), rolled(task, [1])
     for place in range(2):
         check_episode(task, together, place, make())

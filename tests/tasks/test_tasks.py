@@ -63,10 +63,11 @@ def actions_of(kind, rng, size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["random", "extreme", "zero"])
+@pytest.mark.parametrize("kind, repeat", [("random", 2), ("extreme", 2), ("zero", 2), ("random", 1), ("random", 4)])
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
-def test_a_whole_episode_agrees_with_dm_control(task_id, kind):
-    task = get_task(task_id)
+def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
+    task = get_task(task_id).at(repeat)
+    assert task.max_steps * repeat == 1000 and task.at(2) is get_task(task_id).at(2)
     batch = task.batch(SIMULATIONS)
     state = batch.reset([np.random.default_rng(seed) for seed in range(SIMULATIONS)])
     environments = [suite.load(*task_id.split("-")) for _ in range(SIMULATIONS)]
@@ -84,7 +85,7 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind):
         physics = batch.physics()
         for i, environment in enumerate(environments):
             reward = 0.0
-            for _ in range(ACTION_REPEAT):
+            for _ in range(repeat):
                 step = environment.step(action[i])
                 reward += step.reward
             np.testing.assert_array_equal(physics[i], dm_control_physics(environment.physics, task.physics_size))

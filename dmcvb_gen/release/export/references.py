@@ -10,7 +10,7 @@ from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.spec import FIXED
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks import Task, get_task
 
 RANDOM_EPISODES, SEED, NAMES = 10, 0, ("reference",)
 """Episodes of uniform actions that are simulated if the release has none of its own."""
@@ -24,23 +24,25 @@ def reference_returns(release: Release, record: SubsetRecord) -> dict[str, float
     """
     low, high = (_own(release, record, level) for level in ("random", "expert"))
     if record.setting != FIXED:  # its pairs of start and goal have returns of their own
-        if high is None and record.max_steps == get_task(record.task).max_steps:
+        task = get_task(record.task).at(record.action_repeat)
+        if high is None and record.max_steps == task.max_steps:
             high = _bundled(record.task)
         if low is None and high is not None:
-            low = _simulated(record.task, record.max_steps)
+            low = _simulated(task, record.max_steps)
     return {} if low is None or high is None else {"ref_min_score": low, "ref_max_score": high}
 
 
 def _own(release: Release, record: SubsetRecord, level: str) -> float | None:
     for subset in release.subsets.values():
         like = (subset.task, subset.level, subset.setting) == (record.task, level, record.setting)
-        if like and subset.record.max_steps == record.max_steps and len(subset.returns):
+        cut = (subset.record.max_steps, subset.record.action_repeat) == (record.max_steps, record.action_repeat)
+        if like and cut and len(subset.returns):
             return float(subset.returns.mean())
     return None
 
 
-def _simulated(task_id: str, max_steps: int) -> float:
-    task, names = get_task(task_id), (*NAMES, task_id)
+def _simulated(task: Task, max_steps: int) -> float:
+    names = (*NAMES, task.id)
     found = simulate(task, [random_policy(task)], list(range(RANDOM_EPISODES)), SEED, names, max_steps=max_steps)
     return float(found.reward.astype("float64").sum(axis=1).mean())
 

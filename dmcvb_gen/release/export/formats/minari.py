@@ -16,6 +16,7 @@ from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.registry import register_exporter
 from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
+from dmcvb_gen.tasks import ACTION_REPEAT
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
@@ -107,6 +108,8 @@ def _environment(source: Source, split: str) -> EnvSpec:
         if record.hidden_goal != record.spec.hides_goal:  # `paint --goal` decides it, too
             options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
     options["max_steps"] = record.max_steps
+    if record.action_repeat != ACTION_REPEAT:
+        options["action_repeat"] = record.action_repeat
     if _own_videos(source):
         options["own_videos"] = (record.backgrounds or {}).get("digest")
     if record.setting == FIXED:
