@@ -11,8 +11,7 @@ import numpy as np
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.engine import WorkResult, run_work
 from dmcvb_gen.generate.works import Work
-from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, expect, ignore, open_pool
-from dmcvb_gen.parallel.cores import usable_cores
+from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, expect, ignore, open_pool
 from dmcvb_gen.parallel.memory import free_memory
 from dmcvb_gen.tasks import check_in_workers
 from dmcvb_gen.text import format_bytes
@@ -44,7 +43,7 @@ def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCal
         check_in_workers(task_id)
     with open_pool(workers, tick=progress, kept=kept, needs=needs_of(works), most=max(len(works), 1)) as pool:
         for number, work in enumerate(works):
-            pool.submit(number, run_work, work, usable_cores() if alone else 1)
+            pool.submit(number, run_work, work, cores.usable_cores() if alone else 1)
         expected = _Expected(works)
         expect(progress, expected.frames)
         for number, result in pool.results():
@@ -54,11 +53,9 @@ def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCal
 
 
 def default_workers(works: Sequence[Work]) -> int:
-    """Processes for works if nobody says how many: a core each, as far as memory and the amount of work allow."""
-    cores, steps = usable_cores(), sum(work.frames for work in works)
-    free = free_memory()
-    room = cores if free is None or not works else int(free / max(map(_memory, works)))
-    return max(1, min(cores, len(works), room, steps // STEPS_PER_PROCESS))
+    """Processes for works, see `cores.default_workers`; few frames are worth no other process."""
+    worth = sum(work.frames for work in works) // STEPS_PER_PROCESS
+    return cores.default_workers(min(len(works), worth), max(map(_memory, works), default=0))
 
 
 class _Expected:

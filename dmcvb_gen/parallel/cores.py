@@ -1,11 +1,25 @@
-"""Count the cores that this process may use: a batch system or container often grants few of a machine's."""
+"""Count the cores that this process may use: a batch system or container often grants few of a machine's.
+
+The number of workers follows from them, unless it is given.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 
-from dmcvb_gen.parallel.memory import CONTAINER
+from dmcvb_gen.parallel.memory import CONTAINER, free_memory
+
+
+def default_workers(pieces: int, memory: int = 0) -> int:
+    """Workers if nobody says how many: a core each, as far as there is work and memory for them; at least 1.
+
+    Args:
+      pieces: pieces of work. memory: bytes that a worker needs; 0 if it needs little.
+    """
+    free = free_memory()
+    room = pieces if free is None or not memory else free // memory
+    return max(1, min(usable_cores(), pieces, room))
 
 
 def usable_cores() -> int:
