@@ -13,14 +13,12 @@ Functions and arguments travel by pickle between processes of one program and us
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeVar
 
 from dmcvb_gen.parallel.base import (
     IN_FLIGHT,
     KEPT,
-    Future,
     Needs,
     Pool,
     ProgressCallback,
@@ -35,7 +33,6 @@ from dmcvb_gen.parallel.base import (
 __all__ = [
     "IN_FLIGHT",
     "KEPT",
-    "Future",
     "Needs",
     "Pool",
     "Ray",
@@ -47,10 +44,7 @@ __all__ = [
     "in_order",
     "limit_threads",
     "open_pool",
-    "run_all",
 ]
-
-Item = TypeVar("Item")
 
 
 def open_pool(
@@ -85,46 +79,21 @@ def open_pool(
     return ProcessPool(workers, threads, tick, kept)
 
 
-def run_all(
-    function: Callable,
-    items: Iterable[Item],
-    workers: Workers | Pool = 1,
-    *,
-    threads: int = 1,
-    tick: ProgressCallback = ignore,
-) -> Iterator[tuple[Item, Any]]:
-    """(item, `function(item, tick=...)`) of all items, as they come.
-
-    Args:
-      workers: or an open pool, which stays open, with the threads and the tick that it has.
-
-    Raises:
-      StoreError: a worker was killed.
-    """
-    items = list(items)
-    for number, result in _run(function, items, workers, threads, tick):
-        yield items[number], result
-
-
 def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> list:
     """`function(item, tick=...)` of all items, in their order, whoever had them first.
 
     Args:
-      workers, tick: see `run_all`.
+      workers: or an open pool, which stays open, with the tick that it has.
 
     Raises:
       StoreError: a worker was killed.
     """
-    return [result for _, result in sorted(_run(function, items, workers, 1, tick), key=lambda pair: pair[0])]
-
-
-def _run(function: Callable, items: Sequence, workers: Workers | Pool, threads: int, tick: ProgressCallback):
-    """(number of an item, result), as they come."""
     if isinstance(workers, Pool):
         opened: AbstractContextManager[Pool] = nullcontext(workers)
     else:
-        opened = open_pool(workers, threads=threads, tick=tick, most=len(items))
+        opened = open_pool(workers, tick=tick, most=len(items))
     with opened as pool:
         for number, item in enumerate(items):
             pool.submit(number, function, item)
-        yield from pool.results()
+        results = dict(pool.results())
+    return [results[number] for number in range(len(items))]

@@ -20,8 +20,6 @@ IN_FLIGHT = 2
 """Pieces of work handed out for each worker: one at work, one that waits for it."""
 POLL_SECONDS = 0.2
 """How often progress is passed on while no result comes."""
-TIDY: list[Callable[[], None]] = []
-"""What a worker that outlives the command (a cluster's) does after each piece of work: nobody tells it of the end."""
 KEPT = "finished shards are saved: rerun the same command"
 
 
@@ -34,24 +32,12 @@ def expect(tick: ProgressCallback, count: float) -> None:
     getattr(tick, "expect", ignore)(count)
 
 
-class Future:
-    """A result that is on its way while its worker goes on with something else.
-
-    Args:
-      wait: gives the result once it is there, or raises what went wrong.
-    """
-
-    def __init__(self, wait: Callable[[], Any]):
-        self.wait = wait
-
-
 class Pool(abc.ABC):
     """Pool of workers; a context manager that ends its workers when it is left, at once on an error.
 
     `submit(key, function, *arguments)` has `function(*arguments, tick=...)` run; `results()` gives (key, result) as
     they come, until nothing is left of what was submitted, then or meanwhile. The first exception of a function is
-    raised by `results()`. A function may give a `Future`: its worker takes the next piece of work, and the result comes
-    when it is there.
+    raised by `results()`.
     """
 
     @abc.abstractmethod
@@ -91,18 +77,9 @@ class SerialPool(Pool):
         self._waiting.append((key, function, arguments))
 
     def results(self):
-        late: deque[tuple[Any, Future]] = deque()
-        while self._waiting or late:
-            if self._waiting:
-                key, function, arguments = self._waiting.popleft()
-                result = function(*arguments, tick=self._tick)
-                if not isinstance(result, Future):
-                    yield key, result
-                    continue
-                late.append((key, result))
-            while late and (len(late) > 1 or not self._waiting):
-                key, later = late.popleft()
-                yield key, later.wait()
+        while self._waiting:
+            key, function, arguments = self._waiting.popleft()
+            yield key, function(*arguments, tick=self._tick)
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import atexit
-import concurrent.futures
 import contextlib
-import itertools
 import multiprocessing
 import os
 import pickle
@@ -17,14 +15,14 @@ import traceback
 import types
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.parallel.base import IN_FLIGHT, KEPT, POLL_SECONDS, Future, Pool, ProgressCallback, ignore, limit_threads
+from dmcvb_gen.parallel.base import IN_FLIGHT, KEPT, POLL_SECONDS, Pool, ProgressCallback, ignore, limit_threads
 
 
 class ProcessPool(Pool):
@@ -45,31 +43,19 @@ class ProcessPool(Pool):
         self._messages = context.Queue()
         self._pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(self._messages, threads))
         self._waiting: deque = deque()
-        self._running: dict[concurrent.futures.Future, tuple[int, Any]] = {}
-        self._on_their_way: dict[int, Any] = {}
-        self._arrived: dict[int, tuple[Any, BaseException | None]] = {}
-        self._numbers = itertools.count()
+        self._running: dict[Future, Any] = {}
 
     def submit(self, key, function, *arguments):
         self._waiting.append((key, function, arguments))
 
     def results(self):
         try:
-            while self._waiting or self._running or self._on_their_way:
+            while self._waiting or self._running:
                 self._hand_out()
                 done, _ = wait(self._running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
-                self._listen(block=not self._running)
+                self._pass_on()
                 for future in done:
-                    (number, key), result = self._running.pop(future), future.result()
-                    if isinstance(result, _OnItsWay):
-                        self._on_their_way[number] = key
-                    else:
-                        yield key, result
-                for number in self._on_their_way.keys() & self._arrived.keys():
-                    key, (result, error) = self._on_their_way.pop(number), self._arrived.pop(number)
-                    if error is not None:
-                        raise error
-                    yield key, result
+                    yield self._running.pop(future), future.result()
         except BrokenProcessPool:
             self._terminate()  # one that was just starting was overlooked
             raise StoreError(
@@ -80,29 +66,20 @@ class ProcessPool(Pool):
     def _hand_out(self) -> None:
         while self._waiting and len(self._running) < IN_FLIGHT * self._workers:
             key, function, arguments = self._waiting.popleft()
-            number = next(self._numbers)
             try:
                 with _without_guardless_main():
-                    future = self._pool.submit(_work, number, function, arguments)
+                    future = self._pool.submit(_work, function, arguments)
             except OSError:
                 if self._pool._broken:  # a worker died, and its queue was closed while the next worker started
                     raise BrokenProcessPool from None
                 raise
-            self._running[future] = (number, key)
+            self._running[future] = key
 
-    def _listen(self, block: bool = False) -> None:
-        """Pass on what the workers tell, and take the results that were on their way; `block` waits for one a while."""
-        try:
+    def _pass_on(self) -> None:
+        """Pass on what the workers tell."""
+        with contextlib.suppress(queue.Empty):
             while True:
-                number, *facts = self._messages.get(block, POLL_SECONDS)
-                block = False
-                if number is None:
-                    self._tick(*facts)
-                else:
-                    self._arrived[number] = (facts[0], facts[1])
-        except queue.Empty:
-            if block and any(not process.is_alive() for process in (self._pool._processes or {}).values()):
-                raise BrokenProcessPool from None
+                self._tick(*self._messages.get_nowait())
 
     def _terminate(self) -> None:
         for process in list((self._pool._processes or {}).values()):
@@ -112,7 +89,7 @@ class ProcessPool(Pool):
         if at_once:
             self._terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
-        self._listen()
+        self._pass_on()
         self._messages.close()
 
 
@@ -142,11 +119,7 @@ def _without_guardless_main() -> Iterator[None]:
 
 
 _messages: multiprocessing.Queue
-"""To the parent: (None, *what a function tells) or (number, result, error) of a result that was on its way."""
-
-
-class _OnItsWay:
-    """Stands for a `Future`, which stays in its worker."""
+"""To the parent: what a function tells."""
 
 
 def _start(messages: multiprocessing.Queue, threads: int) -> None:
@@ -168,35 +141,23 @@ def _end_with_parent() -> None:
 
 
 def _tell(*facts: Any) -> None:
-    _messages.put((None, *facts))
+    _messages.put(facts)
 
 
-def _work(number: int, function: Callable, arguments: tuple) -> Any:
+def _work(function: Callable, arguments: tuple) -> Any:
     try:
-        result = function(*arguments, tick=_tell)
+        return function(*arguments, tick=_tell)
     except Exception as error:
         told = _sendable(error)
         if told is error:
             raise
         raise told from error
-    if not isinstance(result, Future):
-        return result
-    threading.Thread(target=_wait, args=(number, result), daemon=True).start()
-    return _OnItsWay()
-
-
-def _wait(number: int, later: Future) -> None:
-    try:
-        _messages.put((number, later.wait(), None))
-    except BaseException as error:
-        _messages.put((number, None, _sendable(error)))
 
 
 def _sendable(error: BaseException) -> BaseException:
     """An error that reaches the parent: itself, or one that tells of it if it does not survive pickling.
 
-    The parent would take the first kind of loss for a killed worker, and would wait for ever after the second: a queue
-    pickles in a thread of its own, and drops what it cannot pickle.
+    The parent would take it for a killed worker.
     """
     try:
         pickle.loads(pickle.dumps(error))  # of this very process; nothing from elsewhere is loaded

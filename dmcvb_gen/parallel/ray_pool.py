@@ -16,17 +16,7 @@ from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.own_code import permissions
-from dmcvb_gen.parallel.base import (
-    IN_FLIGHT,
-    POLL_SECONDS,
-    TIDY,
-    Future,
-    Needs,
-    Pool,
-    ProgressCallback,
-    ignore,
-    limit_threads,
-)
+from dmcvb_gen.parallel.base import IN_FLIGHT, POLL_SECONDS, Needs, Pool, ProgressCallback, ignore, limit_threads
 
 _log = logging.getLogger(__name__)
 
@@ -179,9 +169,4 @@ def _work(function, arguments, threads: int, allowed: Sequence[tuple[str, str]])
         else:
             told.append(facts)
 
-    try:
-        result = function(*arguments, tick=tell)
-        return told, result.wait() if isinstance(result, Future) else result
-    finally:
-        for tidy in TIDY:
-            tidy()
+    return told, function(*arguments, tick=tell)

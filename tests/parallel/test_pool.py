@@ -13,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
-from dmcvb_gen.parallel import IN_FLIGHT, Future, open_pool, run_all
+from dmcvb_gen.parallel import IN_FLIGHT, in_order, open_pool
 from dmcvb_gen.parallel.base import Needs
 from dmcvb_gen.parallel.ray_pool import RayPool
 
@@ -45,29 +45,8 @@ def fail_oddly(kind, tick):
     raise Two("x\ny", "z") if kind == "two" else Kept("x\ny")
 
 
-def fail_oddly_later(kind, tick):
-    return Future(lambda: fail_oddly(kind, tick))
-
-
 def die(number, tick):
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def send(number, tick):
-    """Is done at once, and its result comes after that of the next piece of work."""
-    started = time.time()
-
-    def arrive():
-        time.sleep(0.3)
-        if number == 13:
-            raise UnknownNameError("level", "exprt", ("expert", "medium"))
-        return started, time.time(), os.getpid()
-
-    return Future(arrive)
-
-
-def send_and_die(number, tick):
-    return Future(lambda: os.kill(os.getpid(), signal.SIGKILL))
 
 
 def threads(number, tick):
@@ -79,8 +58,8 @@ def threads(number, tick):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_every_item_gives_its_result_and_its_progress(workers):
     ticks = []
-    found = dict(run_all(square, range(7), workers, tick=ticks.append))
-    assert found == {number: number**2 for number in range(7)} and sorted(ticks) == list(range(7))
+    assert in_order(square, range(7), workers, ticks.append) == [number**2 for number in range(7)]
+    assert sorted(ticks) == list(range(7))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -98,34 +77,15 @@ def test_results_may_ask_for_more_work(workers):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_of_the_work_arrives_as_it_was_raised(workers):
     with pytest.raises(UnknownNameError, match="Did you mean 'expert'"):
-        list(run_all(fail, [1, 2], workers))
+        in_order(fail, [1, 2], workers)
 
 
-@pytest.mark.parametrize("work", [fail_oddly, fail_oddly_later])
 @pytest.mark.parametrize(("kind", "told"), [("two", "Two: x y"), ("kept", "Kept: x y")])
-def test_an_error_that_does_not_survive_pickling_is_told_with_where_it_was(work, kind, told):
+def test_an_error_that_does_not_survive_pickling_is_told_with_where_it_was(kind, told):
     with pytest.raises(DmcvbError) as caught:
-        list(run_all(work, [kind, kind], 2))
+        in_order(fail_oddly, [kind, kind], 2)
     assert str(caught.value) == f"a worker failed ({told})"
     assert "in fail_oddly" in "".join(caught.value.__notes__)
-
-
-@pytest.mark.slow_cases("2")
-@pytest.mark.parametrize("workers", [1, 2])
-def test_the_next_piece_of_work_begins_while_a_result_is_on_its_way(workers):
-    found = dict(run_all(send, range(4), workers))
-    assert sorted(found) == [0, 1, 2, 3]
-    if workers == 2:
-        for pid in {pid for _, _, pid in found.values()}:
-            own = sorted(times for *times, worker in found.values() if worker == pid)
-            assert all(later[0] < earlier[1] for earlier, later in zip(own, own[1:], strict=False))
-    with pytest.raises(UnknownNameError, match="Did you mean 'expert'"):
-        list(run_all(send, [1, 13, 2], workers))
-
-
-def test_a_worker_that_dies_with_a_result_on_its_way_is_said():
-    with pytest.raises(StoreError, match="killed"):
-        list(run_all(send_and_die, [1, 2], 2))
 
 
 def test_a_worker_that_dies_while_the_next_one_starts_is_said(monkeypatch):
@@ -138,12 +98,12 @@ def test_a_worker_that_dies_while_the_next_one_starts_is_said(monkeypatch):
 
     monkeypatch.setattr(ProcessPoolExecutor, "_spawn_process", spawn_late)
     with pytest.raises(StoreError, match="killed"):
-        list(run_all(die, [1, 2], 2))
+        in_order(die, [1, 2], 2)
 
 
 def test_a_killed_worker_is_one_line_with_a_cure():
     with pytest.raises(StoreError, match="killed .*; finished shards are saved.* fewer --workers than 2") as caught:
-        list(run_all(die, [1, 2], 2))
+        in_order(die, [1, 2], 2)
     assert "\n" not in str(caught.value)
 
 
@@ -159,7 +119,7 @@ def test_what_is_handed_out_is_bounded():
 
 @pytest.mark.slow
 def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
-    found = [result for _, result in run_all(threads, [1, 2], 2, threads=1)]
+    found = in_order(threads, [1, 2], 2)
     assert {count for count, _ in found} == {1}
     deadline = time.time() + 20
     while any(os.path.exists(f"/proc/{pid}") for _, pid in found) and time.time() < deadline:
@@ -169,14 +129,14 @@ def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
 
 PARENT = """
 import os, sys, time
-from dmcvb_gen.parallel import run_all
+from dmcvb_gen.parallel import in_order
 
 def announce(number, tick):
     open(sys.argv[1] + f"/{os.getpid()}", "w").close()
     time.sleep(120)
 
 if __name__ == "__main__":
-    list(run_all(announce, [1, 2], 2))
+    in_order(announce, [1, 2], 2)
 """
 
 
@@ -247,11 +207,11 @@ def test_a_cluster_without_a_node_for_the_work_says_once_what_it_waits_for(needs
 
 
 GUARDLESS = """
-from dmcvb_gen.parallel import run_all
+from dmcvb_gen.parallel import in_order
 import helper
 
 print("began")
-print(sorted(result for _, result in run_all(helper.double, [1, 2, 3], 2)))
+print(in_order(helper.double, [1, 2, 3], 2))
 """
 
 
