@@ -18,6 +18,7 @@ import io
 import json
 import os
 import resource
+import shutil
 import signal
 import struct
 import subprocess
@@ -199,61 +200,37 @@ def changed_policy(draw) -> bytes:
 @functools.cache
 def valid_tfds() -> Files:
     """A TFDS folder of one episode of two steps, as the exporter of RLDS lays them out."""
-    import google_crc32c
     import numpy as np
     from PIL import Image
 
+    from dmcvb_gen.release.tfrecord import encode_example, record
     from dmcvb_gen.tasks import get_task
 
-    def varint(value: int) -> bytes:
-        out = b""
-        while value > 127:
-            out, value = out + bytes([value & 127 | 128]), value >> 7
-        return out + bytes([value])
-
-    def field(number: int, content: bytes) -> bytes:
-        return varint(number << 3 | 2) + varint(len(content)) + content
-
-    def crc(data: bytes) -> bytes:
-        value = google_crc32c.value(data)
-        return struct.pack("<I", (((value >> 15) | (value << 17)) + 0xA282EAD8) & 0xFFFFFFFF)
-
-    task, picture = get_task("walker-walk"), io.BytesIO()
+    task, picture, steps = get_task("walker-walk"), io.BytesIO(), 3
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(picture, "PNG")
-    steps = 3
-    features = {"steps/observation/pixels": (1, [picture.getvalue()] * steps), "steps/is_terminal": (3, [0] * steps)}
+    values: dict[str, Any] = {"observation/pixels": [picture.getvalue()] * steps}
     for name, part in task.state_slices.items():
-        features[f"steps/observation/{name}"] = (2, [0.5] * steps * (part.stop - part.start))
-    features |= {"steps/action": (2, [0.1] * steps * task.action_size), "steps/reward": (2, [1.0] * steps)}
-    example = b""
-    for name, (kind, values) in features.items():
-        if kind == 1:
-            content = b"".join(field(1, value) for value in values)
-        elif kind == 2:
-            content = field(1, np.asarray(values, "<f4").tobytes())
-        else:
-            content = field(1, b"".join(varint(value) for value in values))
-        example += field(1, field(1, name.encode()) + field(2, field(kind, content)))
-    record = field(1, example)
-    head = struct.pack("<Q", len(record))
-    flat = {name.removeprefix("steps/"): {"tensor": {}} for name in features}
+        values[f"observation/{name}"] = np.full(steps * (part.stop - part.start), 0.5, np.float32)
+    values |= {"action": np.full(steps * task.action_size, 0.1, np.float32), "reward": np.ones(steps, np.float32)}
+    values["is_terminal"] = np.zeros(steps, np.int64)
     tree: dict[str, Any] = {}
-    for name, value in flat.items():
+    for name in values:
         inner = tree
         *parents, last = name.split("/")
         for parent in parents:
             inner = inner.setdefault(parent, {"featuresDict": {"features": {}}})["featuresDict"]["features"]
-        inner[last] = {"image": {"shape": {"dimensions": ["8", "8", "3"]}}} if last == "pixels" else value
-    steps_json = {"sequence": {"feature": {"featuresDict": {"features": tree}}}}
-    described = json.dumps({"featuresDict": {"features": {"steps": steps_json}}}).encode()
-    data = head + crc(head) + record + crc(record)
-    return {"features.json": described, "d-train.tfrecord-00000-of-00001": data}
+        inner[last] = {"image": {"shape": {"dimensions": ["8", "8", "3"]}}} if last == "pixels" else {"tensor": {}}
+    described = {
+        "featuresDict": {"features": {"steps": {"sequence": {"feature": {"featuresDict": {"features": tree}}}}}}
+    }
+    data = record(encode_example({f"steps/{name}": value for name, value in values.items()}))
+    return {"features.json": json.dumps(described).encode(), "d-train.tfrecord-00000-of-00001": data}
 
 
 @st.composite
 def changed_tfds(draw) -> Files:
-    """Other features, other records; also records whose checksums fit (`crc`), as a hostile hand would make them."""
-    import google_crc32c
+    """Other features, other records; also records whose checksums fit, as a hostile hand would make them."""
+    from dmcvb_gen.release.tfrecord import record
 
     files = dict(valid_tfds())
     name = draw(st.sampled_from(sorted(files)))
@@ -261,14 +238,7 @@ def changed_tfds(draw) -> Files:
         return files | {name: draw(changed_json(files[name]))}
     if draw(st.booleans()):
         return files | {name: draw(changed_bytes(files[name]))}
-    record = draw(changed_bytes(files[name][12:-4]))
-
-    def crc(data: bytes) -> bytes:
-        value = google_crc32c.value(data)
-        return struct.pack("<I", (((value >> 15) | (value << 17)) + 0xA282EAD8) & 0xFFFFFFFF)
-
-    head = struct.pack("<Q", len(record))
-    return files | {name: head + crc(head) + record + crc(record)}
+    return files | {name: record(draw(changed_bytes(files[name][12:-4])))}
 
 
 def png(width: int, height: int, data: bytes = b"") -> bytes:
@@ -354,23 +324,15 @@ def changed_pictures(draw) -> Files:
 # -- takers: what reads each kind, given the folder that a case is in -------------------------------------------
 
 
-def _read_all(root: str) -> None:
+def take_release(folder: Path) -> None:
     from dmcvb_gen.dataset import Release
 
-    release = Release.open(root)
+    release = Release.open(str(folder))
     assert release.recipes
     for subset in release.subsets.values():
         for array in subset.arrays:  # of every shard at once
             subset.read(array)
         subset.episode(int(subset.episodes[0]), ["action"])
-
-
-def take_release(folder: Path) -> None:
-    _read_all(str(folder))
-
-
-def take_unfinished(folder: Path) -> None:
-    _read_all(str(folder))
 
 
 def take_recipe(folder: Path) -> None:
@@ -417,7 +379,7 @@ def take_published(folder: Path) -> None:
     from dmcvb_gen.release.fetch import fetch
 
     fetch(f"file://{folder}/there", folder / "deep/down/here", workers=1)
-    _read_all(str(folder / "deep/down/here"))
+    take_release(folder / "deep/down/here")
 
 
 def take_names(folder: Path) -> None:
@@ -519,8 +481,8 @@ def _recipes() -> st.SearchStrategy[Files]:
 KINDS: dict[str, Kind] = {
     "manifest": Kind(_one_of_release(lambda name: name == "manifest.json"), take_release, valid_release),
     "list": Kind(_one_of_release(lambda name: name.startswith("layers/")), take_release, valid_release),
-    "record": Kind(_one_of_release(lambda name: name.startswith("records/")), take_unfinished, _unfinished),
-    "resolved": Kind(_one_of_release(lambda name: name.startswith("recipes/")), take_unfinished, _unfinished),
+    "record": Kind(_one_of_release(lambda name: name.startswith("records/")), take_release, _unfinished),
+    "resolved": Kind(_one_of_release(lambda name: name.startswith("recipes/")), take_release, _unfinished),
     "chunk": Kind(_one_of_release(lambda name: "/c/" in name), take_release, valid_release),
     "published": Kind(_one_of_release(lambda name: name.endswith(".json"), "there/"), take_published, _published),
     "recipe": Kind(_recipes, take_recipe, lambda: {"recipe.yaml": RECIPE.encode()}),
@@ -635,7 +597,7 @@ def serve() -> None:
     sys.dont_write_bytecode = True
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    guard, kind, laid = _Guard(), None, Laid(Path(), {})
+    guard, kind, base = _Guard(), None, dict[str, bytes]()
     signal.signal(signal.SIGALRM, guard.too_late)
     signal.signal(signal.SIGPROF, guard.too_late)
     sys.addaudithook(guard)
@@ -644,70 +606,31 @@ def serve() -> None:
         for line in iter(requests.readline, ""):
             asked, case = json.loads(line)
             if asked != kind:
-                kind, laid = asked, Laid(folder, KINDS[asked].base())
-                _warm_up(KINDS[kind], laid)
-            laid.out({name: base64.b64decode(data) for name, data in case.items()})
+                kind, base = asked, KINDS[asked].base()
+                _warm_up(KINDS[kind], folder, base)
+            _lay(folder, base | {name: base64.b64decode(data) for name, data in case.items()})
             answers.write(json.dumps(_take(KINDS[kind].take, folder, guard)) + "\n")
             answers.flush()
 
 
-def _warm_up(kind: Kind, laid: Laid) -> None:
+def _warm_up(kind: Kind, folder: Path, base: Files) -> None:
     """Take a sound case without bounds (what is imported or made once for all counts for none), then set them."""
     from dmcvb_gen.errors import DmcvbError
 
     resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    laid.out({})
+    _lay(folder, base)
     with contextlib.suppress(DmcvbError, OSError):
-        kind.take(laid.folder)
+        kind.take(folder)
     resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, resource.RLIM_INFINITY))
 
 
-class Laid:
-    """A folder of sound files and one case at a time; what a case changed, or its taker, is put back before the next.
-
-    (Making a release of a hundred files anew for each takes longer than to read it.)
-    """
-
-    def __init__(self, folder: Path, base: Files):
-        self.folder, self.base = folder, base
-        self._seen: dict[str, tuple[int, int, int]] = {}
-
-    def out(self, case: Files) -> None:
-        """Make the folder hold the base and over it these files, and nothing else."""
-        os.makedirs(self.folder, exist_ok=True)
-        there = self._tidy(str(self.folder), "")
-        for name in self.base.keys() - case.keys() - there:
-            self._write(name, self.base[name])
-            self._seen[name] = _mark(os.lstat(f"{self.folder}/{name}"))
-        for name, data in case.items():
-            self._seen.pop(name, None)
-            self._write(name, data)
-
-    def _tidy(self, folder: str, prefix: str) -> set[str]:
-        """Remove what is not of the base any more, and folders left empty; the names of what stays."""
-        stays = set()
-        for entry in list(os.scandir(folder)):
-            name = prefix + entry.name
-            if entry.is_dir(follow_symlinks=False):
-                inner = self._tidy(entry.path, name + "/")
-                stays |= inner
-                if not inner:
-                    os.rmdir(entry.path)
-            elif self._seen.get(name) == _mark(entry.stat(follow_symlinks=False)):
-                stays.add(name)
-            else:
-                os.unlink(entry.path)
-        return stays
-
-    def _write(self, name: str, data: bytes) -> None:
-        path = self.folder / name
+def _lay(folder: Path, files: Files) -> None:
+    """Make a folder hold these files and nothing else."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, data in files.items():
+        path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)  # a name may be a link to another
         path.write_bytes(data)
-
-
-def _mark(found: os.stat_result) -> tuple[int, int, int]:
-    return found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def _take(take: Callable[[Path], None], folder: Path, guard: _Guard) -> dict[str, Any]:
