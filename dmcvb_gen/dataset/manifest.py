@@ -519,15 +519,13 @@ def merged_layers(recipes: Iterable[Resolved]) -> dict[str, Layer]:
 
 
 def _difference(one: Layer, other: Layer) -> str:
-    if one.arrays != other.arrays:
+    keys, fields = sorted({*one.makes, *other.makes}), ("episodes_per_shard", "rows", "group", "kind", "source")
+    pairs = {key: (one.makes.get(key), other.makes.get(key)) for key in keys}
+    pairs |= {name: (getattr(one, name), getattr(other, name)) for name in fields}
+    different = ((name, *pair) for name, pair in pairs.items() if pair[0] != pair[1])
+    if (found := next(different, None)) is None:
         return f"{one.name} has {_arrays(one, other)}, asked for {_arrays(other, one)}; {_cure(other)}"
-    for field in ("episodes_per_shard", "rows", "group", "kind", "source"):
-        first, second = getattr(one, field), getattr(other, field)
-        if first != second:
-            return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
-    keys = sorted(set(one.makes) | set(other.makes))
-    field = next(key for key in keys if one.makes.get(key) != other.makes.get(key))
-    first, second = one.makes.get(field), other.makes.get(field)
+    field, first, second = found
     return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
 
 

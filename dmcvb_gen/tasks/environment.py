@@ -120,6 +120,7 @@ class EnvironmentTask(Task):
 
     def at(self, action_repeat: int) -> Task:
         other = super().at(action_repeat)
+        assert isinstance(other, EnvironmentTask)
         other._set_limits()  # an odd number of control steps
         return other
 
