@@ -17,6 +17,7 @@ import functools
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -76,20 +77,49 @@ class ArrayDifference:
 
 
 @dataclass(frozen=True)
-class LayerOutcome:
+class ShardOutcome:
     """What became of one layer's shard.
 
     Attributes:
+      episodes: (first, last + 1).
       was: what was wrong with its files, in words; None if nothing was, or nobody looked.
       equal: whether the bytes made are the recorded ones; None if no record was there.
-      differences: of the arrays whose bytes differ.
+      repaired: True if files were put back.
+      differences: of the arrays whose bytes differ; "largest" is None if the released values cannot be read.
     """
 
     layer: str
     shard: int
+    episodes: tuple[int, int]
     was: str | None = None
     equal: bool | None = None
+    repaired: bool = False
     differences: tuple[ArrayDifference, ...] = ()
+
+    @classmethod
+    def of(cls, layer: Layer, shard: int, **facts: Any) -> ShardOutcome:
+        """The outcome of a layer's shard; `facts`: its further attributes."""
+        span = layer.episodes_of(shard)
+        return cls(layer.name, shard, (span.start, span.stop), **facts)
+
+    def __str__(self) -> str:
+        text = f"{self.layer} shard {self.shard} (episodes {self.episodes[0]}:{self.episodes[1]}): "
+        if self.was:
+            text += f"{self.was}; "
+        if self.equal is None:
+            return text + "made"
+        if self.equal:
+            return text + ("repaired" if self.repaired else "made again with the same digest")
+        text += "made again, other bytes"
+        for difference in self.differences:
+            if difference.largest is None:
+                text += f"; {difference.array}: how far is unknown, as the released one cannot be read"
+            elif not difference.largest:
+                text += f"; {difference.array}: equal values, only the compression differs"
+            else:
+                unit = " grey levels" if difference.array.startswith("pixels") else ""
+                text += f"; {difference.array}: max {difference.largest:.3g}, mean {difference.mean:.3g}{unit}"
+        return text
 
 
 @dataclass(frozen=True)
@@ -102,7 +132,7 @@ class WorkResult:
       seconds: time spent in "physics", "policy", "rendering" and "storage".
     """
 
-    outcomes: tuple[LayerOutcome, ...]
+    outcomes: tuple[ShardOutcome, ...]
     episodes: int
     steps: int
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -135,7 +165,7 @@ def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> W
 
 def _make_setting(
     work: Work, setting: Setting, episodes: Episodes, tick: ProgressCallback, clock: _Clock
-) -> Iterator[LayerOutcome]:
+) -> Iterator[ShardOutcome]:
     """The labels and images of one setting."""
     images = [layer for layer in setting.images if layer.name in work.make]
     makes_labels = setting.labels is not None and setting.labels.name in work.make
@@ -281,7 +311,7 @@ def _rendered(
 # -- what becomes of a layer's arrays -------------------------------------------------------------
 
 
-def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]], clock: _Clock) -> LayerOutcome:
+def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]], clock: _Clock) -> ShardOutcome:
     """Put a layer's shard, or compare it with its record, as the work is for; one array is in memory at a time."""
     with clock.of("storage"):
         known = work.known.get(layer.name)
@@ -301,7 +331,14 @@ def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]], 
                 files[name] = _put_file(work, path, data, facts, first_wins)
         if work.purpose != "check" and not differences:
             put_record(work.store, layer, work.shard, ShardRecord(key=layer.job_key(work.shard), files=files))
-        return LayerOutcome(layer.name, work.shard, was, None if known is None else not differences, tuple(differences))
+        return ShardOutcome.of(
+            layer,
+            work.shard,
+            was=was,
+            equal=None if known is None else not differences,
+            repaired=work.purpose == "repair" and not differences,
+            differences=tuple(differences),
+        )
 
 
 def _put_file(work: Work, path: str, data: bytes, facts: ShardFile, first_wins: bool) -> ShardFile:

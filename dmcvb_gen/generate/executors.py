@@ -41,7 +41,8 @@ def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCal
     alone = workers == 1 or len(works) <= 1 and isinstance(workers, int)
     for task_id in set() if alone else {setting.record.task for work in works for setting in work.settings}:
         check_in_workers(task_id)
-    with open_pool(workers, tick=progress, kept=kept, needs=needs_of(works), most=max(len(works), 1)) as pool:
+    needs = Needs(memory=max(map(_memory, works), default=0))
+    with open_pool(workers, tick=progress, kept=kept, needs=needs, most=max(len(works), 1)) as pool:
         for number, work in enumerate(works):
             pool.submit(number, run_work, work, cores.usable_cores() if alone else 1)
         expected = _Expected(works)
@@ -66,27 +67,24 @@ class _Expected:
         self._ended: Counter = Counter()
         self._rendered: Counter = Counter()
         for work in works:
-            self._open[self._kind(work)] += work.frames
+            self._open[_kind(work)] += work.frames
 
     def done(self, work: Work, result: WorkResult) -> None:
         """Count a finished work: others of its task and level are taken to end as early."""
-        kind, planned = self._kind(work), work.frames
-        self._open[kind] -= planned
-        self._ended[kind] += planned
-        count = len(work.settings)
-        full = count * (work.steps + len(work.episodes))
-        self._rendered[kind] += round(planned * (result.steps + result.episodes) / full)
+        kind, full = _kind(work), len(work.settings) * (work.steps + len(work.episodes))
+        self._open[kind] -= work.frames
+        self._ended[kind] += work.frames
+        self._rendered[kind] += round(work.frames * (result.steps + result.episodes) / full)
 
     @property
     def frames(self) -> int:
         shares = {kind: self._rendered[kind] / planned for kind, planned in self._ended.items()}
-        to_come = (planned * shares.get(kind, 1) for kind, planned in self._open.items())
-        return sum(self._rendered.values()) + round(sum(to_come))
+        return round(self._rendered.total() + sum(n * shares.get(kind, 1) for kind, n in self._open.items()))
 
-    @staticmethod
-    def _kind(work: Work) -> tuple[str, str]:
-        record = work.settings[0].record
-        return record.task, record.level
+
+def _kind(work: Work) -> tuple[str, str]:
+    record = work.settings[0].record
+    return record.task, record.level
 
 
 def check_memory(works: Sequence[Work], workers: Workers) -> None:
@@ -110,11 +108,6 @@ def check_memory(works: Sequence[Work], workers: Workers) -> None:
         f"a side) needs {format_bytes(needed)} of memory, {side_by_side} are made at once, and {format_bytes(free)} "
         f"are free; use {advice}"
     )
-
-
-def needs_of(works: Sequence[Work]) -> Needs:
-    """Return the most memory that any work takes."""
-    return Needs(memory=max(map(_memory, works), default=0))
 
 
 def _memory(work: Work) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.dataset.gate import Release
@@ -164,16 +165,13 @@ def _recipe_with(release: Release, records: Iterable[SubsetRecord], layers: Mapp
         own |= {layer.name: bare(layer) for layer in layers[record.name]}
         described |= own
         subsets.append(record.model_copy(update={"layers": tuple(sorted(own, key=layer_order))}))
-    old = release.manifest
-    return Resolved(
-        name=old.name,
-        version=old.version,
-        license=old.license,
-        authors=old.authors,
-        description=old.description,
-        layers=tuple(described.values()),
-        subsets=tuple(subsets),
-    )
+    return recipe_after(release, described.values(), subsets)
+
+
+def recipe_after(release: Release, layers: Iterable[Layer], subsets: Iterable[SubsetRecord], **facts: Any) -> Resolved:
+    """The recipe of other layers and subsets with a release's name, license and so on; `facts`: what else it says."""
+    kept = {name: getattr(release.manifest, name) for name in ("name", "version", "license", "authors", "description")}
+    return Resolved(**(kept | facts), layers=tuple(layers), subsets=tuple(subsets))
 
 
 def bare(layer: Layer) -> Layer:

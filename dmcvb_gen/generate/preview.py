@@ -24,9 +24,6 @@ SHEET_COLUMNS = 10
 VIDEO_FRAMES, VIDEO_FPS = 200, 20
 SHEET_SCALE, VIDEO_SIDE = 2, 512
 """Enlargement on the contact sheet; pixels that the shorter side of a video has at least."""
-RAMP, RAMP_PLACES = ((60, 20, 90), (30, 145, 140), (250, 230, 40)), (0.0, 0.5, 1.0)
-"""Colors of distances to a goal, from the farthest to the nearest."""
-MAP = "distance to the goal, and the path so far"
 FORMATS = ("mp4", "webp", "gif")
 LABEL_HEIGHT = 14
 
@@ -43,57 +40,11 @@ def _label(text: str, width: int) -> np.ndarray:
     return np.asarray(picture)
 
 
-def _top(subset: Subset) -> str:
-    return shown(subset, ["top"]).arrays[0]
-
-
-def _map(subset: Subset, values: dict[str, np.ndarray], steps: np.ndarray, scale: int) -> np.ndarray:
-    """(step, h, w, 3): the top view under the distance field, with the path walked so far."""
-    from dmcvb_gen.tasks import get_task
-    from dmcvb_gen.tasks.ant_maze import as_maze
-    from dmcvb_gen.tasks.ant_maze.distance import floor_pixels, look_up, make_field
-    from dmcvb_gen.tasks.ant_maze.layouts import CELL
-
-    task = as_maze(get_task(subset.task))
-    frames = _enlarge(values[_top(subset)][steps], scale)
-    size, reach = frames.shape[1], max(task.layout.shape) * CELL / 2  # the outer walls end at the edge
-    place = (np.arange(size) + 0.5) / size * 2 * reach - reach
-    x, y = (part.ravel() for part in np.meshgrid(place, -place))
-    where = np.stack([x, y], axis=1)
-    state = values["state"]
-    goal = state[0, task.state_slices["target_position"]]
-    field = make_field(task.reward, task.layout, goal)
-    floor = floor_pixels(task.layout)[0].astype(float)
-    stacked = np.broadcast_to(field.values, (len(where), *field.values.shape))
-    distance = look_up("geodesic", task.layout, stacked, where) / field.largest
-    open_ = look_up("geodesic", task.layout, np.broadcast_to(floor, stacked.shape), where) > 0.5
-    near = [np.interp(1 - distance, RAMP_PLACES, channel) for channel in zip(*RAMP, strict=True)]
-    colors = np.stack(near, axis=-1).reshape(size, size, 3)
-    blend = np.where(open_.reshape(size, size, 1), 0.45, 0.0)
-    frames = (frames * (1 - blend) + colors * blend).astype(np.uint8)
-    position = state[:, task.state_slices["walker_position"]][:, :2]
-    points = np.stack([(position[:, 0] / reach + 1) / 2 * size, (1 - position[:, 1] / reach) / 2 * size], axis=1)
-    out = []
-    for frame, step in zip(frames, steps, strict=True):
-        picture = Image.fromarray(frame)
-        draw = ImageDraw.Draw(picture)
-        if step > 0:
-            draw.line([tuple(point) for point in points[: step + 1]], fill=(255, 40, 40), width=max(1, scale // 2))
-        gx, gy = (goal[0] / reach + 1) / 2 * size, (1 - goal[1] / reach) / 2 * size
-        draw.ellipse([gx - scale, gy - scale, gx + scale, gy + scale], outline=(0, 255, 0))
-        out.append(np.asarray(picture))
-    return np.stack(out)
-
-
 def _fitting(name: str, width: int) -> str:
     """Return the last parts of a subset's name that fit into a caption of that width in pixels."""
     parts = name.split("/")
     endings = ["/".join(parts[first:]) for first in range(len(parts))]
     return next((text for text in endings if ImageFont.load_default().getlength(text) <= width), parts[-1])
-
-
-def _has_map(subset: Subset) -> bool:
-    return subset.record.goal_mode is not None and "top" in shown(subset).views
 
 
 def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
@@ -107,9 +58,6 @@ def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, sc
     for view, name in zip(pictures.views, pictures.arrays, strict=True):
         frames = subset.episode(episode, [name, "length"])[name][steps]
         rows.append((view, np.concatenate(list(_enlarge(frames, scale)), axis=1)))
-    if _has_map(subset):
-        drawn = _map(subset, subset.episode(episode, ["state", _top(subset)]), steps, scale)
-        rows.append((MAP, np.concatenate(list(drawn), axis=1)))
     named = [part for view, row in rows for part in (_label(view, row.shape[1]), row)]
     picture = np.concatenate(named if len(rows) > 1 else [rows[0][1]])
     value = float(subset.read("return", [episode])[0])
@@ -148,11 +96,9 @@ def video_frames(
 def _subset_frames(subset: Subset, scale: int, frames: int, episode: int | None) -> np.ndarray:
     """(frame, height, width, 3): the views of one episode in a grid, under the subset's name."""
     pictures = shown(subset)
-    values = subset.episode(int(subset.episodes[0]) if episode is None else episode, ["state", *pictures.arrays])
+    values = subset.episode(int(subset.episodes[0]) if episode is None else episode, pictures.arrays)
     steps = np.minimum(np.arange(frames), len(values[pictures.arrays[0]]) - 1)
     views = [_enlarge(values[name][steps], scale) for name in pictures.arrays]
-    if _has_map(subset):
-        views.append(_map(subset, values, steps, scale))
     picture = _grid(views)
     label = _label(_fitting(subset.name, picture.shape[2]), picture.shape[2])
     return np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1)

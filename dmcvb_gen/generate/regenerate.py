@@ -24,7 +24,7 @@ from dmcvb_gen.dataset.writer import (
 )
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
-from dmcvb_gen.generate.engine import ArrayDifference, LayerOutcome
+from dmcvb_gen.generate.engine import ShardOutcome
 from dmcvb_gen.generate.executors import default_workers, run_works
 from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
 from dmcvb_gen.generate.paint import environment_diff
@@ -34,45 +34,6 @@ from dmcvb_gen.generate.works import Work, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.store import NotThere, Store, open_store
-
-
-@dataclass(frozen=True)
-class ShardOutcome:
-    """The result for one layer's shard.
-
-    Attributes:
-      was: fault of the released files, None if there was none.
-      equal: True if the new shard has the recorded bytes; None if no record was there.
-      repaired: True if files were put into the release.
-      differences: of the arrays whose bytes differ; "largest" is None if the released values cannot be read.
-    """
-
-    layer: str
-    shard: int
-    episodes: tuple[int, int]
-    was: str | None
-    equal: bool | None
-    repaired: bool = False
-    differences: tuple[ArrayDifference, ...] = ()
-
-    def __str__(self) -> str:
-        text = f"{self.layer} shard {self.shard} (episodes {self.episodes[0]}:{self.episodes[1]}): "
-        if self.was:
-            text += f"{self.was}; "
-        if self.equal is None:
-            return text + "made"
-        if self.equal:
-            return text + ("repaired" if self.repaired else "made again with the same digest")
-        text += "made again, other bytes"
-        for difference in self.differences:
-            if difference.largest is None:
-                text += f"; {difference.array}: how far is unknown, as the released one cannot be read"
-            elif not difference.largest:
-                text += f"; {difference.array}: equal values, only the compression differs"
-            else:
-                unit = " grey levels" if difference.array.startswith("pixels") else ""
-                text += f"; {difference.array}: max {difference.largest:.3g}, mean {difference.mean:.3g}{unit}"
-        return text
 
 
 @dataclass(frozen=True)
@@ -166,12 +127,8 @@ class Regeneration:
 
     def run(self, works: Sequence[Work], progress: ProgressCallback) -> tuple[ShardOutcome, ...]:
         """Run works, and tell their outcomes."""
-        found: list[LayerOutcome] = []
-        for result in run_works(works, self.workers or default_workers(works), progress):
-            found += result.outcomes
-        layers = {layer.name: layer for work in works for layer in work.layers}
-        repairs = any(work.purpose == "repair" for work in works)
-        return tuple(_told(outcome, layers[outcome.layer], repairs) for outcome in found)
+        results = run_works(works, self.workers or default_workers(works), progress)
+        return tuple(outcome for result in results for outcome in result.outcomes)
 
     def _faults(self, release: Release) -> set[tuple[str, int]]:
         """(layer, shard) of those whose record or files are not as listed."""
@@ -224,7 +181,7 @@ def remake(
             record, digests = made.records(layer.name).get(work.shard), known.records[layer.name]
             if work.shard < len(digests):
                 equal = record is not None and sha256_bytes(canonical_json(record)) == digests[work.shard]
-                outcomes[layer.name, work.shard] = _told(LayerOutcome(layer.name, work.shard, None, equal), layer)
+                outcomes[layer.name, work.shard] = ShardOutcome.of(layer, work.shard, equal=equal)
     return Outcome(tuple(outcomes.values()), {})
 
 
@@ -282,10 +239,3 @@ def restore_lists(store: Store) -> list[str]:
 def _is_promised(release: Release, layer: str, shard: int) -> bool:
     runs = release.copy.promised.get(layer, ()) if release.copy else ()
     return any(first <= shard < last for first, last in runs)
-
-
-def _told(outcome: LayerOutcome, layer: Layer, repairs: bool = False) -> ShardOutcome:
-    span = layer.episodes_of(outcome.shard)
-    repaired = repairs and outcome.equal is not False
-    facts = (outcome.was, outcome.equal, repaired, outcome.differences)
-    return ShardOutcome(outcome.layer, outcome.shard, (span.start, span.stop), *facts)

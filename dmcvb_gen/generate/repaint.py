@@ -19,7 +19,7 @@ from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.executors import default_workers, run_works
 from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
-from dmcvb_gen.generate.paint import bare
+from dmcvb_gen.generate.paint import bare, recipe_after
 from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.generate.resolve import (
     all_pictures,
@@ -85,16 +85,25 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
     files: dict[str, Path] = {}
     layers: dict[str, Layer] = {}
     records: dict[str, SubsetRecord] = {}
-    for old in chosen:
-        record, made = _repainted(release, old, request, files)
+    for source in chosen:
+        record, made = _repainted(release, source, request, files)
         if record.name in records:
             raise RecipeError(
-                f"two subsets would become {record.name}; choose one with --only, e.g. '*/*/{old.setting}'"
+                f"two subsets would become {record.name}; choose one with --only, e.g. '*/*/{source.setting}'"
             )
         layers |= {layer.name: layer for layer in made}
         records[record.name] = record.model_copy(update={"layers": tuple(layer.name for layer in made)})
     _check_options_used(request, records.values())
-    resolved = _resolved(release, request, layers, records, files)
+    old = release.manifest
+    resolved = recipe_after(
+        release,
+        layers.values(),
+        records.values(),
+        name=request.name or f"{old.name[:80]}-repainted",
+        description=f"Repainted from {old.name} {old.version}. {old.description}".strip(),
+        inputs=file_records(files),
+        derived={"kind": "repaint", "name": old.name, "version": old.version, "digest": release.digest},
+    )
     _check_out(store, resolved)
     begin(store, resolved, files)
     write_provenance(store, "repaint")
@@ -170,27 +179,6 @@ def _check_options_used(request: Repainting, records: Iterable[SubsetRecord]) ->
     for name, has_effect in heard.items():
         if getattr(request, name) and not has_effect:
             raise RecipeError(f"--{name} has no effect here: these subsets show no videos; remove it")
-
-
-def _resolved(
-    release: Release,
-    request: Repainting,
-    layers: dict[str, Layer],
-    records: dict[str, SubsetRecord],
-    files: dict[str, Path],
-) -> Resolved:
-    old = release.manifest
-    return Resolved(
-        name=request.name or f"{old.name[:80]}-repainted",
-        version=old.version,
-        license=old.license,
-        authors=old.authors,
-        description=f"Repainted from {old.name} {old.version}. {old.description}".strip(),
-        inputs=file_records(files),
-        layers=tuple(layers.values()),
-        subsets=tuple(records.values()),
-        derived={"kind": "repaint", "name": old.name, "version": old.version, "digest": release.digest},
-    )
 
 
 def _check_out(store: Store, resolved: Resolved) -> None:

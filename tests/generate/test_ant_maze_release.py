@@ -10,7 +10,6 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.generate.engine import paint
-from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
@@ -18,36 +17,20 @@ from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from tests.conftest import roll_out
-
-TINY = "ant-maze-tiny:****/*..*/****"
-"""Two cells: even random actions find the goal now and then."""
-
-
-def maze_recipe(settings=("visible",), **changes):
-    pattern = {"tasks": TINY, "levels": "random", "settings": list(settings), "episodes": 2, "episodes_per_shard": 1}
-    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "native"}}
-    return make_recipe(fields | {"subsets": [pattern | changes]})
-
-
-@pytest.fixture(scope="module")
-def maze_release(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("maze") / "release"
-    return folder, roll_out(maze_recipe(), folder)
+from tests.conftest import TINY_MAZE, maze_recipe, roll_out
 
 
 @pytest.mark.slow
 def test_a_maze_release_is_sound_and_the_same_with_two_workers(maze_release, tmp_path):
-    folder, made = maze_release
-    result = verify(folder)
+    result = verify(maze_release)
     assert result.sound, result.findings
     again = roll_out(maze_recipe(), tmp_path / "again", workers=2, works=lambda works: works[::-1])
-    assert again.digest == made.digest
+    assert again.digest == Release.open(maze_release).digest
 
 
 def test_all_views_with_and_without_the_goal(maze_release):
-    subset = Release.open(maze_release[0])["ant-maze-tiny/random/visible"]
-    task, episode = get_task(TINY), subset.episode(0)
+    subset = Release.open(maze_release)["ant-maze-tiny/random/visible"]
+    task, episode = get_task(TINY_MAZE), subset.episode(0)
     assert set(subset.pixel_arrays) == {
         f"{root}/{view}" for root in ("pixels", "pixels_hidden_goal") for view in task.views
     }
@@ -88,7 +71,7 @@ def _fixed_release(tmp_path, seed=0):
 def test_fixed_goals(tmp_path):
     subset = Release.open(_fixed_release(tmp_path))["ant-maze-tiny/random/fixed"]
     np.testing.assert_array_equal(subset.read("goal_pair"), [0, 0, 1, 1])
-    task = get_task(TINY)
+    task = get_task(TINY_MAZE)
     first = [subset.episode(i, ["state", "length"])["state"][0] for i in range(4)]
     goals = np.array([state[task.state_slices["target_position"]] for state in first])
     starts = np.array([state[task.state_slices["walker_position"]] for state in first])
@@ -166,23 +149,6 @@ def filled(physics, length):
     """Physics states with the last one of an episode repeated past its end."""
     rows = np.minimum(np.arange(physics.shape[1])[None], length[:, None])
     return np.take_along_axis(physics, rows[..., None], axis=1)
-
-
-@pytest.mark.slow
-def test_renderers_agree_on_mazes():
-    """native's pictures are near OpenGL's in every view and style."""
-    reason = available_renderers()["opengl"]
-    if reason:
-        pytest.skip(reason)
-    task = get_task("ant-maze-medium7x7c")
-    physics, labels = frames(task, 1, 12)
-    pictures = []
-    for name in ("native", "opengl"):
-        renderer = make_renderer(name, task, 64)
-        pictures.append(renderer.render(physics, labels).astype(int))
-        renderer.close()
-    difference = np.abs(pictures[0] - pictures[1]).mean(axis=(0, 2, 3, 4))
-    assert (difference < [10, 4, 4, 4]).all(), difference
 
 
 def test_styles_of_data_and_of_evaluation_are_apart():

@@ -16,7 +16,7 @@ def test_the_video_has_512_pixels_on_its_shorter_side_and_shows_the_stored_frame
     assert len(video) == 2 and VIDEO_SIDE <= min(video.shape[1:3]) < VIDEO_SIDE + 200
     array = subset.pixel_arrays[0] if release == "small_release" else "pixels/top"
     stored = subset.episode(int(subset.episodes[0]), [array])[array][1]
-    columns = 1 if release == "small_release" else 3  # four views and the map: three in a row
+    columns = 1 if release == "small_release" else 3  # four views: three in a row
     scale = video.shape[2] // (columns * stored.shape[1])
     first = video[1, LABEL_HEIGHT:, : stored.shape[1] * scale][: stored.shape[0] * scale]
     np.testing.assert_array_equal(first[::scale, ::scale], stored)
@@ -25,7 +25,7 @@ def test_the_video_has_512_pixels_on_its_shorter_side_and_shows_the_stored_frame
 def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
     maze = next(iter(Release.open(maze_release).subsets.values()))
     walker = next(iter(Release.open(small_release).subsets.values()))
-    rows = len(maze.record.views) + 1  # and the map
+    rows = len(maze.record.views)
     strip = episode_strip(maze, 0, columns=20, scale=2)
     assert strip.shape[0] == LABEL_HEIGHT + rows * (LABEL_HEIGHT + 32)
     for row in range(rows):

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -18,16 +12,14 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
-from dmcvb_gen.files import PARTIAL
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.policies import simulate
-from dmcvb_gen.release.verify import check_files, verify
+from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
 from tests.conftest import rewrite, roll_out, small_recipe
-from tests.faults.commands import GRACE, session
 
 
 @pytest.fixture
@@ -56,38 +48,6 @@ def test_a_repainted_subset_has_the_records_of_a_rolled_out_one(small_release, d
     }
     request, ticks = Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic"), []
     assert repaint(request, 2, ticks.append).digest == ours.digest and len(ticks) > 1
-
-
-@pytest.mark.slow
-def test_a_stopped_repaint_leaves_no_process_and_goes_on_to_a_clean_folder(small_release, tmp_path):
-    out, patterns = tmp_path / "r", ["*/*/none", "*/*/dynamic"]
-    words = ["repaint", str(small_release), "--out", str(out), "--size", "48", "--workers", "2"]
-    words += [word for pattern in patterns for word in ("--only", pattern)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dmcvb_gen", *words],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        while process.poll() is None and not any(path.is_file() for path in out.glob("**/pixels/c/**/*")):
-            time.sleep(0.01)  # until images are being written: the other setting of its work is still to come
-        assert process.poll() is None and len(session(process.pid)) >= 3
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(timeout=60)
-        assert process.returncode not in (0, 2) and "Traceback" not in errors and "Exception ignored" not in errors
-        deadline = time.time() + GRACE
-        while session(process.pid) and time.time() < deadline:
-            time.sleep(0.05)
-        assert not session(process.pid)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    assert len(list(out.glob("records/**/pixels/*.json"))) < 4
-    assert not repaint(Repainting(small_release, out, patterns, size=48), 1).shortfalls
-    assert not [path for path in out.rglob("*") if path.name.endswith(PARTIAL)]
-    assert not list(check_files(out))
 
 
 def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dynamic, small_release):
