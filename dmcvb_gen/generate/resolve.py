@@ -42,10 +42,10 @@ from dmcvb_gen.generate.render import check_renderer, renderer_for
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.own_code import is_own, source_digest
 from dmcvb_gen.policies.bundled import resolve_policies
-from dmcvb_gen.policies.header import OWN_CODE
+from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import SPLITS, is_maze
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
 
@@ -306,8 +306,8 @@ def _tell_of_held_actions(recipe: Recipe, subsets: Iterable[SubsetRecord]) -> No
     """Log a line for policies that act more rarely than in their training."""
     headers = {policy.name: policy.header for record in subsets for policy in record.policies}
     for name, header in headers.items():
-        trained = header.get("action_repeat", ACTION_REPEAT)
-        if header.get("algorithm") != OWN_CODE and trained < recipe.action_repeat:
+        trained = PolicyHeader.model_validate(header).acts_every
+        if trained and trained < recipe.action_repeat:
             _log.warning(
                 f"{name} was trained at action repeat {trained}, and its actions are held for {recipe.action_repeat} "
                 "control steps; expect lower returns"

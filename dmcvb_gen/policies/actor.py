@@ -79,17 +79,17 @@ class Policy:
       header: its origin; None for uniform random actions.
       weights: name -> float32, see `header.weight_shapes`.
       digest: SHA-256 of its file ("random" for uniform random actions).
-      trained_at: control steps for which its actions are held, if the task's agent steps are shorter; None: it acts at
+      acts_every: control steps for which its actions are held, if the task's agent steps are shorter; None: it acts at
         each agent step.
       unit: True if its actions lie in [-1, 1], whatever the task's bounds; they are scaled (`Task.from_unit`).
     """
 
     unit = True
-    trained_at: int | None = None
+    acts_every: int | None = None
 
     def __init__(self, header: PolicyHeader, weights: Mapping[str, np.ndarray], digest: str):
         self.header, self.weights, self.digest = header, dict(weights), digest
-        self.trained_at = header.action_repeat
+        self.acts_every = header.acts_every
         # Rows of inputs: neighboring outputs lie beside each other, for vectors of sums.
         self._rows = {
             name: np.ascontiguousarray(value.T, np.float32) for name, value in self.weights.items() if value.ndim == 2

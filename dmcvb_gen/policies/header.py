@@ -112,6 +112,12 @@ class PolicyHeader(_Model):
         """Origin of the policy, in a few words."""
         return origin_of(self.algorithm)
 
+    @property
+    def acts_every(self) -> int | None:
+        """Control steps for which its actions are held; None of the user's code and of other programs' policies."""
+        outside = self.algorithm == OWN_CODE or "converted_from" in self.training
+        return None if outside else self.action_repeat
+
     def without_local_paths(self) -> PolicyHeader:
         """The header with the last names alone of paths that name a place on some machine, fit for manifests.
 

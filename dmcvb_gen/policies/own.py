@@ -62,7 +62,6 @@ class OwnPolicy(Policy):
             training={"behaviour": name, "source_sha256": digest, "note": MARK},
         )
         super().__init__(header, {}, digest)
-        self.trained_at = None
         self._name, self._function, self._bounds = name, function, (task.action_low, task.action_high)
 
     def act(self, observation, generators=None, deterministic=False):

@@ -89,7 +89,7 @@ def _actions(
     actions = np.where(active[:, None], before, np.float32(0))
     for index in np.unique(assigned).tolist():
         rows = np.flatnonzero(active & (assigned == index))
-        held = max(1, (policies[index].trained_at or 1) // task.action_repeat)
+        held = max(1, (policies[index].acts_every or 1) // task.action_repeat)
         if len(rows) and step % held == 0:
             streams = [generators[int(row)] for row in rows]
             given = policies[index].act(observations[rows], streams, deterministic)

@@ -12,7 +12,12 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import Recipe, load_recipe
 from dmcvb_gen.loaders import DistractedEnv
+from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.release.verify import verify
+from dmcvb_gen.tasks import get_task
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out
 
 NAME = "walker-walk/expert/dynamic"
@@ -59,6 +64,20 @@ def test_a_policy_that_was_trained_at_2_acts_at_2(walkers):
     np.testing.assert_allclose(one.read("return"), two.read("return"), rtol=1e-5)
     np.testing.assert_array_equal(four.read("action")[:, 0], two.read("action")[:, 0])
     assert (four.read("physics")[:, 1] != two.read("physics")[:, 2]).any()  # it held its first action for longer
+
+
+@pytest.mark.parametrize("facts, held", [
+    ({}, 2),
+    ({"action_repeat": 1}, 1),
+    ({"action_repeat": 4}, 4),
+    ({"training": {"converted_from": "their.zip"}}, 1),  # nobody knows at which repeat it was trained
+])  # fmt: skip
+def test_the_header_says_for_how_many_control_steps_a_policy_acts(facts, held):
+    task, bundled = get_task("walker-walk").at(1), load_policy(bundled_policies("walker-walk", "expert")[0])
+    policy = Policy(bundled.header.model_copy(update=facts), bundled.weights, "x")
+    action = simulate(task, [policy], [0], 0, ("a",), max_steps=8).action[0, :-1]
+    changes = [step for step in range(1, 8) if (action[step] != action[step - 1]).any()]
+    assert changes == [step for step in range(1, 8) if step % held == 0]
 
 
 @pytest.mark.parametrize("repeat", STEPS)
