@@ -175,7 +175,6 @@ def _run(plan, workers, as_json, whole=True):
     release, steps, place = made.release, made.steps, plan.store.place
     complete = whole and not _missing(release)
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
-    facts |= dict(seconds_by_part={part: round(value, 2) for part, value in made.seconds_by_part.items()})
     named = shlex.quote(str(place))
     state = "complete" if complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
     if not whole:

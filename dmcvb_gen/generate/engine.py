@@ -12,11 +12,9 @@ it or puts files back.
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -129,13 +127,11 @@ class WorkResult:
     Attributes:
       outcomes: of each layer that was made.
       episodes, steps: simulated or rendered, once for each setting.
-      seconds: time spent in "physics", "policy", "rendering" and "storage".
     """
 
     outcomes: tuple[ShardOutcome, ...]
     episodes: int
     steps: int
-    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> WorkResult:
@@ -148,24 +144,21 @@ def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> W
     Raises:
       StoreError: what is read is damaged, other bytes are there, or the place is full or cannot be written.
     """
-    clock = _Clock()
     first = work.settings[0].record
     if work.simulates:
-        episodes = simulated_episodes(work, first, threads, clock)
-        outcomes = [_settle(work, work.trajectories, episodes.arrays.items(), clock)]
+        episodes = simulated_episodes(work, first, threads)
+        outcomes = [_settle(work, work.trajectories, episodes.arrays.items())]
     else:
         episodes, outcomes = stored_episodes(work), []
     if not work.images:
         tick(int((episodes.length + 1).sum()))
     for setting in work.settings:
-        outcomes += _make_setting(work, setting, episodes, tick, clock)
+        outcomes += _make_setting(work, setting, episodes, tick)
     count = len(work.settings)
-    return WorkResult(tuple(outcomes), count * len(episodes.index), count * int(episodes.length.sum()), clock.seconds)
+    return WorkResult(tuple(outcomes), count * len(episodes.index), count * int(episodes.length.sum()))
 
 
-def _make_setting(
-    work: Work, setting: Setting, episodes: Episodes, tick: ProgressCallback, clock: _Clock
-) -> Iterator[ShardOutcome]:
+def _make_setting(work: Work, setting: Setting, episodes: Episodes, tick: ProgressCallback) -> Iterator[ShardOutcome]:
     """The labels and images of one setting."""
     images = [layer for layer in setting.images if layer.name in work.make]
     makes_labels = setting.labels is not None and setting.labels.name in work.make
@@ -174,17 +167,15 @@ def _make_setting(
     record, root = setting.record, local_inputs(work.store, work.inputs)
     backgrounds = background_source(root, record, work.backgrounds)
     if makes_labels:
-        with clock.of("rendering"):
-            labels = _drawn_labels(work, record, episodes, backgrounds)
-        yield _settle(work, setting.labels, label_arrays(labels, episodes.length, work.trajectories.rows), clock)
+        labels = _drawn_labels(work, record, episodes, backgrounds)
+        yield _settle(work, setting.labels, label_arrays(labels, episodes.length, work.trajectories.rows))
     else:
         labels = _stored_labels(work, setting.labels, episodes)
     for size in dict.fromkeys(layer.arrays[0].shape[0] for layer in images):
         layers = {_plain(layer.arrays[0]): layer for layer in images if layer.arrays[0].shape[0] == size}
         rendered = _rendered(record.model_copy(update={"size": size}), layers, episodes, labels, backgrounds, tick)
-        for name, values in clock.items("rendering", rendered):
-            layer = layers[name]
-            yield _settle(work, layer, [(layer.arrays[0].name, values)], clock)
+        for name, values in rendered:
+            yield _settle(work, layers[name], [(layers[name].arrays[0].name, values)])
 
 
 def _plain(spec: ArraySpec) -> str:
@@ -196,7 +187,7 @@ def _plain(spec: ArraySpec) -> str:
 # -- states and labels ----------------------------------------------------------------------------
 
 
-def simulated_episodes(work: Work, record: SubsetRecord, threads: int, clock: _Clock) -> Episodes:
+def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episodes:
     """Simulate the episodes of a shard."""
     task, makes = get_task(record.task).at(record.action_repeat), work.trajectories.makes
     pairs = None
@@ -217,7 +208,6 @@ def simulated_episodes(work: Work, record: SubsetRecord, threads: int, clock: _C
         threads=threads,
         max_steps=record.max_steps,
     )
-    clock.add(made.seconds)
     return Episodes(made.episodes, made.arrays())
 
 
@@ -311,34 +301,33 @@ def _rendered(
 # -- what becomes of a layer's arrays -------------------------------------------------------------
 
 
-def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]], clock: _Clock) -> ShardOutcome:
+def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]]) -> ShardOutcome:
     """Put a layer's shard, or compare it with its record, as the work is for; one array is in memory at a time."""
-    with clock.of("storage"):
-        known = work.known.get(layer.name)
-        first_wins = layer.makes.get("renderer", {}).get("name") in ANY_BITS
-        files: dict[str, ShardFile] = {}
-        differences, was = [], None
-        for name, values in arrays:
-            spec = layer.array(name)
-            data = encode(layer, spec, np.ascontiguousarray(values, dtype=spec.dtype))
-            facts, promised = None if data is None else file_facts(data), known.files.get(name) if known else None
-            path = layer.file_path(spec, work.shard)
-            if promised and work.purpose != "make":
-                was = was or _fault(work.store, path, promised)
-            if known is not None and facts != promised:
-                differences.append(_difference(work, layer, spec, known, values))
-            elif data is not None and facts is not None:
-                files[name] = _put_file(work, path, data, facts, first_wins)
-        if work.purpose != "check" and not differences:
-            put_record(work.store, layer, work.shard, ShardRecord(key=layer.job_key(work.shard), files=files))
-        return ShardOutcome.of(
-            layer,
-            work.shard,
-            was=was,
-            equal=None if known is None else not differences,
-            repaired=work.purpose == "repair" and not differences,
-            differences=tuple(differences),
-        )
+    known = work.known.get(layer.name)
+    first_wins = layer.makes.get("renderer", {}).get("name") in ANY_BITS
+    files: dict[str, ShardFile] = {}
+    differences, was = [], None
+    for name, values in arrays:
+        spec = layer.array(name)
+        data = encode(layer, spec, np.ascontiguousarray(values, dtype=spec.dtype))
+        facts, promised = None if data is None else file_facts(data), known.files.get(name) if known else None
+        path = layer.file_path(spec, work.shard)
+        if promised and work.purpose != "make":
+            was = was or _fault(work.store, path, promised)
+        if known is not None and facts != promised:
+            differences.append(_difference(work, layer, spec, known, values))
+        elif data is not None and facts is not None:
+            files[name] = _put_file(work, path, data, facts, first_wins)
+    if work.purpose != "check" and not differences:
+        put_record(work.store, layer, work.shard, ShardRecord(key=layer.job_key(work.shard), files=files))
+    return ShardOutcome.of(
+        layer,
+        work.shard,
+        was=was,
+        equal=None if known is None else not differences,
+        repaired=work.purpose == "repair" and not differences,
+        differences=tuple(differences),
+    )
 
 
 def _put_file(work: Work, path: str, data: bytes, facts: ShardFile, first_wins: bool) -> ShardFile:
@@ -361,30 +350,3 @@ def _difference(work: Work, layer: Layer, spec: ArraySpec, known: ShardRecord, v
         return ArrayDifference(spec.name, None, None)
     gap = np.abs(values.astype(np.float64) - other.astype(np.float64))
     return ArrayDifference(spec.name, float(gap.max()), float(gap.mean()))
-
-
-class _Clock:
-    """Seconds spent, by part."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    def add(self, seconds: Mapping[str, float]) -> None:
-        for part, value in seconds.items():
-            self.seconds[part] = self.seconds.get(part, 0.0) + value
-
-    @contextlib.contextmanager
-    def of(self, part: str) -> Iterator[None]:
-        """Count the time of a block."""
-        started = time.perf_counter()
-        yield
-        self.add({part: time.perf_counter() - started})
-
-    def items(self, part: str, items: Iterator) -> Iterator:
-        """The same items; the time that they take counts, what the caller does with them does not."""
-        while True:
-            with self.of(part):
-                item = next(items, None)
-            if item is None:
-                return
-            yield item

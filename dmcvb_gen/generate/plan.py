@@ -173,13 +173,11 @@ class RolloutResult:
       release: the release as it is now.
       steps: transitions that were made now.
       seconds: on the clock.
-      seconds_by_part: seconds of all workers together, by part: "physics", "policy", "rendering" and "storage".
     """
 
     release: Release
     steps: int
     seconds: float
-    seconds_by_part: dict[str, float]
 
 
 def run_plan(
@@ -202,11 +200,9 @@ def run_plan(
     Raises:
       StoreError: the disk is full, or another machine has put other bytes.
     """
-    started, steps, seconds = time.monotonic(), 0, dict[str, float]()
+    started, steps = time.monotonic(), 0
     for result in run_works(plan.works, workers or default_workers(plan.works), progress):
         steps += result.steps
-        for part, value in result.seconds.items():
-            seconds[part] = seconds.get(part, 0.0) + value
         on_result(result)
     release = finish(plan.store) if finishing else plan.release
-    return RolloutResult(release, steps, time.monotonic() - started, seconds)
+    return RolloutResult(release, steps, time.monotonic() - started)

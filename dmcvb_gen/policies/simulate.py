@@ -7,9 +7,8 @@ whatever rows lie beside it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -33,7 +32,6 @@ class Simulation:
       seed: (episode,) uint64, label of the episode's streams.
       behaviour: (episode,) int16, index of the policy.
       goal_pair: (episode,) int16, index of the fixed start and goal, -1 if they are random.
-      seconds: time spent, by part.
     """
 
     episodes: np.ndarray
@@ -47,7 +45,6 @@ class Simulation:
     seed: np.ndarray
     behaviour: np.ndarray
     goal_pair: np.ndarray
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def returns(self) -> np.ndarray:
@@ -56,8 +53,7 @@ class Simulation:
 
     def part(self, places: slice) -> Simulation:
         """Some of the episodes, as views."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Simulation(**{name: part if name == "seconds" else part[places] for name, part in values.items()})
+        return Simulation(**{field.name: getattr(self, field.name)[places] for field in fields(self)})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """By the store's names."""
@@ -112,7 +108,6 @@ def _empty(task: Task, episodes: np.ndarray, limit: int) -> Simulation:
         seed=np.zeros(size, np.uint64),
         behaviour=np.zeros(size, np.int16),
         goal_pair=np.full(size, -1, np.int16),
-        seconds={"physics": 0.0, "policy": 0.0},
     )
 
 
@@ -170,11 +165,9 @@ def _run(
     out: Simulation,
 ) -> None:
     """Simulate the episodes of `out` side by side, and fill it; see `simulate`."""
-    started = time.perf_counter()
     batch = task.batch(len(starts), threads)
     try:
         state = batch.reset(starts) if cells is None else batch.reset_fixed(starts, cells)
-        out.seconds["physics"] += time.perf_counter() - started
         _step_to_the_end(batch, state, policies, noise, deterministic, out)
     except EpisodeError as error:
         raise error.of_episode(int(out.episodes[error.place])) from error
@@ -225,14 +218,10 @@ def _step_to_the_end(
         active &= ~over
         if step == limit or not active.any():
             break
-        started = time.perf_counter()
         seen = batch.behaviour_observation()
         given = (seen, active, batch.task, deterministic, step, actions)
         actions = _actions(policies, out.behaviour, noise, *given)
-        acted = time.perf_counter()
         result = batch.step(actions, active)
-        out.seconds["policy"] += acted - started
-        out.seconds["physics"] += time.perf_counter() - acted
         state, over = result.state, result.terminated | result.truncated
         out.action[active, step] = actions[active]
         out.reward[active, step] = result.reward[active]
