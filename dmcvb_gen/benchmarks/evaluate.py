@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -111,6 +111,8 @@ def protocol(
     """
     task = get_task(subset.task).at(subset.record.action_repeat)
     facts: dict[str, Any] = {"steps": evaluation_steps(task, max_steps), "goals": pair}
+    if task.action_repeat != ACTION_REPEAT:
+        facts["action_repeat"] = task.action_repeat
     if pictures:
         facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
         if subset.record.distractor.kind != "none":
@@ -354,6 +356,7 @@ def evaluate(
     samples: int | None = None,
     backgrounds: str = "builtin",
     split: str = SPLIT,
+    action_repeat: Literal[1, 2, 4] | None = None,
     max_steps: int | None = None,
     threads: int = 1,
 ) -> Score:
@@ -377,6 +380,7 @@ def evaluate(
       backgrounds: "builtin" or a folder of videos.
       split: videos and maze styles to show: "val", as `validate` does, or "train", those of the data. The difference of
         the two scores is what a policy loses on distractors that it has not seen.
+      action_repeat: control steps for which an action is held, by default those of a `load_agent` policy's data, or 2.
       max_steps: cut episodes short; they never last longer than in `validate`.
 
     Returns:
@@ -400,7 +404,9 @@ def evaluate(
     drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
     if renderer in (None, drawn["name"]):
         samples = drawn["samples"] if samples is None else samples
-    shown = dict(renderer=renderer or drawn["name"], samples=samples, backgrounds=backgrounds, split=split)
+    repeat = action_repeat or seen.get("action_repeat", ACTION_REPEAT)
+    shown: dict[str, Any] = dict(backgrounds=backgrounds, split=split, action_repeat=repeat)
+    shown |= dict(renderer=renderer or drawn["name"], samples=samples)
     scene = EvaluationScene.parse(where, size=_own_value(policy, "picture_size", size, 64) if pixels else 64, **shown)
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
     evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
