@@ -66,7 +66,7 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
 
 def permissions() -> dict[str, str]:
     """The environment variables that let code run here, for workers that do not inherit them."""
-    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS) if name in os.environ}
+    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS, DISTRACTORS) if name in os.environ}
 
 
 def allowed(variable: str) -> list[str]:

@@ -13,7 +13,6 @@ from dmcvb_gen.generate.engine import WorkResult, run_work
 from dmcvb_gen.generate.works import Work
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, expect, ignore, open_pool
 from dmcvb_gen.parallel.memory import free_memory
-from dmcvb_gen.tasks import check_in_workers
 from dmcvb_gen.text import format_bytes
 
 PROCESS_BYTES = 1 << 30
@@ -39,8 +38,6 @@ def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCal
     check_memory(works, workers)
     kept = "finished shards are saved: rerun the same command (fewer --episodes-per-shard need less memory)"
     alone = workers == 1 or len(works) <= 1 and isinstance(workers, int)
-    for task_id in set() if alone else {setting.record.task for work in works for setting in work.settings}:
-        check_in_workers(task_id)
     needs = Needs(memory=max(map(_memory, works), default=0))
     with open_pool(workers, tick=progress, kept=kept, needs=needs, most=max(len(works), 1)) as pool:
         for number, work in enumerate(works):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
+import functools
 import threading
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
@@ -69,8 +69,7 @@ def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-_kept: OrderedDict[Task, _KeptBatch] = OrderedDict()
-_kept_lock = threading.Lock()
+_kept = functools.lru_cache(maxsize=KEPT)(_KeptBatch)
 
 
 class Kinematics:
@@ -82,11 +81,7 @@ class Kinematics:
     """
 
     def __init__(self, task: Task, fields: Sequence[str]):
-        self._fields = tuple(fields)
-        with _kept_lock:
-            self._batch = _kept[task] = _kept.pop(task) if task in _kept else _KeptBatch(task)
-            while len(_kept) > KEPT:
-                _kept.popitem(last=False)
+        self._fields, self._batch = tuple(fields), _kept(task)
 
     def __call__(self, physics: np.ndarray) -> dict[str, np.ndarray]:
         """(frame, physics) float64 -> each field with a leading frame axis, float64.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import io
 import math
 import pickle
 import weakref
@@ -29,10 +30,12 @@ PROBE_STEPS = 10
 PROBE_SEEDS = (0, 1)
 """Seeds of these episodes."""
 MAX_ENTRIES = 10_000
-"""Values of the model that may change in an episode, at most: each row of `physics` holds them."""
+"""Values of a model's field that may change in an episode, at most: each row of `physics` holds them."""
+TERRAIN, TERRAIN_KEY = "hfield_data", 3
+"""The field that may have more if the start of an episode draws it, and how many numbers of a row stand for it."""
 ASSETS = ("mesh_", "oct_", "skin_", "tex_")
 """Beginnings of the names of large fields of a model, which only the start's check compares."""
-BAD_STATES = tuple(int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL"))
+BAD_STATES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
 """Warnings after which MuJoCo has reset a simulation; a task cannot hide them."""
 
 
@@ -53,10 +56,13 @@ class EnvironmentTask(Task):
 
     physics_spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
     replayed = True
+    action_low = action_high = np.zeros(0, np.float32)
+    control_timestep = 0.0
     most_at_once = 8  # an environment holds a model and its data: 12 MB for most of the suite, 80 for the dog
 
     def __init__(self, id: str, make: Callable[[], Any], domain: str = ""):
         self.id, self._make, self._idle = id, make, list[Any]()
+        self._terrain: tuple[tuple[int, ...], np.ndarray] = (), np.zeros(0)  # what was last drawn again
         self.floor_alpha = {"walker": 1.0, "cheetah": 1.0, "reacher": 0.0}.get(domain, 0.3)
         self.trusted = self.reusable = bool(domain)  # the tests compare the suite's tasks with dm_control
         self.state_fields, self.model_entries = {}, {}
@@ -64,9 +70,9 @@ class EnvironmentTask(Task):
         with self._starting():
             environment = self.make_environment(PROBE_SEEDS[0])
             _check_environment(id, environment)
-            self._low, self._high = _bounds(id, environment)
+            self.action_low, self.action_high = _bounds(id, environment)
             self._control_steps = environment._step_limit
-            self.substeps, self._control_timestep = environment._n_sub_steps, environment.control_timestep()
+            self.substeps, self.control_timestep = environment._n_sub_steps, environment.control_timestep()
         if not math.isfinite(self._control_steps):
             self._control_steps = DEFAULT_STEPS * self.action_repeat
         self._set_limits()
@@ -88,35 +94,47 @@ class EnvironmentTask(Task):
             ) from error
 
     @property
-    def model(self) -> mujoco.MjModel:
-        return self._model
-
-    @property
     def action_size(self) -> int:
-        return len(self._low)
-
-    @property
-    def action_low(self) -> np.ndarray:
-        return self._low
-
-    @property
-    def action_high(self) -> np.ndarray:
-        return self._high
+        return len(self.action_low)
 
     @property
     def array_attributes(self) -> dict[str, dict[str, Any]]:
         """The actions' bounds, and where a row of `physics` holds the simulation's state and the model's fields."""
-        place = mujoco.mj_stateSize(self._model, self.physics_spec)
+        place = mujoco.mj_stateSize(self.model, self.physics_spec)
         fields = {"state": [0, place]}
         for name, columns in self.model_entries.items():
             fields[f"model.{name}"] = [place, place + len(columns)]
             place += len(columns)
-        bounds = {"low": self._low.tolist(), "high": self._high.tolist()}
+        if self.draws_terrain:
+            fields[f"seed and CRC-32 of model.{TERRAIN}"] = [place, place + TERRAIN_KEY]
+        bounds = {"low": self.action_low.tolist(), "high": self.action_high.tolist()}
         return {"action": bounds, "physics": {"fields": fields, "mjtState": self.physics_spec}}
 
     @property
-    def control_timestep(self) -> float:
-        return self._control_timestep
+    def physics_size(self) -> int:
+        return super().physics_size + TERRAIN_KEY * self.draws_terrain
+
+    def terrain_of(self, row: np.ndarray) -> tuple[int, ...]:
+        """High and low half of the seed that draws a row's terrain, CRC-32 of its heights; empty if none is drawn."""
+        return tuple(row[len(row) - TERRAIN_KEY * self.draws_terrain :].astype(int).tolist())
+
+    def apply_entries(self, model: mujoco.MjModel, row: np.ndarray) -> None:
+        """See `Task`; terrain is drawn again from the row's seed.
+
+        Raises:
+          DmcvbError: it is not the stored one.
+        """
+        super().apply_entries(model, row)
+        if not (key := self.terrain_of(row)):
+            return
+        if self._terrain[0] != key:
+            episode = _Episode(self, self.take_environment(seed := key[0] << 32 | key[1]))
+            episode.reset(seed)
+            self._terrain = episode.terrain, episode.model.hfield_data.copy()
+            self.give_back([episode.environment])
+        if self._terrain[0] != key:
+            raise self.error("draws other terrain than is stored; install dm_control, numpy and scipy as they were")
+        model.hfield_data[:] = self._terrain[1]
 
     def at(self, action_repeat: int) -> Task:
         other = super().at(action_repeat)
@@ -157,8 +175,8 @@ class EnvironmentTask(Task):
         """
         first, second = PROBE_SEEDS
         probes = [_Probe(self, environment, first)]
-        self._model = copy.deepcopy(environment.physics.model._model)
-        if not self._model.ncam:
+        self.model = copy.deepcopy(environment.physics.model._model)
+        if not self.model.ncam:
             raise DmcvbError(f"{self.id} has no camera to look through; add a <camera> to its model")
         if self.trusted:
             probes += [_Probe(self, environment, seed) for seed in (second, first)]
@@ -169,6 +187,9 @@ class EnvironmentTask(Task):
         start, assets = probes[0].models[0], probes[0].assets
         changed = {name for probe in probes for name in probe.changed(start)}
         self._fixed = {name: value for name, value in start.items() if not self.trusted and name not in changed}
+        self.draws_terrain = TERRAIN in changed and start[TERRAIN].size > MAX_ENTRIES
+        if self.draws_terrain and not any(TERRAIN in probe.changed(probe.models[0]) for probe in probes):
+            changed.remove(TERRAIN)
         self.model_entries = {name: np.arange(start[name].size) for name in sorted(changed)}
         repainted = {name for probe in probes for name in assets if probe.assets.get(name) != assets[name]}
         large = {name for name in changed if start[name].size > MAX_ENTRIES}
@@ -225,6 +246,13 @@ def _arrays(model: mujoco.MjModel, beginnings: tuple[str, ...] = ("",)) -> dict[
     return {name: np.ravel(value).copy() for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
+class _Writer(pickle.Pickler):
+    """Of a random generator it writes the state, and not the seed that the generator was made with."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        return (dict, (thing.state,)) if isinstance(thing, np.random.BitGenerator) else NotImplemented
+
+
 class _Probe:
     """An episode of a few steps, for the check at the start.
 
@@ -252,11 +280,12 @@ class _Probe:
 
     @staticmethod
     def _python_of(environment: Any) -> bytes:
-        parts = {name: value for name, value in vars(environment).items() if name != "_physics"}
+        parts, found = {name: value for name, value in vars(environment).items() if name != "_physics"}, io.BytesIO()
         try:
-            return pickle.dumps(parts)  # compared, and never read
+            _Writer(found).dump(parts)  # compared, and never read
         except Exception:  # of a user's own code; what cannot be written is not known
             return b""
+        return found.getvalue()
 
     def changed(self, start: Mapping[str, np.ndarray]) -> set[str]:
         """Names of the model's fields that are ever other than in `start`."""
@@ -328,7 +357,7 @@ class _Episode:
     def __init__(self, task: EnvironmentTask, environment: Any, place: int = 0):
         self.task, self.environment, self.place = task, environment, place
         self.steps, self.terminated, self.truncated = 0, False, False
-        self.state = np.zeros(0)
+        self.state, self.terrain = np.zeros(0), (0, 0, 0)
 
     @property
     def over(self) -> bool:
@@ -339,6 +368,7 @@ class _Episode:
         with self._told(), seeded(seed):
             seed_task(self.environment.task, seed)
             self._observe(self.environment.reset().observation)
+        self.terrain = seed >> 32, seed & 0xFFFFFFFF, zlib.crc32(self.model.hfield_data)
         self._warned = self._warnings()
         self.check_model()
 
@@ -376,30 +406,34 @@ class _Episode:
     def row(self) -> np.ndarray:
         """(physics,) float64: the simulation's state, then the model's entries."""
         owners = (field_owner(self.model, name) for name in self.task.model_entries)
-        return np.concatenate([self.full_state(), *(np.ravel(getattr(owner, name)) for owner, name in owners)])
+        entries = [np.ravel(getattr(owner, name)) for owner, name in owners]
+        return np.concatenate([self.full_state(), *entries, self.terrain if self.task.draws_terrain else ()])
 
     def put(self, row: np.ndarray) -> None:
         """Put the simulation into a stored row; what the task keeps in Python stays as it is."""
         physics, spec = self.environment.physics, self.task.physics_spec
         with self._told():
             self.task.apply_entries(self.model, row)
+            self.terrain = self.task.terrain_of(row)
             physics.reset()
             physics.set_state(row[: mujoco.mj_stateSize(self.task.model, spec)], spec)
             physics.after_reset()
-            self._observe(self.environment.task.get_observation(physics))
+            self._observe(None if self.task.trusted else self.environment.task.get_observation(physics))
 
     def error(self, reason: str) -> EpisodeError:
         return EpisodeError(self.task.id, self.place, self.steps, reason)
 
     def check_model(self) -> None:
         """Raise EpisodeError if the episode changed the model where the episodes of the start's check did not."""
+        if self.task.draws_terrain and zlib.crc32(self.model.hfield_data) != self.terrain[-1]:
+            raise self.error(f"it changed {TERRAIN} of the model in a step; change it at the start of an episode alone")
         if name := self.task.changed_field(self.model):
             raise self.error(
                 f"it changed {name} of the model, which its first episodes left as it was; change it in every episode"
             )
 
     def _warnings(self) -> np.ndarray:
-        return self.environment.physics.data.warning.number[list(BAD_STATES)]
+        return self.environment.physics.data.warning.number[BAD_STATES]
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:
@@ -417,21 +451,23 @@ class _Episode:
             raise self.error(f"it failed ({type(error).__name__}: {reason})") from error
 
     def _observe(self, observation: Any) -> None:
-        """Take an observation.
+        """Take an observation; a task of the suite is asked for it, see `suite`.
 
         Raises:
           EpisodeError: it is no dictionary of finite numbers with the names and sizes of the first one.
         """
+        if self.task.trusted:
+            observation = self.environment.task.observe(self.environment.physics)
         if not isinstance(observation, Mapping) or not observation:
             raise self.error(f"it observes a {type(observation).__name__}; get_observation must give a dictionary")
         parts, fields = [np.ravel(value) for value in observation.values()], self.task.state_fields
         for name, part in zip(observation, parts, strict=True):
             if part.dtype.kind not in "biuf":
                 raise self.error(f"it observes {name!r} as {part.dtype}; give numbers")
-        if not fields:
-            self.task.state_fields = fields = dict(zip(observation, map(len, parts), strict=True))
         sizes = dict(zip(observation, map(len, parts), strict=True))
-        if sizes != fields or list(sizes) != list(fields):
+        if not fields:
+            self.task.state_fields = fields = sizes
+        if list(sizes.items()) != list(fields.items()):
             name = next((name for name in fields if sizes.get(name) != fields[name]), next(iter(sizes)))
             raise self.error(
                 f"it observes {name!r} in different sizes ({fields.get(name)} and {sizes.get(name)}); fix it"

@@ -1,5 +1,7 @@
 """Tasks of your own: "<module>:<function>" names a function that returns a dm_control `Environment`.
 
+"<module>:<Class>" names a subclass of `Task` that steps a whole batch by itself, as DMC-VB's own tasks do.
+
 Its code runs only if a person named it, see `own_code`.
 """
 
@@ -10,18 +12,23 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.own_code import TASKS, find_function
+from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.environment import EnvironmentTask
-from dmcvb_gen.tasks.suite import import_suite
+from dmcvb_gen.tasks.suite import import_quietly
 
 
-def own_task(task_id: str) -> EnvironmentTask:
-    """The task of a function "<module>:<function>".
+def own_task(task_id: str) -> Task:
+    """The task of a function "<module>:<function>", or of a class.
 
     Raises:
       DmcvbError: its code may not run, cannot be found, fails, or gives no usable environment.
     """
-    import_suite()  # before the task imports it, to hide its warnings
+    import_quietly("suite")  # before the task imports it, to hide its warnings
     make = find_function(task_id, TASKS, "task")
+    if isinstance(make, type) and issubclass(make, Task):
+        task = make()
+        task.id = task_id
+        return task
     return EnvironmentTask(task_id, make)
 
 

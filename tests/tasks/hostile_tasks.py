@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import time
 
 import numpy as np
 from dm_control import mujoco
@@ -50,6 +49,11 @@ def arm(task=None, xml=ARM, kind=control.Environment, **options):
     return kind(mujoco.Physics.from_xml_string(xml), task or Arm(), **options)
 
 
+def having(name, **methods):
+    """A task with other methods."""
+    return type(name, (Arm,), methods)
+
+
 # -- what is stored as dm_control does it -----------------------------------------------------------
 
 
@@ -57,72 +61,48 @@ def plain():
     return arm()
 
 
-def pushed_in_each_step():
-    class Task(Arm):
-        def before_step(self, action, physics):
-            physics.data.xfrc_applied[-1, 0] = 3 * np.sin(9 * physics.time())
-            super().before_step(action, physics)
-
-    return arm(Task())
+class PushedInEachStep(Arm):
+    def before_step(self, action, physics):
+        physics.data.xfrc_applied[-1, 0] = 3 * np.sin(9 * physics.time())
+        super().before_step(action, physics)
 
 
-def pushed_from_the_start():
-    class Task(Arm):
-        def start(self, physics):
-            physics.data.qfrc_applied[:] = self.random.uniform(-1, 1, 2)
-
-    return arm(Task())
+class PushedFromTheStart(Arm):
+    def start(self, physics):
+        physics.data.qfrc_applied[:] = self.random.uniform(-1, 1, 2)
 
 
-def moves_its_hand_before_a_step():
-    class Task(Arm):
-        def before_step(self, action, physics):
-            physics.data.mocap_pos[0, 2] += 0.01
-            super().before_step(action, physics)
-
-    return arm(Task())
+class MovesItsHandBeforeAStep(Arm):
+    def before_step(self, action, physics):
+        physics.data.mocap_pos[0, 2] += 0.01
+        super().before_step(action, physics)
 
 
-def moves_its_hand_after_a_step():
-    class Task(Arm):
-        def after_step(self, physics):
-            physics.data.mocap_pos[0, 0] -= 0.02 + 0.1 * physics.data.qpos[0]
-
-    return arm(Task())
+class MovesItsHandAfterAStep(Arm):
+    def after_step(self, physics):
+        physics.data.mocap_pos[0, 0] -= 0.02 + 0.1 * physics.data.qpos[0]
 
 
-def damping_drifts():
-    class Task(Arm):
-        def start(self, physics):
-            physics.model.dof_damping[:] *= self.random.uniform(0.5, 2.0)
-
-    return arm(Task())
+class DampingDrifts(Arm):
+    def start(self, physics):
+        physics.model.dof_damping[:] *= self.random.uniform(0.5, 2.0)
 
 
-def drawn_looks():
-    class Task(Arm):
-        def start(self, physics):
-            physics.model.geom_size[1, 0] = self.random.uniform(0.02, 0.1)
-            physics.model.geom_rgba[0, :3] = self.random.uniform(0, 1, 3)
-            physics.model.mat_rgba[0, :3] = self.random.uniform(0, 1, 3)
-
-    return arm(Task())
+class DrawnLooks(Arm):
+    def start(self, physics):
+        physics.model.geom_size[1, 0] = self.random.uniform(0.02, 0.1)
+        physics.model.geom_rgba[0, :3] = self.random.uniform(0, 1, 3)
+        physics.model.mat_rgba[0, :3] = self.random.uniform(0, 1, 3)
 
 
-def changing_looks():
-    class Task(Arm):
-        def after_step(self, physics):
-            physics.model.geom_rgba[0, 0] = physics.time() % 1
-
-    return arm(Task())
+class ChangingLooks(Arm):
+    def after_step(self, physics):
+        physics.model.geom_rgba[0, 0] = physics.time() % 1
 
 
-def drawn_gravity():
-    class Task(Arm):
-        def start(self, physics):
-            physics.model.opt.gravity[:] = [self.random.uniform(-1, 1), 0, -5]
-
-    return arm(Task())
+class DrawnGravity(Arm):
+    def start(self, physics):
+        physics.model.opt.gravity[:] = [self.random.uniform(-1, 1), 0, -5]
 
 
 def own_step_and_reset():
@@ -139,45 +119,28 @@ def own_step_and_reset():
     return arm(kind=Environment)
 
 
-def cut_off():
-    class Task(Arm):
-        def get_termination(self, physics):
-            return 1.0 if physics.time() > 0.1 + 0.1 * abs(physics.data.qpos[0]) else None
-
-    return arm(Task())
+class CutOff(Arm):
+    def get_termination(self, physics):
+        return 1.0 if physics.time() > 0.1 + 0.1 * abs(physics.data.qpos[0]) else None
 
 
-def ended_by_python():
-    class Task(Arm):
-        def start(self, physics):
-            self.left = self.random.randint(5, 12)
+class EndedByPython(Arm):
+    def start(self, physics):
+        self.left = self.random.randint(5, 12)
 
-        def after_step(self, physics):
-            self.left -= 1
+    def after_step(self, physics):
+        self.left -= 1
 
-        def get_termination(self, physics):
-            return 0.0 if self.left <= 0 else None
-
-    return arm(Task())
+    def get_termination(self, physics):
+        return 0.0 if self.left <= 0 else None
 
 
-def half_a_discount():
-    class Task(Arm):
-        def get_termination(self, physics):
-            return 0.5 if physics.time() > 0.2 else None
+class ThreeActionsForTwoMotors(Arm):
+    def action_spec(self, physics):
+        return specs.BoundedArray((3,), float, [0, -2, -0.3], [3, 0.8, 0.1])
 
-    return arm(Task())
-
-
-def three_actions_for_two_motors():
-    class Task(Arm):
-        def action_spec(self, physics):
-            return specs.BoundedArray((3,), float, [0, -2, -0.3], [3, 0.8, 0.1])
-
-        def before_step(self, action, physics):
-            physics.set_control(np.array(action) @ TRIPLE)
-
-    return arm(Task())
+    def before_step(self, action, physics):
+        physics.set_control(np.array(action) @ TRIPLE)
 
 
 def strong():
@@ -188,12 +151,9 @@ def no_bounds():
     return arm(xml=ARM.replace(' ctrlrange="-1 1"', ""))
 
 
-def torques_alone():
-    class Task(Arm):
-        def get_observation(self, physics):
-            return {"torque": physics.data.sensordata.copy()}
-
-    return arm(Task())
+class TorquesAlone(Arm):
+    def get_observation(self, physics):
+        return {"torque": physics.data.sensordata.copy()}
 
 
 def flat():
@@ -217,15 +177,24 @@ def current_step():
     return arm(legacy_step=False)
 
 
-def counts_episodes():
-    class Task(Arm):
-        episodes = 0
+class Hills(Arm):
+    def start(self, physics):
+        physics.model.hfield_data[:] = self.random.uniform(0, 1, 120 * 120)
 
-        def start(self, physics):
-            self.episodes += 1
-            physics.data.qvel[:] = self.episodes
 
-    return arm(Task())
+def hills(task=Hills):
+    """Terrain of more numbers than a stored row has."""
+    asset = '<hfield name="hills" nrow="120" ncol="120" size="2 2 .5 .1"/></asset>'
+    ground = '<geom type="hfield" hfield="hills" pos="0 0 -.4"/></worldbody>'
+    return arm(task(), xml=ARM.replace("</asset>", asset).replace("</worldbody>", ground))
+
+
+class CountsEpisodes(Arm):
+    episodes = 0
+
+    def start(self, physics):
+        self.episodes += 1
+        physics.data.qvel[:] = self.episodes
 
 
 def keeps_physics():
@@ -237,43 +206,31 @@ def keeps_physics():
 # -- what is drawn elsewhere, and seeded for each episode -------------------------------------------
 
 
-def numpy_at_the_start():
-    class Task(Arm):
-        def start(self, physics):
-            physics.data.qpos[:] = np.random.uniform(-1, 1, 2)
-
-    return arm(Task())
+class NumpyAtTheStart(Arm):
+    def start(self, physics):
+        physics.data.qpos[:] = np.random.uniform(-1, 1, 2)
 
 
-def python_at_the_start():
-    class Task(Arm):
-        def start(self, physics):
-            physics.data.qpos[:] = random.uniform(-1, 1)
-
-    return arm(Task())
+class PythonAtTheStart(Arm):
+    def start(self, physics):
+        physics.data.qpos[:] = random.uniform(-1, 1)
 
 
-def generator_of_its_own():
-    class Task(Arm):
-        def __init__(self):
-            super().__init__()
-            self.generator = np.random.default_rng()
+class GeneratorOfItsOwn(Arm):
+    def __init__(self):
+        super().__init__()
+        self.generator = np.random.default_rng()
 
-        def start(self, physics):
-            physics.data.qpos[:] = self.generator.uniform(-1, 1, 2)
+    def start(self, physics):
+        physics.data.qpos[:] = self.generator.uniform(-1, 1, 2)
 
-        def after_step(self, physics):
-            physics.data.qvel[:] += self.generator.normal(size=2)
-
-    return arm(Task())
+    def after_step(self, physics):
+        physics.data.qvel[:] += self.generator.normal(size=2)
 
 
-def new_generator_at_the_start():
-    class Task(Arm):
-        def start(self, physics):
-            physics.data.qpos[:] = np.random.default_rng().uniform(-1, 1, 2)
-
-    return arm(Task())
+class NewGeneratorAtTheStart(Arm):
+    def start(self, physics):
+        physics.data.qpos[:] = np.random.default_rng().uniform(-1, 1, 2)
 
 
 def drawn_model():
@@ -284,56 +241,33 @@ def drawn_model():
 # -- what is refused ---------------------------------------------------------------------------------
 
 
-def numpy_in_a_step():
-    class Task(Arm):
-        def after_step(self, physics):
-            physics.data.qvel[0] += np.random.normal()
-
-    return arm(Task())
+class NumpyInAStep(Arm):
+    def after_step(self, physics):
+        physics.data.qvel[0] += np.random.normal()
 
 
-def python_in_a_step():
-    class Task(Arm):
-        def get_reward(self, physics):
-            return random.random()
-
-    return arm(Task())
+class NumpyInALateStep(Arm):
+    def after_step(self, physics):
+        physics.data.qvel[0] += np.random.normal() if physics.time() > 0.45 else 0
 
 
-def numpy_in_a_late_step():
-    class Task(Arm):
-        def after_step(self, physics):
-            physics.data.qvel[0] += np.random.normal() if physics.time() > 0.45 else 0
-
-    return arm(Task())
+class NewGeneratorInAStep(Arm):
+    def before_step(self, action, physics):
+        super().before_step(action + np.random.default_rng().normal(size=2), physics)
 
 
-def new_generator_in_a_step():
-    class Task(Arm):
-        def before_step(self, action, physics):
-            super().before_step(action + np.random.default_rng().normal(size=2), physics)
+class FixedGenerator(Arm):
+    def __init__(self):
+        super().__init__()
+        self.generators = {"start": np.random.default_rng(0)}
 
-    return arm(Task())
-
-
-def fixed_generator():
-    class Task(Arm):
-        def __init__(self):
-            super().__init__()
-            self.generators = {"start": np.random.default_rng(0)}
-
-        def start(self, physics):
-            physics.data.qpos[:] = self.generators["start"].uniform(-1, 1, 2)
-
-    return arm(Task())
+    def start(self, physics):
+        physics.data.qpos[:] = self.generators["start"].uniform(-1, 1, 2)
 
 
-def generator_of_the_module():
-    class Task(Arm):
-        def start(self, physics):
-            physics.data.qpos[:] = MODULE_GENERATOR.uniform(-1, 1, 2)
-
-    return arm(Task())
+class GeneratorOfTheModule(Arm):
+    def start(self, physics):
+        physics.data.qpos[:] = MODULE_GENERATOR.uniform(-1, 1, 2)
 
 
 def python_generator_without_seed():
@@ -346,98 +280,15 @@ def python_generator_without_seed():
     return arm(Task())
 
 
-def count_of_the_module():
-    class Task(Arm):
-        def start(self, physics):
-            EPISODES["begun"] += 1
-            physics.data.qvel[:] = EPISODES["begun"]
-
-    return arm(Task())
-
-
-def clock():
-    class Task(Arm):
-        def get_observation(self, physics):
-            return {"clock": np.array([time.perf_counter()])}
-
-    return arm(Task())
-
-
-def observed(value):
-    class Task(Arm):
-        def get_observation(self, physics):
-            return value(physics)
-
-    return arm(Task())
-
-
-def text():
-    return observed(lambda physics: {"name": "arm"})
-
-
-def thing():
-    return observed(lambda physics: {"physics": physics})
-
-
-def number():
-    return observed(lambda physics: 1.0)
-
-
-def nothing():
-    return observed(lambda physics: {})
-
-
-def growing():
-    return observed(lambda physics: {"contacts": physics.data.qpos[: 1 + (physics.time() > 0.03)]})
-
-
-def other_names():
-    return observed(lambda physics: {"late" if physics.time() > 0.03 else "early": physics.data.qpos})
-
-
-def nan_seen():
-    return observed(lambda physics: {"x": np.array([1.0, np.nan])})
-
-
-def late_nan_seen():
-    return observed(lambda physics: {"x": np.array([np.nan if physics.time() > 0.45 else 1.0])})
-
-
-def rewarded(value):
-    class Task(Arm):
-        def get_reward(self, physics):
-            return value(physics)
-
-    return arm(Task())
-
-
-def late_nan_reward():
-    return rewarded(lambda physics: np.nan if physics.time() > 0.45 else 1.0)
-
-
-def no_reward():
-    return rewarded(lambda physics: None)
-
-
-def breaks():
-    return rewarded(lambda physics: {}["left"])
-
-
-def breaks_late():
-    return rewarded(lambda physics: {}["left"] if physics.time() > 0.45 else 0.0)
+class CountOfTheModule(Arm):
+    def start(self, physics):
+        EPISODES["begun"] += 1
+        physics.data.qvel[:] = EPISODES["begun"]
 
 
 def no_motor():
     start, end = ARM.index("<actuator>"), ARM.index("</mujoco>")  # and no sensor of them
     return arm(xml=ARM[:start] + ARM[end:])
-
-
-def discrete():
-    class Task(Arm):
-        def action_spec(self, physics):
-            return specs.DiscreteArray(3)
-
-    return arm(Task())
 
 
 def no_camera():
@@ -463,33 +314,24 @@ def diverges_quietly():
     return arm(Diverging(), kind=Environment)
 
 
-def late_change():
-    class Task(Arm):
-        def after_step(self, physics):
-            if physics.time() > 0.45:
-                physics.model.geom_rgba[0, 0] = 0.3
-
-    return arm(Task())
+class LateChange(Arm):
+    def after_step(self, physics):
+        if physics.time() > 0.45:
+            physics.model.geom_rgba[0, 0] = 0.3
 
 
 def other_models():
     return arm(xml=ARM.replace('<light pos="0 0 3"/>', '<light pos="0 0 3"/>' * np.random.randint(1, 100)))
 
 
-def painted_anew():
-    class Task(Arm):
-        def start(self, physics):
-            physics.model.tex_data[:] = self.random.randint(256)
-
-    return arm(Task())
+class PaintedAnew(Arm):
+    def start(self, physics):
+        physics.model.tex_data[:] = self.random.randint(256)
 
 
-def other_headlight():
-    class Task(Arm):
-        def start(self, physics):
-            physics.model.vis.headlight.ambient[:] = self.random.uniform(0, 1)
-
-    return arm(Task())
+class OtherHeadlight(Arm):
+    def start(self, physics):
+        physics.model.vis.headlight.ambient[:] = self.random.uniform(0, 1)
 
 
 def restarts_itself():
@@ -506,3 +348,22 @@ def no_environment():
 
 def fails():
     return 1 / 0
+
+
+class Quake(Hills):
+    def after_step(self, physics):
+        if physics.time() > 0.45:
+            physics.model.hfield_data[0] = 0.3
+
+
+def quake():
+    return hills(Quake)
+
+
+class EarlyQuake(Hills):
+    def after_step(self, physics):
+        physics.model.hfield_data[0] = physics.time()
+
+
+def early_quake():
+    return hills(EarlyQuake)

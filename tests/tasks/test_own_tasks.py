@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import copy
 import functools
+import random
+import time
 
 import mujoco
 import numpy as np
 import pytest
+from dm_env import specs
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import random_policy
@@ -16,60 +19,89 @@ from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks.cameras import Kinematics, nominal_cameras
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from tests.tasks import hostile_tasks as h
+from tests.tasks.hostile_tasks import having
 
+
+def late(physics):
+    """After the episodes of the start's check."""
+    return physics.time() > 0.45
+
+
+def observed(value):
+    return having("Observes", get_observation=lambda self, physics: value(physics))
+
+
+def rewarded(value):
+    return having("Earns", get_reward=lambda self, physics: value(physics))
+
+
+HALF_A_DISCOUNT = having("Ends", get_termination=lambda self, physics: 0.5 if physics.time() > 0.2 else None)
+DISCRETE = having("Discrete", action_spec=lambda self, physics: specs.DiscreteArray(3))
 NAMES, SEED = ("own", "random"), 5
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
 
 EQUAL = (
-    h.plain, h.pushed_in_each_step, h.pushed_from_the_start, h.moves_its_hand_before_a_step,
-    h.moves_its_hand_after_a_step, h.damping_drifts, h.drawn_looks, h.changing_looks, h.drawn_gravity,
-    h.other_headlight, h.own_step_and_reset, h.cut_off, h.ended_by_python, h.half_a_discount,
-    h.three_actions_for_two_motors, h.strong, h.no_bounds, h.torques_alone, h.flat, h.odd_limit, h.sleeping,
-    h.muscles, h.current_step, h.counts_episodes, h.keeps_physics,
+    h.plain, h.PushedInEachStep, h.PushedFromTheStart, h.MovesItsHandBeforeAStep,
+    h.MovesItsHandAfterAStep, h.DampingDrifts, h.DrawnLooks, h.ChangingLooks, h.DrawnGravity,
+    h.OtherHeadlight, h.own_step_and_reset, h.CutOff, h.EndedByPython, HALF_A_DISCOUNT,
+    h.ThreeActionsForTwoMotors, h.strong, h.no_bounds, h.TorquesAlone, h.flat, h.odd_limit, h.sleeping,
+    h.hills, h.muscles, h.current_step, h.CountsEpisodes, h.keeps_physics,
 )  # fmt: skip
 SEEDED = (
-    h.numpy_at_the_start, h.python_at_the_start, h.generator_of_its_own, h.new_generator_at_the_start, h.drawn_model,
+    h.NumpyAtTheStart, h.PythonAtTheStart, h.GeneratorOfItsOwn, h.NewGeneratorAtTheStart, h.drawn_model,
 )  # fmt: skip
 REFUSED = {
-    h.numpy_in_a_step: "drew from a global random generator in a step; draw from self.random",
-    h.python_in_a_step: "drew from a global random generator in a step",
-    h.numpy_in_a_late_step: "drew from a global random generator in a step",
-    h.new_generator_in_a_step: "made a random generator without a seed in a step",
-    h.fixed_generator: "holds a random generator with a fixed seed, which begins every episode alike",
-    h.generator_of_the_module: "gives another episode for the same seed",
+    h.NumpyInAStep: "drew from a global random generator in a step; draw from self.random",
+    rewarded(lambda physics: random.random()): "drew from a global random generator in a step",
+    h.NumpyInALateStep: "drew from a global random generator in a step",
+    h.NewGeneratorInAStep: "made a random generator without a seed in a step",
+    h.FixedGenerator: "holds a random generator with a fixed seed, which begins every episode alike",
+    h.GeneratorOfTheModule: "gives another episode for the same seed",
     h.python_generator_without_seed: "gives another episode for the same seed",
-    h.count_of_the_module: "gives another episode for the same seed",
-    h.clock: "gives another episode for the same seed",
-    h.text: "observes 'name' as <U3; give numbers",
-    h.thing: "observes 'physics' as object; give numbers",
-    h.number: "observes a float; get_observation must give a dictionary",
-    h.nothing: "observes a dict; get_observation must give a dictionary",
-    h.growing: "observes 'contacts' in different sizes",
-    h.other_names: "observes 'early' in different sizes",
-    h.nan_seen: "observes 'x' with values that are no finite numbers",
-    h.no_reward: "failed .TypeError: .*None",
-    h.breaks: "failed .KeyError: 'left'",
+    h.CountOfTheModule: "gives another episode for the same seed",
+    observed(lambda physics: {"t": np.array([time.perf_counter()])}): "gives another episode for the same seed",
+    observed(lambda physics: {"name": "arm"}): "observes 'name' as <U3; give numbers",
+    observed(lambda physics: {"physics": physics}): "observes 'physics' as object; give numbers",
+    observed(lambda physics: {"arm": {"position": physics.data.qpos}}): "observes 'arm' as object; give numbers",
+    h.early_quake: "changes hfield_data of the model in its episodes, which cannot be stored",
+    observed(lambda physics: 1.0): "observes a float; get_observation must give a",
+    observed(lambda physics: {}): "observes a dict; get_observation must give a dictionary",
+    observed(lambda physics: {"x": np.zeros(1 + (physics.time() > 0.1))}): "observes 'x' in different sizes",
+    observed(lambda physics: {"b" if physics.time() > 0.03 else "a": 0.0}): "observes 'a' in different sizes",
+    observed(lambda physics: {"x": np.array([1.0, np.nan])}): "observes 'x' with values that are no finite numbers",
+    rewarded(lambda physics: None): "failed .TypeError: .*None",
+    rewarded(lambda physics: {}["left"]): "failed .KeyError: 'left'",
     h.no_motor: "takes float64 of shape .0,. as actions; give it actuators",
-    h.discrete: "takes int32 of shape .. as actions",
+    DISCRETE: "takes int32 of shape .. as actions",
     h.no_camera: "has no camera to look through",
     h.other_models: "changes .* of the model in its episodes, which cannot be stored",
-    h.painted_anew: "changes tex_data of the model in its episodes, which cannot be stored",
+    h.PaintedAnew: "changes tex_data of the model in its episodes, which cannot be stored",
     h.restarts_itself: "began another episode within a step",
     h.no_environment: "gives a int; give a function that returns",
     h.fails: "cannot start task t .division by zero",
 }  # fmt: skip
 REFUSED_LATE = {
-    h.late_nan_seen: "observes 'x' with values that are no finite numbers",
-    h.late_nan_reward: "gave the reward nan",
-    h.breaks_late: "failed .KeyError: 'left'",
+    observed(lambda physics: {"x": np.nan if late(physics) else 1.0}): "observes 'x' with values that are no finite",
+    rewarded(lambda physics: np.nan if late(physics) else 1.0): "gave the reward nan",
+    rewarded(lambda physics: {}["left"] if late(physics) else 0.0): "failed .KeyError: 'left'",
     h.diverges: "the simulation diverged .mjWARN_BAD",
     h.diverges_quietly: "the simulation diverged .mjWARN_BAD",
-    h.late_change: "changed geom_rgba of the model, which its first episodes left as it was",
+    h.quake: "changed hfield_data of the model in a step",
+    h.LateChange: "changed geom_rgba of the model, which its first episodes left as it was",
 }  # fmt: skip
 
 
 def named(table):
-    return pytest.mark.parametrize("make", [pytest.param(make, id=make.__name__) for make in table])
+    return pytest.mark.parametrize("case", [pytest.param(case, id=case.__name__) for case in table])
+
+
+def make(case):
+    """The environment of a function that gives one, or of a task."""
+    return h.arm(case()) if isinstance(case, type) else case()
+
+
+def task_of(case):
+    return EnvironmentTask("t", functools.partial(make, case))
 
 
 def rolled(task, episodes):
@@ -124,20 +156,20 @@ def check_episode(task, made, place, environment):
 
 
 @named(EQUAL)
-def test_what_dm_control_does_is_what_is_stored(make):
-    task = EnvironmentTask("t", make)
-    check_episode(task.at(1), rolled(task.at(1), [2]), 0, make())
+def test_what_dm_control_does_is_what_is_stored(case):
+    task = task_of(case)
+    check_episode(task.at(1), rolled(task.at(1), [2]), 0, make(case))
     together, alone = rolled(task, [0, 1]), rolled(task, [1])
     for place in range(2):
-        check_episode(task, together, place, make())
+        check_episode(task, together, place, make(case))
     for name, values in alone.arrays().items():
         np.testing.assert_array_equal(values[0], together.arrays()[name][1], err_msg=name)
-    assert (together.state[0, 0] != together.state[1, 0]).any() or make in (h.torques_alone, h.own_step_and_reset)
+    assert (together.state[0, 0] != together.state[1, 0]).any() or case in (h.TorquesAlone, h.own_step_and_reset)
 
 
 @named([*EQUAL, *SEEDED])
-def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(make):
-    task, other = EnvironmentTask("t", make), EnvironmentTask("t", make)
+def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(case):
+    task, other = task_of(case), task_of(case)
     task.most_at_once = 3
     many = rolled(task, [2, 0, 1, 3])
     again = rolled(other, [3])
@@ -150,34 +182,36 @@ def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(make):
 
 
 @named(REFUSED)
-def test_what_cannot_be_repeated_or_stored_is_refused_in_one_line(make):
-    with pytest.raises(DmcvbError, match=REFUSED[make]) as caught:
-        rolled(EnvironmentTask("t", make), [0])
+def test_what_cannot_be_repeated_or_stored_is_refused_in_one_line(case):
+    with pytest.raises(DmcvbError, match=REFUSED[case]) as caught:
+        rolled(task_of(case), [0])
     assert "\n" not in str(caught.value)
 
 
 @named(REFUSED_LATE)
-def test_what_fails_late_names_task_episode_and_step(make):
-    task = EnvironmentTask("t", make)
-    with pytest.raises(DmcvbError, match=f"^task t, episode 8, step 1[0-2]: .*{REFUSED_LATE[make]}"):
+def test_what_fails_late_names_task_episode_and_step(case):
+    task = task_of(case)
+    with pytest.raises(DmcvbError, match=f"^task t, episode 8, step 1[0-2]: .*{REFUSED_LATE[case]}"):
         rolled(task, [8])
 
 
 def test_an_environment_is_used_again_only_if_nothing_of_an_episode_is_left_in_it():
-    made = []
-
-    def counted(make):
-        made.append(make.__name__)
-        return make()
-
-    for make, expected in ((h.flat, False), (h.counts_episodes, False)):
-        task = EnvironmentTask("t", functools.partial(counted, make))
-        assert task.reusable is expected
+    for case, expected in ((h.PushedInEachStep, True), (h.DampingDrifts, False), (h.CountsEpisodes, False)):
+        assert task_of(case).reusable is expected
 
 
-@named([h.sleeping, h.drawn_model, h.other_headlight, h.drawn_looks, h.changing_looks, h.flat])
-def test_the_cameras_of_stored_rows_are_mujocos(make):
-    task = EnvironmentTask("t", make)
+def test_terrain_that_is_drawn_otherwise_than_it_was_stored_is_refused():
+    task = task_of(h.hills)
+    row = rolled(task, [0]).physics[0, 0]
+    task.apply_entries(copy.deepcopy(task.model), row)
+    row[-1] += 1
+    with pytest.raises(DmcvbError, match="draws other terrain than is stored; install dm_control, numpy and scipy"):
+        task.apply_entries(copy.deepcopy(task.model), row)
+
+
+@named([h.sleeping, h.drawn_model, h.OtherHeadlight, h.DrawnLooks, h.ChangingLooks, h.flat])
+def test_the_cameras_of_stored_rows_are_mujocos(case):
+    task = task_of(case)
     rows = rolled(task, [0]).physics[0]
     position = nominal_cameras(task, rows)[0][:, 0]
     geoms = Kinematics(task, ["geom_xpos"])(rows)["geom_xpos"]

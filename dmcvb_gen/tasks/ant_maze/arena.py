@@ -6,20 +6,16 @@ mocap body, so that each episode of a batch puts it elsewhere.
 
 from __future__ import annotations
 
-import contextlib
-import ctypes.util
 import functools
-import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
+from dmcvb_gen.tasks.suite import import_quietly
 
 WALL_HEIGHT = 2.0
 """Meters."""
@@ -73,25 +69,8 @@ def textures(style: int) -> dict[str, tuple[str, ...]]:
 
 def look_numbers(style: int) -> tuple[int, ...]:
     """All looks of a style: every wall texture with every floor texture."""
-    walls, floors = (len(paths) for paths in textures(style).values())
-    if max(walls, floors) > 10:
-        raise ValueError(
-            f"style {style} has {walls} walls and {floors} floors; a look's number has room for 10 of each"
-        )
+    walls, floors = (len(paths) for paths in textures(style).values())  # 8 of each at most
     return tuple(style * 100 + wall * 10 + floor for wall in range(walls) for floor in range(floors))
-
-
-@contextlib.contextmanager
-def _quiet_renderer_choice():
-    """dm_control looks for a window system when it is imported, and complains; nothing is drawn with it here."""
-    if "MUJOCO_GL" in os.environ:
-        yield
-        return
-    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"
-    try:
-        yield
-    finally:
-        del os.environ["MUJOCO_GL"]
 
 
 @functools.lru_cache(maxsize=2)  # each holds 200 MB
@@ -101,17 +80,14 @@ def textured_model(layout: Layout) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(arena.source, arena.assets)
 
 
-def _without_textures(source: str, assets: Mapping[str, bytes]) -> mujoco.MjModel:
+def _without_textures(source: str, assets: dict[str, bytes]) -> mujoco.MjModel:
     """Return the model without textures, for simulations that each keep a copy: 0.1 MB instead of 200."""
-    root = ElementTree.fromstring(source)
-    listed = root.find("asset")
-    assert listed is not None
-    for texture in listed.findall("texture"):
-        listed.remove(texture)
-    for material in listed.findall("material"):
-        material.attrib.pop("texture", None)
-    text = ElementTree.tostring(root, encoding="unicode")
-    return mujoco.MjModel.from_xml_string(text, {name: data for name, data in assets.items() if name in text})
+    spec = mujoco.MjSpec.from_string(source, assets=assets)
+    for texture in list(spec.textures):
+        spec.delete(texture)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    return spec.compile()
 
 
 @functools.lru_cache(maxsize=32)
@@ -119,11 +95,8 @@ def build_arena(layout: Layout) -> Arena:
     """The arena of a layout, with the ant and the goal."""
     import labmaze
 
-    with _quiet_renderer_choice():
-        from dm_control.locomotion.arenas import labmaze_textures, mazes
-        from dm_control.locomotion.props import target_sphere
-        from dm_control.locomotion.walkers import ant
-
+    modules = ("arenas.labmaze_textures", "arenas.mazes", "props.target_sphere", "walkers.ant")
+    labmaze_textures, mazes, target_sphere, ant = (import_quietly(f"locomotion.{module}") for module in modules)
     maze = labmaze.FixedMazeWithRandomGoals(entity_layer=layout.entity_layer, num_spawns=1, num_objects=1)
     arena = mazes.MazeWithTargets(
         maze=maze, xy_scale=CELL, z_height=WALL_HEIGHT, skybox_texture=labmaze_textures.SkyBox(SKY)

@@ -9,6 +9,7 @@ exact position, interpolated between pixels.
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import skfmm
@@ -23,7 +24,7 @@ SATURATION = 5
 """Travel time from the walls, in pixels, from which on the wave is as fast as it gets."""
 
 
-class DistanceField:
+class DistanceField(NamedTuple):
     """Distances to a goal on the pixels of a layout.
 
     Attributes:
@@ -32,8 +33,8 @@ class DistanceField:
       largest: the largest value on the floor, d_max.
     """
 
-    def __init__(self, values: np.ndarray, largest: float):
-        self.values, self.largest = values, largest
+    values: np.ndarray
+    largest: float
 
 
 @functools.cache
@@ -45,12 +46,6 @@ def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     nearest = ndimage.distance_transform_edt(~floor, return_distances=False, return_indices=True)
     return floor, np.minimum(from_walls, SATURATION) / SATURATION, nearest
-
-
-def center_pixel(cell: tuple[int, int]) -> tuple[int, int]:
-    """(row, column) of the pixel below and right of a cell's center."""
-    row, column = cell
-    return row * PIXELS + PIXELS // 2, column * PIXELS + PIXELS // 2
 
 
 def floor_pixels(layout: Layout) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ from dmcvb_gen.tasks.ant_maze.arena import (
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, PhysicsBatch, Task
+from dmcvb_gen.tasks.cameras import matrices
 
 EPISODE_STEPS, EVALUATION_STEPS = 600, 1000
 """Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
@@ -170,7 +171,7 @@ class AntMazeBatch(PhysicsBatch):
             self._fields[sim], self._largest[sim] = field.values, field.largest
             if self._paths is not None:
                 self._paths[sim] = geodesic_field(self.task.layout, self._mocap[sim, 0]).values
-        self._touched[ids] = self._touching(ids)
+        self._touched[ids] = self._gaps(ids) < 0
 
     # -- stepping -----------------------------------------------------------------------------
 
@@ -191,10 +192,6 @@ class AntMazeBatch(PhysicsBatch):
         """(n,) meters to the goal -> (n,) int, physics steps that cannot end in a touch; 1 if the next one can."""
         steps = self.task.substeps
         return np.select([gaps >= NEAR, gaps >= NEAR / 5], [steps, steps // 5], 1)
-
-    def _touching(self, ids: np.ndarray) -> np.ndarray:
-        """(len(ids),) bool: whether a geom of the ant overlaps the goal's sphere."""
-        return self._gaps(ids) < 0
 
     def _gaps(self, ids: np.ndarray) -> np.ndarray:
         """(len(ids),) meters between the goal's sphere and the ant's nearest geom, negative where they overlap.
@@ -353,12 +350,8 @@ class AntMaze(Task):
         index = self.views.index(view)
         fovy = np.radians(self.model.cam_fovy[self.model.camera(self.cameras[index]).id])
         goal = physics[:, _mocap_columns(self.model)] + [0, 0, GOAL_HEIGHT]
-        from scipy.spatial.transform import (
-            Rotation,  # scipy takes a fifth of a second, which commands that list or show need not wait for
-        )
-
-        rotation = Rotation.from_quat(exogenous.camera_quaternion[:, index].astype(np.float64), scalar_first=True)
-        seen = rotation.apply(goal - exogenous.camera_position[:, index], inverse=True)
+        turned = matrices(exogenous.camera_quaternion[:, index].astype(np.float64))
+        seen = ((goal - exogenous.camera_position[:, index])[:, None] @ turned)[:, 0]
         depth, aside = -seen[:, 2], np.linalg.norm(seen[:, :2], axis=1)
         angle = np.arctan(np.sqrt(2) * np.tan(fovy / 2))  # of the picture's corners
         outside = aside * np.cos(angle) - depth * np.sin(angle)  # distance from the cone around the picture
