@@ -1,51 +1,30 @@
 """Rendering: `make_renderer("native", task, 64)` gives a renderer; physics states and labels become pictures.
 
-A renderer is a module or package beside this file with a subclass of `Renderer` as `RENDERER`; its file name is the
-renderer's name. Other packages add theirs under the entry point group `dmcvb_gen.renderers` (name = class).
+A renderer is a module or package in this folder with a subclass of `Renderer` as `RENDERER`; its file name is the
+renderer's name.
 """
 
 from __future__ import annotations
 
-import functools
 import importlib
-import pkgutil
 from collections.abc import Callable
-from importlib import metadata
 
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks.base import Task
 
-ENTRY_POINTS = "dmcvb_gen.renderers"
-
-
-def _loader(module: str) -> Callable[[], type[Renderer]]:
-    return lambda: importlib.import_module(f"{__name__}.{module}").RENDERER
-
-
-@functools.cache
-def _table() -> dict[str, Callable[[], type[Renderer]]]:
-    """Renderer -> what gives its class; nothing is imported before it is asked for."""
-    own = {
-        found.name: _loader(found.name)
-        for found in pkgutil.iter_modules(__path__)
-        if found.name not in ("base", "choice")
-    }
-    return {point.name: point.load for point in metadata.entry_points(group=ENTRY_POINTS)} | own
-
-
-RENDERERS = tuple(_table())
+RENDERERS = ("native", "opengl")
 
 
 def renderer_class(name: str) -> type[Renderer]:
-    """The class of a renderer.
+    """The class of a renderer, imported when it is first asked for.
 
     Raises:
       UnknownNameError: no renderer has that name.
     """
-    if name not in _table():
+    if name not in RENDERERS:
         raise UnknownNameError("renderer", name, RENDERERS)
-    return _table()[name]()
+    return importlib.import_module(f"{__name__}.{name}").RENDERER
 
 
 def make_renderer(

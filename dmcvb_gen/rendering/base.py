@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -74,11 +73,8 @@ class Renderer(abc.ABC):
         Returns:
           "depth" -> (frame, view, size, size) float32 in meters (0: sky); "segmentation" -> the same shape, int16
           ids of geoms (-1: sky).
-
-        Raises:
-          RenderingError: this renderer has no labels.
         """
-        raise RenderingError(f"the {self.name} renderer has no depth or segmentation; use --renderer native")
+        raise NotImplementedError
 
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
@@ -120,8 +116,6 @@ def moved_lamps(
 
 def check_size(size: int) -> None:
     """Raise RenderingError for a size that no renderer takes."""
-    if not isinstance(size, numbers.Integral):
-        raise RenderingError(f"size is {size!r}; give a whole number of pixels a side")
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise RenderingError(
             f"size {size} is out of range; give {MIN_SIZE} to {MAX_SIZE} pixels a side (DMC-VB has 64)"

@@ -68,17 +68,23 @@ def unavailable() -> str | None:
     return None if way else f"{reason}; install libegl1 and libgl1 (Debian: apt-get install libegl1 libgl1)"
 
 
-def _gl_context(size: int) -> Any:
-    """An off-screen OpenGL context.
+def _painter(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
+    """MuJoCo's own renderer, in the off-screen OpenGL that starts here.
 
     Raises:
-      RenderingError: none starts here.
+      RenderingError: none does.
     """
     if reason := unavailable():
         raise RenderingError(f"renderer 'opengl' cannot start here: {reason}")
     way, _ = _started()
     os.environ.setdefault("PYOPENGL_PLATFORM", str(way))
-    return importlib.import_module(f"mujoco.{way}").GLContext(size, size)
+    module: Any = sys.modules[mujoco.Renderer.__module__]  # it has chosen already, a window system for example
+    chosen = getattr(module.gl_context, "GLContext", None)
+    module.gl_context.GLContext = importlib.import_module(f"mujoco.{way}").GLContext
+    try:
+        return mujoco.Renderer(model, size, size, MAX_GEOMS)
+    finally:
+        module.gl_context.GLContext = chosen
 
 
 class OpenglRenderer(Renderer):
@@ -92,7 +98,6 @@ class OpenglRenderer(Renderer):
 
     def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
         check_size(size)
-        self._gl = _gl_context(size)
         self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
         self._backgrounds = backgrounds
         self._model = copy.deepcopy(task.picture_model)  # materials and textures change frame by frame
@@ -114,13 +119,8 @@ class OpenglRenderer(Renderer):
         self._own_colors = task.material_colors.astype(np.float32)
         self._own_values = {name: getattr(self._model, name).copy() for name in _REPLACED}
         self._data = mujoco.MjData(self._model)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_150)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
-        self._option = mujoco.MjvOption()
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._painter = _painter(self._model, size)
+        self._terrain_changes = task.draws_terrain or "hfield_data" in task.model_entries
         self._shown: tuple[int, int] = (-1, -1)
 
     def describe(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class OpenglRenderer(Renderer):
     ) -> np.ndarray:
         indices = check_frames(self.task, physics, exogenous, views)
         out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
-        self._gl.make_current()
+        self._painter._gl_context.make_current()
         rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
         # Frames with the same background follow each other: a texture is uploaded once.
         order = np.lexsort((exogenous.background_frame, exogenous.background_video))
@@ -152,30 +152,18 @@ class OpenglRenderer(Renderer):
         """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
         indices = check_frames(self.task, physics, exogenous, views)
         depth, segmentation = empty_labels(len(physics), len(indices), self.size)
-        self._gl.make_current()
+        self._painter._gl_context.make_current()
         rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
-        near = self._model.vis.map.znear * self._model.stat.extent
-        far = self._model.vis.map.zfar * self._model.stat.extent
         for frame in range(len(physics)):
             self._pose(physics[frame], exogenous, frame, hide_goal)
             for column, view in enumerate(indices):
-                raw = np.empty((self.size, self.size), np.float32)
-                self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0  # which has a depth of its own
-                self._shoot(view, exogenous.camera_position[frame], rotations[frame], depth=raw)
-                self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
-                meters = near * far / (far - raw[::-1].astype(np.float64) * (far - near))
-                depth[frame, column] = np.where(raw[::-1] >= 1, 0, meters)
-                self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
-                self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
-                colors = self._shoot(view, exogenous.camera_position[frame], rotations[frame]).astype(np.int32)
-                self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 0
-                self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
-                ids = colors[..., 0] + colors[..., 1] * 256 + colors[..., 2] * 65536
-                table = np.full(self._scene.ngeom + 2, -1, np.int16)
-                for geom in self._scene.geoms[: self._scene.ngeom]:
-                    if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
-                        table[geom.segid + 1] = geom.objid
-                segmentation[frame, column] = table[np.minimum(ids, len(table) - 1)]
+                self._painter.enable_segmentation_rendering()
+                number, kind = np.moveaxis(self._shoot(view, exogenous.camera_position[frame], rotations[frame]), -1, 0)
+                segmentation[frame, column] = np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, number, -1)
+                self._painter.enable_depth_rendering()
+                meters = self._shoot(view, exogenous.camera_position[frame], rotations[frame])
+                depth[frame, column] = np.where(kind < 0, 0, meters)
+        self._painter.disable_depth_rendering()
         return {"depth": depth, "segmentation": segmentation}
 
     def _pose(self, physics, exogenous, frame, hide_goal):
@@ -185,8 +173,8 @@ class OpenglRenderer(Renderer):
         for name, values in self._own_values.items():
             getattr(model, name)[:] = values
         self.task.apply_entries(model, row)
-        for field in range(model.nhfield if "hfield_data" in self.task.model_entries else 0):
-            mujoco.mjr_uploadHField(model, self._context, field)
+        for field in range(model.nhfield if self._terrain_changes else 0):
+            mujoco.mjr_uploadHField(model, self._painter._mjr_context, field)
         mujoco.mj_setState(model, data, row[: mujoco.mj_stateSize(model, spec)], spec)
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
             stage(model, data)
@@ -220,30 +208,21 @@ class OpenglRenderer(Renderer):
             self._model.tex_height[self._sky] = width
             start = self._sky_range.start
             self._model.tex_data[start : start + picture.size] = picture.ravel()
-        mujoco.mjr_uploadTexture(self._model, self._context, self._sky)
+        mujoco.mjr_uploadTexture(self._model, self._painter._mjr_context, self._sky)
         self._shown = (video, frame)
 
-    def _shoot(self, view, positions, rotations, depth=None) -> np.ndarray:
+    def _shoot(self, view, positions, rotations) -> np.ndarray:
+        """What the painter is set to: a picture, depth, or number and kind of the objects."""
         camera = camera_ids(self.task)[view]
         self._data.cam_xpos[camera] = positions[view]
         self._data.cam_xmat[camera] = rotations[view].ravel()
-        self._camera.fixedcamid = camera
-        shown = (self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        mujoco.mjv_updateScene(self._model, self._data, *shown)
-        if self._scene.ngeom >= MAX_GEOMS:
+        self._painter.update_scene(self._data, camera)
+        if self._painter.scene.ngeom >= MAX_GEOMS:
             raise RenderingError(f"{self.task.id} has more than {MAX_GEOMS:,} shapes, which 'opengl' cannot draw")
-        rectangle = mujoco.MjrRect(0, 0, self.size, self.size)
-        mujoco.mjr_render(rectangle, self._scene, self._context)
-        picture = np.empty((self.size, self.size, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, depth, rectangle, self._context)
-        return picture[::-1]
+        return self._painter.render()
 
     def close(self) -> None:
-        if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
-            self._gl = None
+        self._painter.close()
 
 
 RENDERER = OpenglRenderer

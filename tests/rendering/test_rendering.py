@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
-from dmcvb_gen.errors import DmcvbError, RenderingError, UnknownNameError
+from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.opengl import unavailable
-from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
-from dmcvb_gen.tasks.environment import EnvironmentTask
-from dmcvb_gen.tasks.own import mjcf_environment
 
 needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
 FRAMES = 12
@@ -189,50 +187,3 @@ def test_every_renderer_has_its_contract_and_says_why_it_cannot_start():
 def test_what_native_does_not_paint_is_painted_by_another_renderer():
     assert default_renderer(get_task("quadruped-walk")) == "native"
     assert default_renderer(get_task("lqr-lqr_2_1")) == "opengl"
-
-
-WALLS = "".join(
-    f'<geom type="box" size=".01 .01 .01" pos="{column / 20} {row / 20} 0"/>'
-    for row in range(35)
-    for column in range(35)
-)
-PLAIN = f"""<mujoco><worldbody><camera name="top" pos=".9 .9 3"/>{WALLS}
-<body pos="0 0 .8"><joint name="hinge"/><geom size=".01"/></body></worldbody>
-<actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
-
-
-def plain_task(tmp_path, xml):
-    (tmp_path / "plain.xml").write_text(xml)
-    return EnvironmentTask("plain-task", lambda: mjcf_environment(tmp_path / "plain.xml", lambda physics: 0.0))
-
-
-@needs_opengl
-def test_opengl_draws_more_than_a_thousand_shapes_and_refuses_a_video_without_a_sky(tmp_path):
-    task = plain_task(tmp_path, PLAIN)
-    physics = task.batch(1).physics()
-    generators = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
-    renderer = make_renderer("opengl", task, 200, backgrounds=load_backgrounds())
-    for kind in ("none", "dynamic"):
-        labels = sample_distractors(task, DistractorSetting(kind), physics[None], generators, load_backgrounds()).flat()
-        if kind == "none":
-            shown = renderer.render(physics, labels)[0, 0].any(axis=-1)
-            halves = [half.mean() for side in (shown, shown.T) for half in (side[:100], side[100:])]
-            assert min(halves) > 0.8 * max(halves) > 0
-        else:
-            with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):
-                renderer.render(physics, labels)
-    renderer.close()
-
-
-def test_native_refuses_cameras_that_are_more_than_a_field_of_view(tmp_path):
-    special = PLAIN.replace('name="top"', 'name="top" projection="orthographic"')
-    with pytest.raises(RenderingError, match="an orthographic camera"):
-        make_renderer("native", plain_task(tmp_path, special), 16)
-
-
-@pytest.mark.parametrize("difficulty", ["color0.2", "camera0.2-cue0.9", "color0.2-cue0.9"])
-def test_a_model_without_materials_cannot_vary_its_colors(tmp_path, difficulty):
-    task = plain_task(tmp_path, PLAIN)
-    generators = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
-    with pytest.raises(DmcvbError, match="has no materials, so its colors cannot vary"):
-        sample_distractors(task, DistractorSetting("dynamic", difficulty), task.batch(1).physics()[None], generators)

@@ -26,7 +26,7 @@ Around them:
     renderer.py    the `Renderer`: batches, caches, hidden goals
 
 A new kind of convex geom needs `visibility.through_solid` (where a ray enters and leaves it) and `half_length`, a
-radius in `renderer.ball_radius`, and its number in `scene`. Meshes, skins, height fields and transparent bodies are
+radius in `scene._ball_radius`, and its number in `scene`. Meshes, skins, height fields and transparent bodies are
 missing.
 """
 

@@ -164,16 +164,6 @@ def face_planes(rec):
 
 
 @part
-def pose_camera(k, axes, sky, f):
-    """Fill a frame's entries of k."""
-    for row in range(3):
-        for column in range(3):
-            k[L.VIEW + 3 * row + column] = axes[f, row, column]
-    k[L.EYE], k[L.EYE + 1], k[L.EYE + 2] = 0.0, 0.0, -1.0
-    k[L.SKY] = sky[f]
-
-
-@part
 def choose_lamp(k, constants, lamps, lamp, eye, axes, f, which):
     """Fill the lamp's entries of k with one of the lamps; the headlight shines beside the first one alone."""
     for i in range(9):
@@ -247,16 +237,9 @@ def drawn(rec, g, which):
 
 
 @part
-def body_box(k, rec, g, place, axis, pixels):
-    """Pixels in CLIP that a body can touch; its center and axis are in these columns of its record."""
-    half = rec[g, L.SIZE + 1] if rec[g, L.KIND] == CAPSULE else 0.0
-    return box_of_body(k, rec, g, place, axis, half, pixels)
-
-
-@part
 def draw_body(inverse, number, rays, k, rec, g, place, axis):
-    """Draw a body; see `body_box`."""
-    c0, c1, r0, r1 = body_box(k, rec, g, place, axis, rays.size // 9)
+    """Draw a body; its center and axis are in these columns of its record."""
+    c0, c1, r0, r1 = box_of_body(k, rec, g, place, axis, rays.size // 9)
     if c0 >= c1 or r0 >= r1:
         return
     nearest, geom = 1.0 / k[L.NEAR], np.uint8(g)
@@ -573,7 +556,7 @@ def clip_to_some(k, rec, pixels, goal):
     left, right, top, bottom = pixels, 0, pixels, 0
     for g in range(rec.shape[0]):
         if rec[g, L.KIND] != PLANE and rec[g, L.GOAL] == goal and (goal or rec[g, L.MOVING] > 0.0):
-            c0, c1, r0, r1 = body_box(k, rec, g, i8(L.PLACE), i8(L.AXIS), pixels)
+            c0, c1, r0, r1 = box_of_body(k, rec, g, i8(L.PLACE), i8(L.AXIS), pixels)
             if c0 < c1 and r0 < r1:
                 left, right, top, bottom = min(left, c0), max(right, c1), min(top, r0), max(bottom, r1)
     if goal and (k[L.CONE] > 0.0 or k[L.MIRROR] >= 0.0):
@@ -600,22 +583,6 @@ def paint(scene, frames, scratch, f, which, inside, known, out):
                     reflect(k, rec)
             shade_jobs(scene, scratch, pixels, veiled, known, at > 0)
         write_pixels(jobs, color, room, count, out)
-
-
-@part
-def set_constants(k, constants):
-    """The first entries of k."""
-    for i in range(constants.size):
-        k[i] = constants[i]
-
-
-@part
-def copy_picture(source, target):
-    """Copy a picture (row, column, 3) to another."""
-    for row in range(source.shape[0]):
-        for column in range(source.shape[1]):
-            for c in range(3):
-                target[row, column, c] = source[row, column, c]
 
 
 @part
@@ -654,7 +621,10 @@ def pose(scene, frames, scratch, f, pixels):
     """Transform everything of frame f into the camera's frame."""
     k, eye, axes = scratch.k, frames.eye, frames.axes
     pose_geoms(scratch.rec, scene.looks, frames.center, frames.turn, eye, axes, frames.rgb, frames.look[f], f)
-    pose_camera(k, axes, frames.sky, f)
+    for row in range(3):
+        for column in range(3):
+            k[L.VIEW + 3 * row + column] = axes[f, row, column]
+    k[L.EYE], k[L.EYE + 1], k[L.EYE + 2], k[L.SKY] = 0.0, 0.0, -1.0, frames.sky[f]
     clip(k, i8(0), pixels, i8(0), pixels)
 
 
@@ -674,7 +644,7 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
       stays: no plane, shadow or mirror image ever moves.
     """
     k, rec, kept, axes, sky = scratch.k, scratch.rec, scratch.kept, frames.axes, frames.sky
-    set_constants(k, scene.constants)
+    k[: scene.constants.size] = scene.constants
     pixels, has_kept, known = scene.rays.size // 9, False, False
     all_, both = ALL if len(shown) else NO_GOAL, len(shown) > 0 and len(hidden) > 0
     for f in range(frames.look.size):
@@ -698,7 +668,7 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
                     continue
                 picture, which, has_kept = kept, NOTHING_MOVING, True
             elif step == 1 and still:
-                copy_picture(kept, out)
+                out[:] = kept
                 if not clip_to_some(k, rec, pixels, i8(0)):
                     continue
             elif step == 2 and still and all_ == ALL:
@@ -706,7 +676,7 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
                     continue
             elif step == 3 and both:
                 picture, which = hidden[f], NO_GOAL
-                copy_picture(out, picture)
+                picture[:] = out
                 if not clip_to_some(k, rec, pixels, i8(1)):
                     continue
             elif step > 0:
@@ -718,7 +688,7 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
 def label_frames(scene, frames, scratch, depth, geom):
     """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them."""
     k, rec, inverse, number = scratch.k, scratch.rec, scratch.inverse, scratch.number
-    set_constants(k, scene.constants)
+    k[: scene.constants.size] = scene.constants
     pixels = scene.rays.size // 9
     for f in range(frames.look.size):
         pose(scene, frames, scratch, f, pixels)

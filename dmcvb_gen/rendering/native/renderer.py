@@ -16,16 +16,7 @@ from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, 
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.frame import Frames, SceneConstants, labeler, make_scratch, painter
 from dmcvb_gen.rendering.native.layout import call
-from dmcvb_gen.rendering.native.scene import (
-    BOX,
-    CYLINDER,
-    ELLIPSOID,
-    PLANE,
-    SUN_DISTANCE,
-    Scene,
-    look_of,
-    scene_of,
-)
+from dmcvb_gen.rendering.native.scene import PLANE, SUN_DISTANCE, Scene, records_of, scene_of
 from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
 from dmcvb_gen.rendering.native.visibility import sample_rays
 from dmcvb_gen.tasks.base import Task
@@ -63,16 +54,12 @@ class NativeRenderer(Renderer):
         self._textures.make_ready(self._scene.sky)
         self._looks: dict[int, int] = {}
         self._records = np.zeros((0, len(self._scene.geoms), L.RGB + 3))
-        fields = ["geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "light_xpos", "light_xdir"]
-        needed = {
-            "geom": True,
-            "site": len(self._scene.sites) or len(self._scene.cords),
-            "ligh": len(self._scene.lamps),
-        }
-        fields = [name for name in fields if needed[name[:4]]]
+        fields = ["geom_xpos", "geom_xmat"]
+        fields += ["site_xpos", "site_xmat"] * bool(len(self._scene.sites) or len(self._scene.cords))
+        fields += ["light_xpos", "light_xdir"] * bool(len(self._scene.lamps))
         self._kinematics = Kinematics(task, fields)
         self._stays = (
-            self._scene.mirror < 0
+            self._scene.constants[L.MIRROR] < 0
             and not len(self._scene.lamps)
             and not self._scene.moving[self._scene.kind == PLANE].any()
         )
@@ -175,19 +162,9 @@ class NativeRenderer(Renderer):
     def _look(self, style: int) -> int:
         """Row of a style's records, its textures made ready."""
         if style not in self._looks:
-            scene, look = self._scene, look_of(self.task, self._scene, style, self.floor_alpha)
-            for texture in np.unique(look.texture).tolist():
+            rec = records_of(self.task, self._scene, style, self.floor_alpha)
+            for texture in np.unique(rec[:, L.TEXTURE]).astype(int).tolist():
                 self._textures.make_ready(texture)
-            rec = np.zeros(self._records.shape[1:])
-            rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3] = scene.kind, scene.size
-            rec[:, L.GOAL], rec[:, L.BOXED] = scene.goal, _boxed(self.task, scene)
-            rec[:, L.MOVING], rec[:, L.BALL] = scene.moving, ball_radius(scene)
-            rec[:, L.CORD] = np.arange(len(rec)) >= len(rec) - len(scene.cords)
-            rec[:, L.GRIDDED] = np.arange(len(rec)) == scene.gridded
-            rec[:, L.MATERIAL], rec[:, L.OWN_OPACITY] = look.material, look.color[:, 3]
-            rec[:, L.TEXTURE], rec[:, L.REPEAT : L.REPEAT + 2] = look.texture, look.repeat
-            rec[:, L.SHARE], rec[:, L.EXPONENT] = look.shine.T
-            rec[:, L.RGB : L.RGB + 3] = look.color[:, :3]
             self._records = np.concatenate([self._records, rec[None]])
             self._looks[style] = len(self._looks)
         return self._looks[style]
@@ -195,10 +172,8 @@ class NativeRenderer(Renderer):
     def _constants(self, view: int, centers: bool = False) -> SceneConstants:
         """The constant arguments of a view; with `centers` all samples lie in the middle of their pixels."""
         scene, angle = self._scene, self._angles[view]
-        step = 2 * math.tan(angle / 2) / self.size
-        lens = [step, scene.near, scene.far, scene.mirror, scene.reflectance]
-        plane = [*scene.lines, scene.grid.shape[1], scene.horizon]
-        constants = np.concatenate([lens, scene.headlight, scene.shine[0], plane])
+        constants = scene.constants.copy()
+        constants[L.STEP] = step = 2 * math.tan(angle / 2) / self.size
         return SceneConstants(
             looks=self._records,
             constants=constants,
@@ -232,21 +207,3 @@ def _poses(scene: Scene, poses: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
         turn.append(np.zeros((*one.shape, 3)))
         turn[-1][..., 2] = (two - one) / 2
     return np.ascontiguousarray(np.concatenate(center, axis=1)), np.ascontiguousarray(np.concatenate(turn, axis=1))
-
-
-def ball_radius(scene: Scene) -> np.ndarray:
-    """(geom,) meters: of the ball around a body (around the end of a capsule)."""
-    size, kind = scene.size, scene.kind
-    reach = {
-        ELLIPSOID: size.max(axis=1),
-        CYLINDER: np.hypot(size[:, 0], size[:, 1]),
-        BOX: np.sqrt((size**2).sum(axis=1)),
-    }
-    return np.select([kind == each for each in reach], list(reach.values()), size[:, 0])
-
-
-def _boxed(task: Task, scene: Scene) -> np.ndarray:
-    """(geom,) bool: planes that lie on a side of a box."""
-    place = np.where(scene.geoms[:, None] >= 0, task.model.geom_pos[scene.geoms], np.inf)[:, None]
-    touching = (scene.boxes[None, :, :3] - 1e-6 <= place) & (place <= scene.boxes[None, :, 3:] + 1e-6)
-    return (scene.kind == PLANE) & touching.all(axis=2).any(axis=1)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids
 
@@ -42,25 +43,6 @@ _MAX_GRID = 200
 
 
 @dataclass(frozen=True)
-class Look:
-    """Materials of a scene's geoms, sites and tendons under one visual look.
-
-    Attributes:
-      material: (geom,) int64, the material that gives the geom's color; -1: its own color.
-      color: (geom, 4) float64, the color where there is no material, and always the opacity.
-      texture: (geom,) int32; -1: none.
-      repeat: (geom, 2) float64, texture coordinates for each meter (planes).
-      shine: (geom, 2) float64, specular share and exponent.
-    """
-
-    material: np.ndarray
-    color: np.ndarray
-    texture: np.ndarray
-    repeat: np.ndarray
-    shine: np.ndarray
-
-
-@dataclass(frozen=True)
 class Scene:
     """Constant part of a scene: geoms in the model's order, then sites, then pieces of tendons.
 
@@ -74,19 +56,14 @@ class Scene:
       size: (geom, 3) float64, meters, half lengths as MuJoCo's.
       moving: (geom,) bool; the others never move.
       goal: (geom,) bool, left out of the hidden-goal pictures.
-      mirror: the geom that mirrors (the first reflective plane), or -1.
-      reflectance: reflectance of that plane.
-      headlight: (9,) float64, ambient, diffuse and specular RGB; zeros when off.
       lamps: indices of the lamps in the model.
-      shine: (lamp, 12) float64, the same of each lamp, then the cosine of its cut-off angle, its exponent, and the
-        tangent of its shadow map's half angle; one row of zeros without a lamp.
+      shine: (lamp, 12) float64, of each lamp ambient, diffuse and specular RGB, then the cosine of its cut-off angle,
+        its exponent, and the tangent of its shadow map's half angle; one row of zeros without a lamp.
       gridded: the plane that is lit at its vertices (the largest one), or -1.
       grid: (2, line) float64, coordinates in that plane's frame of the vertices that it is drawn with.
-      lines: (2,) int64, how many there are along each axis.
       boxes: (box, 6) float64, lowest and highest corner of the solid boxes behind walls (not drawn themselves).
       sky: texture of the sky, or -1.
-      near, far: depths between which things are drawn, meters.
-      horizon: how far from the eye, in the world's horizontal plane, the sky hides what is beyond, meters.
+      constants: float64, the first entries of `layout`'s `k`; STEP is 0, as it differs between views.
     """
 
     geoms: np.ndarray
@@ -98,19 +75,13 @@ class Scene:
     size: np.ndarray
     moving: np.ndarray
     goal: np.ndarray
-    mirror: int
-    reflectance: float
-    headlight: np.ndarray
     lamps: np.ndarray
     shine: np.ndarray
     gridded: int
     grid: np.ndarray
-    lines: np.ndarray
     boxes: np.ndarray
     sky: int
-    near: float
-    far: float
-    horizon: float
+    constants: np.ndarray
 
 
 def scene_of(task: Task) -> Scene:
@@ -140,13 +111,19 @@ def scene_of(task: Task) -> Scene:
     sites, ends = sites[seen[(seen >= first) & (seen < second)] - first], ends[seen[seen >= second] - second]
     _refuse_what_is_not_painted(task, material, kind, size, alpha[seen])
     shiny = _of_materials(model.mat_reflectance, material) * (kind == PLANE) * (material >= 0)
-    mirror = int(np.flatnonzero(shiny)[0]) if shiny.any() else -1
+    mirror = np.flatnonzero(shiny)[:1]  # the first reflective plane
     lamps = np.flatnonzero(model.light_active)
     planes = np.flatnonzero(kind == PLANE)
     gridded = int(planes[np.argmax(size[planes, 0] * size[planes, 1])]) if len(planes) and len(lamps) else -1
     grid, lines = _vertices(size[gridded]) if gridded >= 0 else (np.zeros((2, 2)), np.zeros(2, np.int64))
-    shine = [np.concatenate([_light(model, lamp), _cone(model, lamp)]) for lamp in lamps]
+    shine = [np.concatenate([_light(model, lamp), _cone(model, lamp)]) for lamp in lamps] or [np.zeros(12)]
+    near, far = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    constants = np.zeros(L.HORIZON + 1)
+    constants[L.NEAR], constants[L.FAR], constants[L.HORIZON] = near, far, SKY_DISTANCE * far if len(skies) else 1e9
+    constants[L.MIRROR], constants[L.REFLECTANCE] = (mirror[0], shiny[mirror[0]]) if len(mirror) else (-1, 0)
+    constants[L.HEADLIGHT : L.SPOT], constants[L.SPOT : L.LINES] = _headlight(model), shine[0]
+    constants[L.LINES : L.GRID], constants[L.GRID] = lines, grid.shape[1]
     return Scene(
         geoms=geoms,
         sites=sites,
@@ -157,24 +134,18 @@ def scene_of(task: Task) -> Scene:
         size=size,
         moving=moving[seen] | bool(task.model_entries),
         goal=np.isin(geoms, task.goal_geoms),
-        mirror=mirror,
-        reflectance=float(shiny[mirror]) if mirror >= 0 else 0.0,
-        headlight=_headlight(model),
         lamps=lamps,
-        shine=np.array(shine) if shine else np.zeros((1, 12)),
+        shine=np.array(shine),
         gridded=gridded,
         grid=grid,
-        lines=lines,
         boxes=_boxes(model),
         sky=int(skies[0]) if len(skies) else -1,
-        near=float(model.vis.map.znear * model.stat.extent),
-        far=float(model.vis.map.zfar * model.stat.extent),
-        horizon=SKY_DISTANCE * float(model.vis.map.zfar * model.stat.extent) if len(skies) else 1e9,
+        constants=constants,
     )
 
 
-def look_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> Look:
-    """The look of a style label (-1: the model's own materials).
+def records_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> np.ndarray:
+    """(geom, column) float64: the first columns of `layout`'s `rec` under a style label (-1: the model's own look).
 
     Args:
       floor_alpha: opacity of the planes whose material is their own (below 1: the floor is seen through).
@@ -193,13 +164,36 @@ def look_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> Look:
     shine = np.stack([_of_materials(model.mat_specular, material), shininess], axis=1)
     shine[material < 0] = 0.5, 64.0  # MuJoCo's defaults of a geom without a material
     scale = np.where(uniform, 1.0, 1.0 / np.maximum(scene.size[:, :2], 1e-9))
-    return Look(
-        material=np.where(own, -1, material),
-        color=color,
-        texture=texture.astype(np.int32),
-        repeat=0.5 * _of_materials(model.mat_texrepeat, material) * scale,
-        shine=shine.astype(np.float64),
-    )
+    rec = np.zeros((len(scene.geoms), L.RGB + 3))
+    rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3] = scene.kind, scene.size
+    rec[:, L.GOAL], rec[:, L.BOXED] = scene.goal, _boxed(task, scene)
+    rec[:, L.MOVING], rec[:, L.BALL] = scene.moving, _ball_radius(scene)
+    rec[:, L.CORD] = np.arange(len(rec)) >= len(rec) - len(scene.cords)
+    rec[:, L.GRIDDED] = np.arange(len(rec)) == scene.gridded
+    rec[:, L.MATERIAL], rec[:, L.OWN_OPACITY] = np.where(own, -1, material), color[:, 3]
+    rec[:, L.TEXTURE] = texture
+    rec[:, L.REPEAT : L.REPEAT + 2] = 0.5 * _of_materials(model.mat_texrepeat, material) * scale
+    rec[:, L.SHARE], rec[:, L.EXPONENT] = shine.T
+    rec[:, L.RGB : L.RGB + 3] = color[:, :3]
+    return rec
+
+
+def _ball_radius(scene: Scene) -> np.ndarray:
+    """(geom,) meters: of the ball around a body (around the end of a capsule)."""
+    size, kind = scene.size, scene.kind
+    reach = {
+        ELLIPSOID: size.max(axis=1),
+        CYLINDER: np.hypot(size[:, 0], size[:, 1]),
+        BOX: np.sqrt((size**2).sum(axis=1)),
+    }
+    return np.select([kind == each for each in reach], list(reach.values()), size[:, 0])
+
+
+def _boxed(task: Task, scene: Scene) -> np.ndarray:
+    """(geom,) bool: planes that lie on a side of a box."""
+    place = np.where(scene.geoms[:, None] >= 0, task.model.geom_pos[scene.geoms], np.inf)[:, None]
+    touching = (scene.boxes[None, :, :3] - 1e-6 <= place) & (place <= scene.boxes[None, :, 3:] + 1e-6)
+    return (scene.kind == PLANE) & touching.all(axis=2).any(axis=1)
 
 
 def _shown(groups: np.ndarray) -> np.ndarray:

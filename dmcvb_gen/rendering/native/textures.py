@@ -11,7 +11,6 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
-from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.kept import kept_njit
@@ -92,7 +91,7 @@ def packed(picture: np.ndarray) -> np.ndarray:
 
 
 def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.ndarray:
-    """(h, w, 3) uint8 -> (texel,) int32, all levels of a background on the sky, one after the other.
+    """(h, w, 3) uint8, sides of 2 to SKY_WIDTH -> (texel,) int32, all levels of a background on the sky in turn.
 
     They are `levels` of the picture that Pillow's bilinear filter makes SKY_WIDTH wide and high.
 
@@ -100,9 +99,6 @@ def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.nd
       room: memory that is kept for the next call; the texels are in it.
     """
     rows, columns = picture.shape[:2]
-    if max(rows, columns) > SKY_WIDTH or min(rows, columns) < 2:
-        image = Image.fromarray(picture).resize((SKY_WIDTH, SKY_WIDTH), Image.Resampling.BILINEAR)
-        return np.concatenate([packed(level) for level in levels(np.asarray(image))])
     if "all" not in room:
         total = sum(width * height for width, height in level_sizes(SKY_WIDTH, SKY_WIDTH))
         sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}

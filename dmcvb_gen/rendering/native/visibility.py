@@ -13,7 +13,7 @@ import numpy as np
 
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.layout import distinct, get, leaf, part, put
-from dmcvb_gen.rendering.native.scene import BOX, CYLINDER
+from dmcvb_gen.rendering.native.scene import BOX, CAPSULE, CYLINDER
 
 SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
 """Where the four samples lie in a pixel: to the right and down."""
@@ -59,14 +59,15 @@ def screen_box(left, right, low, high, k, size):
 
 
 @part
-def box_of_body(k, rec, g, place, axis, half, size):
-    """Pixels that a ball (`half` 0) or capsule can touch; none if it is behind the camera.
+def box_of_body(k, rec, g, place, axis, size):
+    """Pixels in CLIP that a body can touch; none if it is behind the camera.
 
     Args:
       place, axis: the columns of `rec` where its center and its axis are.
     """
     left, right, low, high = 1e9, -1e9, 1e9, -1e9
     radius, behind = rec[g, L.BALL], True
+    half = rec[g, L.SIZE + 1] if rec[g, L.KIND] == CAPSULE else 0.0
     for end in range(2):
         reach = half if end == 0 else -half
         x, y = rec[g, place] + reach * rec[g, axis], rec[g, place + 1] + reach * rec[g, axis + 1]
