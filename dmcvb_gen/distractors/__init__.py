@@ -105,7 +105,6 @@ __all__ = [
     "SCALES",
     "Backgrounds",
     "Distractor",
-    "Distractor",
     "DistractorSampler",
     "Scene",
     "floor_alpha_for",

@@ -9,13 +9,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.backgrounds import Backgrounds
 from dmcvb_gen.spec import DIFFICULTY_SCALES as SCALES
 from dmcvb_gen.spec import DISTRACTOR_KINDS as KINDS
 from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks.base import Task
 
-__all__ = ["KINDS", "SCALES", "Distractor", "Distractor", "Scene", "floor_alpha_for"]
+__all__ = ["KINDS", "SCALES", "Distractor", "Scene", "bounded_walk", "floor_alpha_for"]
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,36 @@ class Distractor(abc.ABC):
         Only distractors whose labels every subset stores (`BUILT_IN`) need it; the others are never left out.
         """
         raise NotImplementedError
+
+
+def bounded_walk(
+    start: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    std: float | np.ndarray,
+    frames: int,
+    repeat: int,
+    generators: Sequence[np.random.Generator],
+) -> np.ndarray:
+    """Walks that stop at the ends of their range.
+
+    Args:
+      start: (episode, ...), `low` and `high` its range.
+      std: standard deviation of a tick's step.
+      repeat: control steps, and so ticks, a frame.
+
+    Returns:
+      (episode, frame, ...)
+    """
+    ticks = repeat * (frames - 1)
+    noise = np.stack([arithmetic.normal(rng, (ticks, *start.shape[1:])) for rng in generators], axis=1)
+    out = np.empty((len(start), frames, *start.shape[1:]))
+    out[:, 0] = place = start
+    for tick in range(ticks):
+        place = np.clip(place + std * noise[tick], low, high)
+        if (tick + 1) % repeat == 0:
+            out[:, (tick + 1) // repeat] = place
+    return out
 
 
 def floor_alpha_for(task: Task, setting: DistractorSetting) -> float:

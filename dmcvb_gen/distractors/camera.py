@@ -35,29 +35,20 @@ class CameraRange:
 
 
 def spherical(position: np.ndarray) -> np.ndarray:
-    """(..., 3) x y z -> (..., 3) radius, polar angle, azimuth in [-pi, pi)."""
-    return np.stack(_spherical(*np.moveaxis(np.asarray(position, np.float64), -1, 0)), axis=-1)
-
-
-def cartesian(coordinates: np.ndarray) -> np.ndarray:
-    """(..., 3) radius, polar angle, azimuth -> (..., 3) x y z."""
-    radius, *angles = np.moveaxis(coordinates, -1, 0)
-    return np.stack(_cartesian(radius, np.stack(angles)), axis=-1)
-
-
-def _spherical(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(3, ...) x y z -> (3, ...) radius, polar angle, azimuth in [-pi, pi)."""
+    x, y, z = position
     radius = np.sqrt(x * x + y * y + z * z)
     cosine = np.clip(z / radius, -1, 1)
     sine = np.sqrt((1 - cosine) * (1 + cosine))
     polar, azimuth = arithmetic.arctan2(np.stack([sine, y]), np.stack([cosine, x]))
-    return radius, polar, np.where(azimuth >= np.pi - 1e-9, azimuth - 2 * np.pi, azimuth)
+    return np.stack([radius, polar, np.where(azimuth >= np.pi - 1e-9, azimuth - 2 * np.pi, azimuth)])
 
 
-def _cartesian(radius: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(...,) radius, (2, ...) polar angle and azimuth -> x, y, z, each (...,)."""
-    (sin_polar, sin_azimuth), (cos_polar, cos_azimuth) = arithmetic.sin_cos(angles)
-    flat = radius * sin_polar
-    return flat * cos_azimuth, flat * sin_azimuth, radius * cos_polar
+def cartesian(coordinates: np.ndarray) -> np.ndarray:
+    """(3, ...) radius, polar angle, azimuth -> (3, ...) x y z."""
+    (sin_polar, sin_azimuth), (cos_polar, cos_azimuth) = arithmetic.sin_cos(coordinates[1:])
+    flat = coordinates[0] * sin_polar
+    return np.stack([flat * cos_azimuth, flat * sin_azimuth, coordinates[0] * cos_polar])
 
 
 def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
@@ -102,11 +93,11 @@ def camera_walk(
       walk begins with the shorter one.
     """
     start = np.stack([rng.random(4) for rng in generators])
-    place = bounds.low + start[:, :3] * (bounds.high - bounds.low)
+    position = cartesian((bounds.low + start[:, :3] * (bounds.high - bounds.low)).T)
     roll = (2 * start[:, 3] - 1) * bounds.roll
     offsets = np.empty((len(generators), frames, 3))
     rolls = np.empty((len(generators), frames))
-    offsets[:], rolls[:] = cartesian(place)[:, None], roll[:, None]
+    offsets[:], rolls[:] = position.T[:, None], roll[:, None]
     if setting.kind != "dynamic":
         return offsets, rolls
     scale = setting.scale_of("camera")
@@ -119,7 +110,7 @@ def camera_walk(
     # The coordinate comes first from here on, and calls are few: of a loop over ticks they are what takes the time.
     noise = np.stack([arithmetic.normal(rng, (ticks, 4)).T for rng in generators], axis=-1)  # (4, tick, episode)
     pushes, twists = VELOCITY_STD * unit * noise[:3], ROLL_VELOCITY_STD * scale * noise[3]
-    position, velocity = cartesian(place).T, velocity.T
+    velocity = velocity.T
     for tick in range(ticks):
         velocity = velocity + pushes[:, tick]
         velocity *= np.minimum(1.0, MAX_SPEED * unit / np.maximum(arithmetic.norm(velocity, axis=0), 1e-12))
@@ -139,11 +130,10 @@ def _within(position: np.ndarray, bounds: CameraRange) -> np.ndarray:
 
     A camera just past the azimuth's seam at pi is past its near end, not its far one.
     """
-    radius, polar, azimuth = _spherical(*position)
+    radius, polar, azimuth = spherical(position)
     middle = (bounds.low[2] + bounds.high[2]) / 2
     azimuth = middle + (azimuth - middle + np.pi) % (2 * np.pi) - np.pi
-    inside = np.clip(np.stack([radius, polar, azimuth]), bounds.low[:, None], bounds.high[:, None])
-    return np.stack(_cartesian(inside[0], inside[1:]))
+    return cartesian(np.clip(np.stack([radius, polar, azimuth]), bounds.low[:, None], bounds.high[:, None]))
 
 
 def nominal_target(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:

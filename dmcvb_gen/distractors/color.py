@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
+from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene, bounded_walk
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.spec import ALL_PARTS, CUE
 from dmcvb_gen.tasks.base import Task
@@ -37,17 +36,9 @@ def color_walk(
     low, high = np.clip(own - scale, 0, 1), np.clip(own + scale, 0, 1)
     start = np.stack([rng.random(own.shape) for rng in generators])
     color = low + start * (high - low)  # uniform in what is left of the range inside [0, 1]
-    out = np.empty((len(generators), frames, *own.shape))
-    out[:] = color[:, None]
     if setting.kind != "dynamic":
-        return out
-    ticks = repeat * (frames - 1)
-    noise = np.stack([arithmetic.normal(rng, (ticks, *own.shape)) for rng in generators], axis=1)
-    for tick in range(ticks):
-        color = np.clip(color + STEP_STD * scale * noise[tick], low, high)
-        if (tick + 1) % repeat == 0:
-            out[:, (tick + 1) // repeat] = color
-    return out
+        return np.repeat(color[:, None], frames, axis=1)
+    return bounded_walk(color, low, high, STEP_STD * scale, frames, repeat, generators)
 
 
 def check_colors_are_seen(task: Task) -> None:

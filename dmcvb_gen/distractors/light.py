@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen import arithmetic
-from dmcvb_gen.distractors.base import Distractor, Scene
+from dmcvb_gen.distractors.base import Distractor, Scene, bounded_walk
 from dmcvb_gen.errors import DmcvbError
 
 RANGE = np.array([2.0, 2.0, 0.5])
@@ -30,15 +29,8 @@ class Light(Distractor):
             raise DmcvbError(f"{scene.task.id} has no lamp, so its light cannot vary; remove light")
         most = RANGE * scene.setting.scale_of("light") * float(heights.max())
         place = (2 * np.stack([rng.random(3) for rng in generators]) - 1) * most
-        repeat = scene.task.action_repeat
-        ticks = repeat * (scene.frames - 1)
-        noise = np.stack([arithmetic.normal(rng, (ticks, 3)) for rng in generators], axis=1)
-        self._shift = np.empty((len(generators), scene.frames, 3))
-        self._shift[:, 0] = place
-        for tick in range(ticks):
-            place = np.clip(place + STEP_STD * most * noise[tick], -most, most)
-            if (tick + 1) % repeat == 0:
-                self._shift[:, (tick + 1) // repeat] = place
+        repeat, std = scene.task.action_repeat, STEP_STD * most
+        self._shift = bounded_walk(place, -most, most, std, scene.frames, repeat, generators)
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         return {"light_shift": self._shift[:, frames]}

@@ -32,6 +32,12 @@ def write_video(path, frames):
     pictures[0].save(path, save_all=True, append_images=pictures[1:])
 
 
+def write_frames(folder, frames, kind="jpg"):
+    folder.mkdir(exist_ok=True)
+    for index, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / f"{index}.{kind}")
+
+
 def test_builtin_clips_are_24_frames_and_differ_between_splits():
     train, val = load_backgrounds("builtin", "train"), load_backgrounds("builtin", "val")
     assert len(train) == len(val) == 8
@@ -59,17 +65,14 @@ def test_a_folder_with_splits_keeps_them(tmp_path, suffix, folder):
 
 def test_folders_of_frames_are_videos(tmp_path):
     for name in ("bear", "camel"):
-        (tmp_path / name).mkdir()
-        for index, frame in enumerate(clip(5)):
-            Image.fromarray(frame).save(tmp_path / name / f"{index:05d}.jpg")
+        write_frames(tmp_path / name, clip(5))
     assert load_backgrounds(tmp_path, "train").names == ("bear",)
     assert load_backgrounds(tmp_path, "val").names == ("camel",)
     assert load_backgrounds(tmp_path, "val").lengths == (5,)
 
 
 def test_loose_files_are_split_by_name_and_pictures_are_videos_of_one_frame(tmp_path):
-    for index in range(4):
-        Image.fromarray(clip(1, seed=index)[0]).save(tmp_path / f"{index}.png")
+    write_frames(tmp_path, clip(4), "png")
     train, val = load_backgrounds(tmp_path, "train"), load_backgrounds(tmp_path, "val")
     assert train.names == ("0", "2") and val.names == ("1", "3") and train.lengths == (1, 1)
 
@@ -88,26 +91,23 @@ def test_backgrounds_travel_to_workers(tmp_path):
     np.testing.assert_array_equal(copy.frames(0), backgrounds.frames(0))
 
 
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(BackgroundError, match="does not exist"):
-        load_backgrounds(tmp_path / "nowhere")
-
-
-def test_an_empty_folder_says_what_to_put_in(tmp_path):
-    with pytest.raises(BackgroundError, match="holds no videos.*mp4"):
-        load_backgrounds(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["broken.mp4", "broken.webp", "broken.png"])
-def test_an_unreadable_file_is_named(tmp_path, name):
-    (tmp_path / name).write_bytes(b"not a video" * 50)
-    with pytest.raises(BackgroundError, match=name):
-        load_backgrounds(tmp_path)
+def test_what_is_no_folder_of_videos_of_a_split_is_named(tmp_path):
+    write_video(tmp_path / "train" / "a.webp", clip())
+    (tmp_path / "empty").mkdir()
+    for name, split, message in (
+        ("nowhere", "train", "does not exist"),
+        ("empty", "train", "holds no videos.*mp4"),
+        ("", "val", "no val or validation"),
+        ("", "test", "unknown split"),
+        ("train/a.webp", "train", "is a file; give the folder"),
+    ):
+        with pytest.raises(BackgroundError, match=message):
+            load_backgrounds(tmp_path / name, split)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv", ".gif", ".webp", ".png", ".jpg"])
-@pytest.mark.parametrize("share", [0.5, 0.9])
-def test_a_truncated_file_is_named_instead_of_giving_fewer_frames(tmp_path, suffix, share):
+@pytest.mark.parametrize("share", [0.5, 0.9, None])
+def test_a_truncated_or_unreadable_file_is_named_instead_of_giving_fewer_frames(tmp_path, suffix, share):
     path = tmp_path / f"a{suffix}"
     frames = clip(12, 128, 128)
     if suffix in (".png", ".jpg"):
@@ -119,7 +119,7 @@ def test_a_truncated_file_is_named_instead_of_giving_fewer_frames(tmp_path, suff
         iio.imwrite(path, frames, plugin="FFMPEG", fps=12, macro_block_size=2, output_params=options)
     assert load_backgrounds(tmp_path).lengths == (1 if suffix in (".png", ".jpg") else 12,)
     data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * share)])
+    path.write_bytes(data[: int(len(data) * share)] if share else b"not a video" * 50)
     with pytest.raises(BackgroundError, match=path.name):
         load_backgrounds(tmp_path)
 
@@ -135,9 +135,7 @@ def test_a_video_keeps_its_colors_order_and_central_square(tmp_path):
 
 
 def test_numbers_in_names_are_ordered_by_value_and_hidden_files_passed_over(tmp_path):
-    (tmp_path / "walk").mkdir()
-    for index in range(12):
-        Image.fromarray(np.full((20, 20, 3), 20 * index, np.uint8)).save(tmp_path / "walk" / f"{index}.png")
+    write_frames(tmp_path / "walk", [np.full((20, 20, 3), 20 * index, np.uint8) for index in range(12)], "png")
     (tmp_path / "walk" / "._0.png").write_bytes(b"left by another system")
     (tmp_path / ".cache").mkdir()
     found = load_backgrounds(tmp_path)
@@ -167,9 +165,7 @@ def test_long_videos_count_with_their_first_frames_and_memory_is_bounded(tmp_pat
     monkeypatch.setattr(backgrounds_module, "CACHE_BYTES", 10 * 256 * 256 * 3)
     write_video(tmp_path / "train" / "a.mp4", clip(9))
     write_video(tmp_path / "train" / "b.gif", clip(9))
-    (tmp_path / "train" / "c").mkdir()
-    for index, frame in enumerate(clip(9)):
-        Image.fromarray(frame).save(tmp_path / "train" / "c" / f"{index}.jpg")
+    write_frames(tmp_path / "train" / "c", clip(9))
     found = load_backgrounds(tmp_path)
     assert found.lengths == (6, 6, 6)
     for video in (0, 1, 2, 0):
@@ -184,24 +180,9 @@ def test_decoded_frames_and_their_digest_are_the_same_each_time():
     assert not first.frames(0).flags.writeable  # nobody changes what others see
 
 
-@pytest.mark.parametrize("split, message", [("val", "no val or validation"), ("test", "unknown split")])
-def test_a_split_that_is_not_there_is_named(tmp_path, split, message):
-    write_video(tmp_path / "train" / "a.webp", clip())
-    with pytest.raises(BackgroundError, match=message):
-        load_backgrounds(tmp_path, split)
-
-
-def test_a_file_in_place_of_a_folder_is_named(tmp_path):
-    write_video(tmp_path / "a.webp", clip())
-    with pytest.raises(BackgroundError, match="is a file; give the folder"):
-        load_backgrounds(tmp_path / "a.webp")
-
-
 def test_a_video_that_is_named_like_a_split_is_a_video(tmp_path):
     for name in ("bear", "train", "walking"):
-        (tmp_path / name).mkdir()
-        for index, frame in enumerate(clip(5)):
-            Image.fromarray(frame).save(tmp_path / name / f"{index:05d}.jpg")
+        write_frames(tmp_path / name, clip(5))
     assert load_backgrounds(tmp_path, "train").names == ("bear", "walking")
     assert load_backgrounds(tmp_path, "val").names == ("train",) and load_backgrounds(tmp_path).lengths == (5, 5)
     assert videos_by_split(tmp_path) == {"train": 2, "val": 1}

@@ -65,7 +65,7 @@ def test_dynamic_stays_in_its_ranges(task_id, difficulty, scale):
     physics = physics_of(task, episodes=4, frames=120)
     found = labels(task, f"dynamic_{difficulty}", physics)
     agent = centers_of_mass(task, physics.reshape(-1, physics.shape[-1])).reshape(4, 120, 3)
-    radius, polar, azimuth = np.moveaxis(spherical(found.camera_position[:, :, 0] - agent), -1, 0)
+    radius, polar, azimuth = spherical(np.moveaxis(found.camera_position[:, :, 0] - agent, -1, 0))
     azimuth = np.where(azimuth > 3, azimuth - 2 * np.pi, azimuth)  # the seam: pi is -pi
     nominal = task.model.cam_poscom0[camera_ids(task)[0]]
     r0, polar0, azimuth0 = spherical(nominal)
@@ -91,7 +91,7 @@ def test_the_range_is_around_every_nominal_camera(task_id, difficulty):
     assert (bounds.low <= bounds.high).all()
     assert (np.abs(np.stack([bounds.low, bounds.high]) - nominal)[:, 1:] <= np.pi / 2 * setting.scale + 1e-9).all()
     walks, _ = camera_walk(bounds, setting, 60, [np.random.default_rng(seed) for seed in range(4)])
-    places = spherical(walks)
+    places = spherical(walks.T).T
     assert (places >= bounds.low - 1e-6).all() and (places <= bounds.high + 1e-6).all()
 
 
@@ -167,7 +167,7 @@ def test_the_camera_does_not_stick_to_the_ends_of_its_ranges():
     setting = DistractorSetting("dynamic", "medium")
     bounds = camera_range(np.array([0.0, -2.0, 1.2]), setting)
     offset, roll = camera_walk(bounds, setting, 501, [np.random.default_rng(i) for i in range(40)])
-    place = spherical(offset)
+    place = spherical(offset.T).T
     at_end = (place < bounds.low + 1e-6) | (place > bounds.high - 1e-6)
     assert (at_end.mean((0, 1)) < 0.12).all() and at_end.mean() > 0.01
     assert (np.abs(roll) > bounds.roll - 1e-9).mean() < 0.12
@@ -233,7 +233,7 @@ def test_difficulty_decides_how_many_videos_are_in_play():
 
 
 def test_look_at_without_roll_keeps_the_horizon_level():
-    offset = cartesian(np.array([[3.0, 1.0, -1.2], [2.0, 0.5, -3.0]]))
+    offset = cartesian(np.array([[3.0, 2.0], [1.0, 0.5], [-1.2, -3.0]])).T
     frame = look_at(offset, np.zeros(2))
     np.testing.assert_allclose(frame[:, 2, 0], 0, atol=1e-12)  # right is horizontal
     assert (frame[:, 2, 1] > 0).all()  # up points up

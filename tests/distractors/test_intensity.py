@@ -60,11 +60,16 @@ def test_words_are_points_on_the_dial():
 
 
 @pytest.mark.parametrize(
-    "difficulty", ["0", "1.01", "nan", "-0.1", "camera2", "camera0", "background0", "background1.5", "0.0001"]
+    "name",
+    [
+        *("dynamic_0", "dynamic_1.01", "dynamic_nan", "dynamic_-0.1", "dynamic_camera2", "dynamic_camera0"),
+        *("dynamic_background0", "dynamic_background1.5", "dynamic_0.0001", "static_cue0.5", "dynamic_cue0"),
+        *("dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1"),
+    ],
 )
-def test_numbers_out_of_range_are_refused(difficulty):
+def test_numbers_out_of_range_and_cues_that_cannot_be_are_refused(name):
     with pytest.raises(DmcvbError):
-        DistractorSetting("dynamic", difficulty)
+        DistractorSetting.parse(name)
 
 
 @pytest.mark.parametrize("difficulty", ["harsh", "camera-camera", "sky0.1", "camera-", "0.1-color", ""])
@@ -127,33 +132,45 @@ def test_a_task_without_lamps_has_no_light_to_vary():
         labels(task, "dynamic_light0.5", physics_of(task, frames=2))
 
 
+SENTENCES = {
+    "static_0.35": "s = 0.35",
+    "dynamic_camera0.5-background3": "up to 3 videos",
+    "dynamic_camera0.2-color0.2-background8-cue0.8": "(correlation 0.8)",
+    "dynamic_color0.2-light0.5": "lamps walk within",
+    "dynamic_shake0.5": "the model's own",
+}
+"""Setting -> what the card says of it."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "cartpole-swingup"])
-def test_a_release_of_it_goes_the_whole_way(task_id, tmp_path):
+def test_a_release_of_them_goes_the_whole_way(task_id, tmp_path):
     folder = tmp_path / "release"
-    short = ["--level", "random", "--episodes", 2, "--max-steps", 4, "--size", 16, "--out", folder]
-    run("rollout", task_id, *short, "--distractor", "static_0.35")
-    run("rollout", task_id, *short, "--distractor", "dynamic_camera0.5-background3")
-    names = [f"{task_id}/random/static_0.35", f"{task_id}/random/dynamic_camera0.5-background3"]
-    assert list(Release.open(folder).subsets) == sorted(names)
+    short = ["--level", "random", "--episodes", 2, "--max-steps", 6, "--size", 16, "--no-pixels", "--out", folder]
+    for setting in SENTENCES:
+        run("rollout", task_id, *short, "--distractor", setting)
+    run("paint", folder)
+    subsets = Release.open(folder).subsets
+    assert {subset.setting for subset in subsets.values()} == SENTENCES.keys()
     assert json.loads(run("verify", folder, "--json"))["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
+    [lit] = [subset for subset in subsets.values() if "light" in subset.setting]
+    assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
     few = ["--profile", "smoke", "--agents", "state-bc,bc", "--workers", 1, "--out", tmp_path / "report"]
     run("validate", folder, *few)
     assert json.loads((tmp_path / "report" / "report.json").read_text())["structure"]["sound"]
     run("card", folder)
-    card = (folder / "README.md").read_text()
-    assert "the model's own" in card and "up to 3 videos" in card and "s = 0.35" in card
-    run("repaint", folder, "--only", names[0], "--distractor", "dynamic_color0.9", "--out", tmp_path / "repainted")
-    [again] = Release.open(tmp_path / "repainted").subsets.values()
-    assert again.setting == "dynamic_color0.9" and (again.episode(0)["exogenous/background_video"] == -1).all()
+    assert all(sentence in (folder / "README.md").read_text() for sentence in SENTENCES.values())
+    run("export", folder, "--to", "npz", "--out", tmp_path / "npz")
+    plain = ["repaint", folder, "--only", f"{task_id}/random/static_0.35", "--out", tmp_path / "again", "--distractor"]
+    run(*plain, "dynamic_color0.9")
+    [again] = Release.open(tmp_path / "again").subsets.values()
+    assert (again.episode(0)["exogenous/background_video"] == -1).all()
     env = DistractedEnv(task_id, "dynamic_background2", size=16)
     env.reset(seed=0)
     env.close()
-    size = get_task(task_id).action_size
-    score = dmcvb_gen.evaluate(
-        lambda seen: np.zeros((2, size)), f"{task_id}/static_0.35", episodes=2, max_steps=2, size=16
-    )
+    actions = np.zeros((2, get_task(task_id).action_size))
+    score = dmcvb_gen.evaluate(lambda seen: actions, f"{task_id}/static_0.35", episodes=2, max_steps=2, size=16)
     assert len(score.returns) == 2
 
 
@@ -202,34 +219,13 @@ def test_the_cue_in_the_data_correlates_with_the_action_as_asked(task_id, rho, t
 
 
 @pytest.mark.slow
-def test_a_cue_stands_beside_all_other_distractors_in_every_command(tmp_path):
-    folder = tmp_path / "r"
-    words = ["--level", "random", "--episodes", 2, "--max-steps", 6, "--size", 16, "--no-pixels", "--out", folder]
-    run("rollout", "walker-walk", "--distractor", "dynamic_camera0.2-color0.2-background8-cue0.8", *words)
-    [subset] = Release.open(folder).subsets.values()
-    assert subset.setting == "dynamic_camera0.2-color0.2-background8-cue0.8"
-    run("paint", folder)
-    assert json.loads(run("verify", folder, "--json"))["sound"]
-    few = ["--profile", "smoke", "--agents", "bc", "--workers", 1, "--out", tmp_path / "report"]
-    run("validate", folder, *few)
-    assert json.loads((tmp_path / "report" / "report.json").read_text())["structure"]["sound"]
-    run("card", folder)
-    assert "(correlation 0.8)" in (folder / "README.md").read_text()
-    run("repaint", folder, "--distractor", "dynamic_cue1", "--out", tmp_path / "again")
+def test_stored_actions_decide_the_cues_of_repainted_images(tmp_path):
+    short = ["--level", "random", "--episodes", 2, "--max-steps", 6, "--no-pixels", "--out", tmp_path / "r"]
+    run("rollout", "walker-walk", "--distractor", "none", *short)
+    run("repaint", tmp_path / "r", "--distractor", "dynamic_cue1", "--out", tmp_path / "again")
     [again] = Release.open(tmp_path / "again").subsets.values()
-    run("repaint", folder, "--distractor", "dynamic_shake0.5", "--out", tmp_path / "shaken")
-    assert json.loads(run("verify", tmp_path / "shaken", "--json"))["sound"]
-    assert "same digest" in run("regenerate", tmp_path / "shaken", "--check")
-    run("repaint", folder, "--distractor", "dynamic_color0.2-light0.5", "--out", tmp_path / "lit")
-    assert json.loads(run("verify", tmp_path / "lit", "--json"))["sound"]
-    assert "same digest" in run("regenerate", tmp_path / "lit", "--check")
-    [lit] = Release.open(tmp_path / "lit").subsets.values()
-    assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
-    run("card", tmp_path / "lit")
-    assert "lamps walk within" in (tmp_path / "lit" / "README.md").read_text()
-    run("export", tmp_path / "lit", "--to", "npz", "--out", tmp_path / "npz")
     cue, action = cue_and_action(again)
-    np.testing.assert_array_equal(cue, action)  # the stored actions decide
+    np.testing.assert_array_equal(cue, action)
 
 
 def test_environments_show_the_cue_of_the_actions_that_are_taken_there():
@@ -241,11 +237,3 @@ def test_environments_show_the_cue_of_the_actions_that_are_taken_there():
         shades.append(float(seen["pixels"].mean()))
     env.close()
     assert shades[1] < shades[0] - 5 and shades[1] < shades[2] - 5
-
-
-@pytest.mark.parametrize(
-    "name", ["static_cue0.5", "dynamic_cue0", "dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1"]
-)
-def test_cues_that_there_cannot_be_are_refused(name):
-    with pytest.raises(DmcvbError):
-        DistractorSetting.parse(name)
