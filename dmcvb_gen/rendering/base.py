@@ -8,7 +8,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from PIL import Image
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError, UnknownNameError
@@ -30,8 +29,6 @@ class Renderer(abc.ABC):
     name: str
     task: Task
     size: int
-    _backgrounds: Any = None
-    """The videos that labels may name."""
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -80,17 +77,6 @@ class Renderer(abc.ABC):
     def describe(self) -> dict[str, Any]:
         """Name, version and every setting that decides a pixel, for the manifest."""
 
-    def background(self, video: int, frame: int, size: int, resampling: Image.Resampling) -> np.ndarray:
-        """(size, size, 3) uint8: a frame of a background video.
-
-        Raises:
-          RenderingError: the renderer was made without backgrounds.
-        """
-        if self._backgrounds is None:
-            raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
-        picture = Image.fromarray(self._backgrounds.frames(video)[frame])
-        return np.asarray(picture.resize((size, size), resampling))
-
     def close(self) -> None:  # noqa: B027  (a renderer may hold nothing)
         """Free what the renderer holds; it cannot be used afterwards."""
 
@@ -136,9 +122,3 @@ def empty_labels(frames: int, views: int, size: int) -> tuple[np.ndarray, np.nda
     """Room for depth (frame, view, size, size) float32 and segmentation int16."""
     shape = (frames, views, size, size)
     return np.empty(shape, np.float32), np.empty(shape, np.int16)
-
-
-def geom_materials(task: Task, look: int) -> np.ndarray:
-    """(geom,) int32: the material of every geom under a look (label `style`); the model's own for -1."""
-    materials = task.style_geom_matid(look) if look >= 0 else None
-    return np.array(task.model.geom_matid if materials is None else materials, np.int32)

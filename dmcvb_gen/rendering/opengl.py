@@ -1,7 +1,7 @@
 """The reference renderer: MuJoCo's own OpenGL through EGL, whose pictures are dm_control's.
 
-Against the usual wrapper it takes what costs no pixel: an off-screen buffer of the picture's own size,
-one render an agent step, kinematics without a physics step.
+`mujoco.Renderer` draws; what costs no pixel is left out: the off-screen buffer has the picture's own size, an agent
+step has one render, and kinematics no physics step.
 """
 
 from __future__ import annotations
@@ -22,21 +22,11 @@ from PIL import Image
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import (
-    Renderer,
-    Views,
-    check_frames,
-    check_size,
-    empty_labels,
-    geom_materials,
-    moved_lamps,
-)
+from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, empty_labels, moved_lamps
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
 RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
-SKY_WIDTH = 800
-"""Texels a side of a background on the sky (the skybox's own width)."""
 _REPLACED = ("mat_rgba", "geom_matid", "geom_rgba")
 """Fields of the model that labels replace, frame by frame."""
 MAX_GEOMS = 20_000
@@ -111,8 +101,7 @@ class OpenglRenderer(Renderer):
             height, width = int(self._model.tex_height[self._sky]), int(self._model.tex_width[self._sky])
             self._sky_range = slice(address, address + height * width * int(self._model.tex_nchannel[self._sky]))
             self._own_sky = height, self._model.tex_data[self._sky_range].copy()
-        self._floors = np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-        for geom in self._floors:
+        for geom in np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
             material = self._model.geom_matid[geom]
             if self.floor_alpha < 1 and material >= 0 and self._model.mat_texid[material, RGB_ROLE] >= 0:
                 self._model.mat_rgba[material, 3] = self.floor_alpha
@@ -183,8 +172,9 @@ class OpenglRenderer(Renderer):
             data.light_xpos[:], data.light_xdir[:] = (part[0] for part in moved_lamps(model, *lamps, shift))
         recolored = np.flatnonzero((exogenous.material_rgb[frame] != self._own_colors).any(axis=1))
         model.mat_rgba[recolored, :3] = exogenous.material_rgb[frame, recolored]
-        if exogenous.style[frame] >= 0:
-            model.geom_matid[:] = geom_materials(self.task, int(exogenous.style[frame]))
+        style = int(exogenous.style[frame])
+        if style >= 0 and (materials := self.task.style_geom_matid(style)) is not None:
+            model.geom_matid[:] = materials
         if hide_goal:
             model.geom_rgba[list(self.task.goal_geoms)] = 0
         self._show_background(int(exogenous.background_video[frame]), int(exogenous.background_frame[frame]))
@@ -204,7 +194,10 @@ class OpenglRenderer(Renderer):
             self._model.tex_data[self._sky_range] = pixels
         else:
             width = int(self._model.tex_width[self._sky])
-            picture = self.background(video, frame, width, Image.Resampling.BILINEAR)
+            if self._backgrounds is None:
+                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
+            picture = Image.fromarray(self._backgrounds.frames(video)[frame])
+            picture = np.asarray(picture.resize((width, width), Image.Resampling.BILINEAR))
             self._model.tex_height[self._sky] = width
             start = self._sky_range.start
             self._model.tex_data[start : start + picture.size] = picture.ravel()
