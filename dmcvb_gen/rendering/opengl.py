@@ -196,8 +196,8 @@ class OpenglRenderer(Renderer):
             width = int(self._model.tex_width[self._sky])
             if self._backgrounds is None:
                 raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
-            picture = Image.fromarray(self._backgrounds.frames(video)[frame])
-            picture = np.asarray(picture.resize((width, width), Image.Resampling.BILINEAR))
+            image = Image.fromarray(self._backgrounds.frames(video)[frame])
+            picture = np.asarray(image.resize((width, width), Image.Resampling.BILINEAR))
             self._model.tex_height[self._sky] = width
             start = self._sky_range.start
             self._model.tex_data[start : start + picture.size] = picture.ravel()

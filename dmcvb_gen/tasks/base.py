@@ -136,8 +136,6 @@ class Task(abc.ABC):
     """Model field -> flat indices of the entries that an episode sets; `physics` rows end with their values."""
     draws_terrain: bool = False
     """True if each episode draws height fields too large for a row of `physics`."""
-    draws_terrain: bool = False
-    """True if the start of an episode draws the height fields."""
 
     @property
     def picture_model(self) -> mujoco.MjModel:

@@ -357,7 +357,7 @@ class _Episode:
     def __init__(self, task: EnvironmentTask, environment: Any, place: int = 0):
         self.task, self.environment, self.place = task, environment, place
         self.steps, self.terminated, self.truncated = 0, False, False
-        self.state, self.terrain = np.zeros(0), (0, 0, 0)
+        self.state, self.terrain = np.zeros(0), tuple[int, ...]()
 
     @property
     def over(self) -> bool:
