@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
+from dmcvb_gen.distractors.base import Distractor, Scene
 
 TICKS_A_FRAME = 10
 """Control steps between two frames of the video."""
@@ -22,33 +22,6 @@ def ping_pong(start: int, direction: int, moves: np.ndarray, length: int) -> np.
     return np.where(place < length, place, period - place)
 
 
-def background_walk(
-    lengths: Sequence[int],
-    setting: DistractorSetting,
-    ticks: np.ndarray,
-    generators: Sequence[np.random.Generator],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw videos, start frames and directions.
-
-    Args:
-      lengths: frames of each video; the first `setting.videos` of them are in play.
-      ticks: (frame,) int, control steps before each frame.
-
-    Returns:
-      video and frame, each (episode, frame) int16.
-    """
-    in_play = len(lengths) if setting.videos is None else min(setting.videos, len(lengths))
-    video = np.empty((len(generators), len(ticks)), np.int16)
-    index = np.empty((len(generators), len(ticks)), np.int16)
-    moves = ticks // TICKS_A_FRAME if setting.kind == "dynamic" else np.zeros_like(ticks)
-    for episode, rng in enumerate(generators):
-        chosen = int(rng.integers(in_play))
-        start, direction = int(rng.integers(lengths[chosen])), int(rng.integers(2)) * 2 - 1
-        video[episode] = chosen
-        index[episode] = ping_pong(start, direction, moves, int(lengths[chosen]))
-    return video, index
-
-
 class Background(Distractor):
     """A video on the sky, from a start frame in a direction; -1 for the model's own sky."""
 
@@ -60,7 +33,13 @@ class Background(Distractor):
         if scene.backgrounds is None:
             raise ValueError(f"distractor {scene.setting.name!r} needs backgrounds")
         lengths, ticks = scene.backgrounds.lengths, scene.task.action_repeat * np.arange(scene.frames)
-        self._video, self._index = background_walk(lengths, scene.setting, ticks, generators)
+        in_play = len(lengths) if scene.setting.videos is None else min(scene.setting.videos, len(lengths))
+        moves = ticks // TICKS_A_FRAME if scene.setting.kind == "dynamic" else np.zeros_like(ticks)
+        self._video, self._index = np.empty((2, len(generators), scene.frames), np.int16)
+        for episode, rng in enumerate(generators):
+            self._video[episode] = chosen = int(rng.integers(in_play))
+            start, direction = int(rng.integers(lengths[chosen])), int(rng.integers(2)) * 2 - 1
+            self._index[episode] = ping_pong(start, direction, moves, int(lengths[chosen]))
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         return {"background_video": self._video[:, frames], "background_frame": self._index[:, frames]}

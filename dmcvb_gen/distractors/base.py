@@ -89,27 +89,25 @@ class Distractor(abc.ABC):
 
 
 def bounded_walk(
+    scene: Scene,
+    generators: Sequence[np.random.Generator],
     start: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
     std: float | np.ndarray,
-    frames: int,
-    repeat: int,
-    generators: Sequence[np.random.Generator],
 ) -> np.ndarray:
-    """Walks that stop at the ends of their range.
+    """Walks that stop at the ends of their range; a tick is a control step.
 
     Args:
       start: (episode, ...), `low` and `high` its range.
       std: standard deviation of a tick's step.
-      repeat: control steps, and so ticks, a frame.
 
     Returns:
       (episode, frame, ...)
     """
-    ticks = repeat * (frames - 1)
+    repeat, ticks = scene.task.action_repeat, scene.task.action_repeat * (scene.frames - 1)
     noise = np.stack([arithmetic.normal(rng, (ticks, *start.shape[1:])) for rng in generators], axis=1)
-    out = np.empty((len(start), frames, *start.shape[1:]))
+    out = np.empty((len(start), scene.frames, *start.shape[1:]))
     out[:, 0] = place = start
     for tick in range(ticks):
         place = np.clip(place + std * noise[tick], low, high)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene, bounded_walk
+from dmcvb_gen.distractors.base import Distractor, Scene, bounded_walk
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.spec import ALL_PARTS, CUE
 from dmcvb_gen.tasks.base import Task
@@ -16,31 +16,6 @@ STEP_STD = 0.03
 """Standard deviation of the change of a channel in one tick, as a multiple of s."""
 
 
-def color_walk(
-    own: np.ndarray,
-    setting: DistractorSetting,
-    frames: int,
-    generators: Sequence[np.random.Generator],
-    repeat: int,
-) -> np.ndarray:
-    """Draw the colors of all materials.
-
-    Args:
-      own: (material, 3) the model's colors.
-      repeat: control steps, and so ticks, a frame.
-
-    Returns:
-      (episode, frame, material, 3) in [0, 1], never farther than s from the model's own.
-    """
-    scale = setting.scale_of("color")
-    low, high = np.clip(own - scale, 0, 1), np.clip(own + scale, 0, 1)
-    start = np.stack([rng.random(own.shape) for rng in generators])
-    color = low + start * (high - low)  # uniform in what is left of the range inside [0, 1]
-    if setting.kind != "dynamic":
-        return np.repeat(color[:, None], frames, axis=1)
-    return bounded_walk(color, low, high, STEP_STD * scale, frames, repeat, generators)
-
-
 def check_colors_are_seen(task: Task) -> None:
     """Raise DmcvbError if no material of a task's model is seen, so that other colors would change no picture."""
     if (seen_materials(task.model) < 0).all():
@@ -48,17 +23,23 @@ def check_colors_are_seen(task: Task) -> None:
 
 
 class Color(Distractor):
-    """A color for every material; those that no geom or site shows keep the model's."""
+    """A color for every material, at most s from the model's own; those that no geom or site shows keep that."""
 
     kinds = ("static", "dynamic")
     stream = "color"
     names = ("material_rgb",)
 
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
-        own = scene.task.material_colors
+        own, scale = scene.task.material_colors, scene.setting.scale_of("color")
         if not any(scene.setting.varies(part) for part in ALL_PARTS if part not in (self.stream, CUE)):
             check_colors_are_seen(scene.task)
-        self._colors = color_walk(own, scene.setting, scene.frames, generators, scene.task.action_repeat)
+        low, high = np.clip(own - scale, 0, 1), np.clip(own + scale, 0, 1)
+        start = np.stack([rng.random(own.shape) for rng in generators])
+        color = low + start * (high - low)  # uniform in what is left of the range inside [0, 1]
+        if scene.setting.kind == "dynamic":
+            self._colors = bounded_walk(scene, generators, color, low, high, STEP_STD * scale)
+        else:
+            self._colors = np.repeat(color[:, None], scene.frames, axis=1)
         unseen = np.setdiff1d(np.arange(len(own)), seen_materials(scene.task.model))
         self._colors[:, :, unseen] = own[unseen]  # a label that nobody sees would only cost bytes
 

@@ -29,8 +29,7 @@ class Light(Distractor):
             raise DmcvbError(f"{scene.task.id} has no lamp, so its light cannot vary; remove light")
         most = RANGE * scene.setting.scale_of("light") * float(heights.max())
         place = (2 * np.stack([rng.random(3) for rng in generators]) - 1) * most
-        repeat, std = scene.task.action_repeat, STEP_STD * most
-        self._shift = bounded_walk(place, -most, most, std, scene.frames, repeat, generators)
+        self._shift = bounded_walk(scene, generators, place, -most, most, STEP_STD * most)
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         return {"light_shift": self._shift[:, frames]}
