@@ -16,9 +16,10 @@ from dmcvb_gen.generate import renderer_choice as choice
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import make_renderer, opengl
 from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.tasks import LOCOMOTION_TASKS
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
-from tests.rendering.test_rendering import needs_opengl
+from tests.rendering.test_rendering import frames_of, needs_opengl
 
 SKY = '<texture type="skybox" builtin="gradient" rgb1=".4 .6 .8" rgb2="0 0 0" width="128" height="128"/>'
 CHECKER = 'builtin="checker" rgb1=".2 .3 .8" rgb2=".9 .9 .2" width="64"'
@@ -165,6 +166,14 @@ def test_the_chosen_renderer_draws_what_mujoco_draws(name, tmp_path):
         assert off.max() <= 1
     else:
         assert off.mean() <= 3 and off.reshape(8, 8, 8, 8).mean(axis=(1, 3)).max() <= 25
+
+
+@needs_opengl
+@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+def test_opengl_without_distractors_is_mujocos_picture(task_id):
+    task, _, physics, labels = frames_of(task_id, "none", 4)
+    off = np.abs(drawn("opengl", task, physics, labels) - reference(task, physics)).max(axis=-1)
+    assert (off > 2).mean() < 0.01  # labels are float32: a pixel on an edge may fall to the other side
 
 
 def draw_looks(model, data):
