@@ -4,16 +4,18 @@
 network); `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every use. An archive
 is xz over a list of the files' names and headers and, behind it, the bytes of all float32 weights: first all lowest
 bytes, then all second ones, ..., because signs and exponents resemble each other and noise does not.
-`scripts/pack_policies.py` makes archives and list.
+`scripts/pack_policies.py` adds the picks of runs.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 import lzma
 import os
 import tempfile
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -113,14 +115,20 @@ def unpack_files(archive: bytes) -> dict[str, bytes]:
     return files
 
 
-def pack(folder: Path, out: Path) -> None:
-    """Write archives and list from the policy files <task>/<level>.safetensors of a folder."""
-    paths = sorted(folder.glob("*/*.safetensors"))
-    groups: dict[str, dict[str, bytes]] = {}
-    for path in paths:
-        group = groups.setdefault(group_of(path.parent.name), {})
-        group[path.relative_to(folder).as_posix()] = path.read_bytes()
-    for group_name, contents in groups.items():
-        (out / f"{group_name}.xz").write_bytes(pack_files(contents))
-    digests = {path.relative_to(folder).as_posix(): sha256_file(path) for path in paths}
-    (out / INDEX).write_text(json.dumps(digests, indent=1) + "\n")
+def pack(files: Mapping[str, bytes], out: Path) -> None:
+    """Put the policies of some tasks, "<task>/<file>" -> bytes, into archives and list; others stay as they are."""
+
+    def others(names: Iterable[str]) -> list[str]:
+        return [name for name in names if name.split("/")[0] not in tasks]
+
+    tasks, index = {name.split("/")[0] for name in files}, out / INDEX
+    for group in sorted(set(map(group_of, tasks))):
+        archive = out / f"{group}.xz"
+        old = unpack_files(archive.read_bytes()) if archive.exists() else {}
+        held = {name: old[name] for name in others(old)}
+        held |= {name: content for name, content in files.items() if group_of(name.split("/")[0]) == group}
+        archive.write_bytes(pack_files(dict(sorted(held.items()))))
+    listed = json.loads(index.read_text()) if index.exists() else {}
+    digests = {name: listed[name] for name in others(listed)}
+    digests |= {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    index.write_text(json.dumps(dict(sorted(digests.items())), indent=1) + "\n")

@@ -273,7 +273,11 @@ def _medium(curve: Sequence[Point], goal: float, tolerance: float, check: Callab
 
 
 def _mixed(curve: Sequence[Point], last: int, check: Callable) -> tuple[Pick, ...] | str:
-    """Eight checkpoints evenly spaced in training steps from the start to `last`, or which is missing."""
+    """Eight checkpoints evenly spaced in training steps from step 0 to `last`, or which is missing.
+
+    The rule, for every task and algorithm: those whose steps are nearest to i / 7 of medium's step, i from 0 to 7.
+    Returns decide nothing, so checkpoints before any learning are among them, and medium itself is the last.
+    """
     picks = []
     for index, goal in enumerate(np.linspace(0, last, MIXED_COUNT)):
         step, value, path = min(curve, key=lambda point: abs(point[0] - goal))

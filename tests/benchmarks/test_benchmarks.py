@@ -142,7 +142,7 @@ def test_what_is_missing_gets_the_shape_of_what_is_there(task, setting):
 
 
 def test_policies_and_videos_that_the_package_does_not_bring_are_to_be_given():
-    _, [missing] = plan_benchmark("b1", release_of("hopper-hop/random/none"))
+    _, [missing] = plan_benchmark("b1", release_of("acrobot-swingup/random/none"))
     assert "--level expert" in missing.command and " --behaviour RUN " in missing.command
     _, [missing] = plan_benchmark("b1", release_of("walker-walk/expert/none"))
     assert "--behaviour" not in missing.command and "--backgrounds" not in missing.command

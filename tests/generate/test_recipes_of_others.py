@@ -6,6 +6,7 @@ from click.testing import CliRunner
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import expand, load_recipe, shipped_recipes
+from dmcvb_gen.policies import bundled
 from dmcvb_gen.policies.bundled import bundled_levels
 from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import save_policy
@@ -80,7 +81,8 @@ def test_two_episodes_of_every_subset_of_a_shipped_recipe_are_planned_made_and_s
     assert ("60 background videos are asked for, and 8 are there" in card) == (name == "laom")
 
 
-def test_tasks_without_a_bundled_expert_name_the_cure_and_take_an_expert_of_ones_own(tmp_path):
+def test_tasks_without_a_bundled_expert_name_the_cure_and_take_an_expert_of_ones_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(bundled, "bundled_names", lambda task, level: [])
     cut = ["--recipe", "laom", "hopper-hop", *TINY, "--out", tmp_path / "r"]
     refused = run(*cut, "--dry-run")
     assert refused.exit_code and "train-behaviour hopper-hop" in refused.output and "--behaviour" in refused.output

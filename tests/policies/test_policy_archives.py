@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies import archives
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack, pack_files
+from dmcvb_gen.policies.bundled import bundled_levels, bundled_names
+from dmcvb_gen.policies.policy_file import read_header
+from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
 
 NAME = "walker-walk/expert.safetensors"
 
@@ -26,7 +30,16 @@ def cache(tmp_path, monkeypatch):
 def test_every_policy_of_the_list_comes_out_with_its_digest(cache):
     for name, digest in bundled_digests().items():
         assert bundled_file(name) == cache / name and sha256_file(cache / name) == digest
-    assert len(bundled_digests()) == 44  # 10 of each locomotion task, 2 of each maze
+
+
+def test_every_task_has_its_levels_and_its_rows_in_the_docs():
+    page = (Path(__file__).parents[2] / "docs/policies.md").read_text()
+    for task in {name.split("/")[0] for name in bundled_digests()}:
+        assert bundled_levels(task) == list(MAZE_TRAINED_LEVELS if is_maze(task) else TRAINED_LEVELS)
+        for level in bundled_levels(task):
+            returns = [read_header(bundled_file(name)).evaluation.mean for name in bundled_names(task, level)]
+            assert len(returns) == (8 if level == "mixed" else 1)
+            assert f"| {task} | {level} | {np.mean(returns):.0f} ±" in page, "run scripts/pack_policies.py"
 
 
 def test_a_file_that_was_changed_or_lost_is_unpacked_again(cache):
@@ -58,20 +71,21 @@ def policy(seed, scale=1.0):
     return save({"weight": scale * weights, "zeros": zeros, "few": few, "bias": weights[1]}, {"header": "{}"})
 
 
-def test_packed_files_come_out_as_they_were(tmp_path, monkeypatch, cache):
-    folder, out = tmp_path / "plain", tmp_path / "data"
+def test_packed_files_come_out_as_they_were_and_other_tasks_keep_theirs(tmp_path, monkeypatch, cache):
     tasks = ("a-task", "ant-maze-x", "ant-maze-y")
     contents = {f"{task}/expert.safetensors": policy(seed, 1.0 + seed) for seed, task in enumerate(tasks)}
-    for name, content in contents.items():
-        (folder / name).parent.mkdir(parents=True)
-        (folder / name).write_bytes(content)
-    out.mkdir()
-    pack(folder, out)
-    assert sorted(path.name for path in out.iterdir()) == ["a-task.xz", "ant-maze.xz", "policies.json"]
-    monkeypatch.setattr(archives, "data_folder", lambda: out)
+    contents["ant-maze-x/medium.safetensors"] = policy(7)
+    pack(contents, tmp_path)
+    assert sorted(path.name for path in tmp_path.glob("*.*")) == ["a-task.xz", "ant-maze.xz", "policies.json"]
+    swapped = {"ant-maze-x/expert.safetensors": policy(9)}
+    before = (tmp_path / "a-task.xz").read_bytes()
+    pack(swapped, tmp_path)
+    assert (tmp_path / "a-task.xz").read_bytes() == before
+    del contents["ant-maze-x/medium.safetensors"]  # all that the task had went
+    monkeypatch.setattr(archives, "data_folder", lambda: tmp_path)
     bundled_digests.cache_clear()
     try:
-        assert {name: bundled_file(name).read_bytes() for name in contents} == contents
+        assert {name: bundled_file(name).read_bytes() for name in bundled_digests()} == contents | swapped
     finally:
         bundled_digests.cache_clear()
 

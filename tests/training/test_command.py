@@ -122,8 +122,8 @@ def test_a_folder_without_picks_says_what_to_run(tmp_path):
     assert result.exit_code == 2 and "select-checkpoints" in result.output
 
 
-@pytest.mark.slow_cases("cartpole-swingup")
-@pytest.mark.parametrize("task", ["cartpole-swingup", "finger-spin"])
+@pytest.mark.slow_cases("acrobot-swingup")
+@pytest.mark.parametrize("task", ["acrobot-swingup", "swimmer-swimmer6"])
 def test_a_task_without_a_setting_of_its_own_goes_from_nothing_to_data(tmp_path, task):
     cut = {"warmup_steps": 24, "simulations": 4, "batch_size": 16, "compile": False}
     words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]

@@ -92,4 +92,4 @@ def short():
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(TASKS, f"{name}:short")
     assert default_run(f"{name}:short")["settings"] == {"warmup_steps": warmup}
-    assert default_run("cartpole-swingup")["settings"] == {}
+    assert default_run("hopper-hop")["settings"] == {}
